@@ -52,8 +52,6 @@ from .io.errors import InputError as InputError
 from .io.errors import MeshError as MeshError
 from .io.errors import ResphysError as ResphysError
 from .io.errors import ResphysWarning as ResphysWarning
-from .learning.bounds import Bounds as Bounds
-from .learning.bounds import Prior as Prior
 from .learning.identification import Identification as Identification
 from .learning.identification import ParameterSearch as ParameterSearch
 from .learning.library import ObservedMotion as ObservedMotion
@@ -61,6 +59,8 @@ from .learning.library import evaluate as evaluate
 from .learning.library import fit_force as fit_force
 from .learning.library import identify as identify
 from .learning.library import reconstruct as reconstruct
+from .learning.parameters import Bounds as Bounds
+from .learning.parameters import Prior as Prior
 from .mesh.arm import ArmGeometry as ArmGeometry
 from .mesh.arm import mesh_arm as mesh_arm
 from .mesh.chambers import find_chambers as find_chambers

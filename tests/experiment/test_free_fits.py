@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warp_resphys.experiment.free_fits import free_fits
-from warp_resphys.experiment.sensitivity import Sensitivity
+from warp_resphys.experiment.sensitivity import Sensitivity, free_fits
 
 RANDOM = np.random.default_rng(0)
 MARKERS = 2

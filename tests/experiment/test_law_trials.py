@@ -10,7 +10,7 @@ import pytest
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.experiment.identify_law import _LawSearch
 from warp_resphys.experiment.law_trials import Score, branches_of, strong_names
-from warp_resphys.learning.law import LawClass, Library
+from warp_resphys.learning.law import LawClass
 
 SHEAR = 100e3  # Pa
 
@@ -106,12 +106,12 @@ def search_from_markers(errors, guess=None, lost=()):
 
     search = object.__new__(_LawSearch)
     search._refine = refine
-    search.settings = SimpleNamespace(law=SimpleNamespace(relaxation_times=(0.01, 1.0)))
+    law = SimpleNamespace(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
+    search.settings = SimpleNamespace(law=law)
     search.trials = SimpleNamespace(guess={"c10": 50e3, "bulk_1": 60e3, **(guess or {})}, shear=SHEAR)
     vertices = np.array([[0.0, 0.0, 0.0], [0.01, 0.2, 0.01]])
     search.experiment = SimpleNamespace(body=SimpleNamespace(mesh=SimpleNamespace(vertices=vertices)))
-    library = Library(terms=("c01", "ogden_3"), viscous=True, times=(0.01, 0.1, 1.0), families=1)
-    return [own.law.groups for own in search._from_markers(library)], began
+    return [own.law.groups for own in search._from_markers()], began
 
 
 WHOLE = ("elastic", "branches", "fibres")

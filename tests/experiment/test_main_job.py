@@ -37,7 +37,7 @@ from support.main_job import (
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment import models
 from warp_resphys.experiment.build import build_simulator
-from warp_resphys.experiment.parts import PartRollout
+from warp_resphys.experiment.parts import TrialPart
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, read_hdf5
@@ -295,21 +295,24 @@ class Interruption:
     def __init__(self, monkeypatch):
         self.at, self.signal = None, signal.SIGINT
         self.done = Counter()
-        arrays, run_epoch = PartRollout.arrays, EpochTrainer.run_epoch
+        write, run_epoch = TrialPart.write, EpochTrainer.run_epoch
 
-        def interrupted_arrays(rollout, report):
-            def counted(**shown):
-                report(**shown)
-                self.count(type(rollout).__name__)
+        def interrupted_write(part, work, advance):
+            def counted(part, report):
+                def reported(**shown):
+                    report(**shown)
+                    self.count(work.__name__)
 
-            return arrays(rollout, counted)
+                return work(part, reported)
+
+            write(part, counted, advance)
 
         def interrupted_epoch(trainer):
             record = run_epoch(trainer)
             self.count("epochs")
             return record
 
-        monkeypatch.setattr(PartRollout, "arrays", interrupted_arrays)
+        monkeypatch.setattr(TrialPart, "write", interrupted_write)
         monkeypatch.setattr(EpochTrainer, "run_epoch", interrupted_epoch)
 
     def count(self, kind):
@@ -332,10 +335,10 @@ class TestInterruption:
         arguments = [*TINY, "integrator=bdf2"]
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
         whole = Counter(interruption.done)
-        assert whole == {"_FreeMotion": 13, "_OfTrials": 13, "epochs": 80, "ModelRollout": 39}
+        assert whole == {"_free_motion": 13, "_of_trials": 13, "epochs": 80, "_rolled_out": 39}
         interruption.done.clear()
-        cuts = {"_FreeMotion": ("simulate", 1), "_OfTrials": ("reconstruct_resphys", 7)}
-        cuts |= {"epochs": ("train_resphys", 25), "ModelRollout": ("evaluate", 18)}
+        cuts = {"_free_motion": ("simulate", 1), "_of_trials": ("reconstruct_resphys", 7)}
+        cuts |= {"epochs": ("train_resphys", 25), "_rolled_out": ("evaluate", 18)}
         for kind, (stage, at) in cuts.items():
             interruption.at, interruption.signal = (kind, at), signal.SIGTERM if stage == "evaluate" else signal.SIGINT
             code, err = run(*arguments, IN_RUN)
@@ -349,7 +352,7 @@ class TestInterruption:
         assert run(*arguments, IN_RUN)[0] == 0
         repeated = interruption.done - whole
         assert repeated.pop("epochs", 0) <= 1  # the epoch that the signal fell into
-        assert repeated == {"_FreeMotion": 1, "_OfTrials": 7, "ModelRollout": 18 - 13}  # the first model is kept
+        assert repeated == {"_free_motion": 1, "_of_trials": 7, "_rolled_out": 18 - 13}  # the first model is kept
         same_errors(errors(), errors("whole"))
         assert not list(Path("run").glob("*_parts"))
         assert not list(Path("run").glob("train_*.safetensors"))

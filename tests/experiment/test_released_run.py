@@ -19,7 +19,7 @@ from warp_resphys.experiment.trials import folds_of, split_of
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.stages import StageInterrupted, run_stages
-from warp_resphys.learning.identification import Identifier
+from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.metrics import marker_errors
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.pipeline import learning_stages
@@ -157,7 +157,7 @@ class TestCompleteRun:
         assert shown.models == [*PLAIN, *MODELS]
         assert len(shown.identification["sysid"]["history"]) == 1
 
-    def test_the_reconstruction_says_how_close_it_came_and_where_its_forces_lead(self, finished):
+    def test_the_reconstruction_says_how_close_it_came(self, finished):
         results = read_json(finished / "reconstruction.json")
         assert results == read_json(finished / "metrics.json")["reconstruction"]
         assert set(results) == {"resphys"}
@@ -169,7 +169,6 @@ class TestCompleteRun:
             assert np.nanmean(file["error"][()]) == pytest.approx(own["mean_mm"], rel=1e-5)
             assert np.isfinite(file["force"][()]).all()
             assert not file["force"][:, 0].any()
-        assert own["replayed_mm"] > 0.0
 
 
 @pytest.mark.slow
@@ -225,7 +224,7 @@ def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tm
         unit, history = self._misfit.to_unit(start), [{"loss": 1.0, **start}]
         return {"parameters": dict(start), "loss": number + 1.0, "unit": unit, "prior_weight": 0.0, "history": history}
 
-    monkeypatch.setattr(Identifier, "_descend", descend)
+    monkeypatch.setattr(ParameterSearch, "_descend", descend)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
         run_stages([stage], tmp_path)
     assert not (tmp_path / "identification.json").exists()

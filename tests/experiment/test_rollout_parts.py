@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 
 from warp_resphys.experiment.parts import (
-    PartRollout,
     padded,
     read_parts,
     remove_parts,
@@ -17,30 +15,19 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.stages import StageContext
 from warp_resphys.settings.run import ParallelSettings
-from warp_resphys.stepping.state import State
 
 
-class Growing(PartRollout):
-    """Powers of a number of every trial, in its only coordinate; interrupted at a frame of a part."""
-
-    def __init__(self, part):
-        self.part, self.frames, self.units = part, part.frames, {"power": "m"}
-
-    def begin(self):
-        return State(torch.ones(len(self.part.names), 1, 1).double(), torch.zeros(len(self.part.names), 1, 1).double())
-
-    def step(self, number):
-        if (self.part.names, number) == self.part.more.get("fails_at"):
+def growing(part, report):
+    """Powers of a number of every trial; interrupted at a frame of a part."""
+    numbers = np.array([float(name) for name in part.names])
+    powers = [np.ones_like(numbers)]
+    for frame in range(1, part.frames):
+        if (part.names, frame) == part.more.get("fails_at"):
             raise KeyboardInterrupt
-        self.part.more["computed"].append((self.part.names, number))
-        growth = torch.tensor([float(name) for name in self.part.names]).double()
-        return State(self.state.q * growth[:, None, None], self.state.v)
-
-    def frame_arrays(self, number):
-        return {"power": self.state.q.flatten().numpy()}
-
-    def constants(self):
-        return {"number": (np.array([float(name) for name in self.part.names]), "m")}
+        part.more["computed"].append((part.names, frame))
+        powers.append(powers[-1] * numbers)
+        report(frame=frame)
+    return {"power": (np.stack(powers, 1), "m"), "number": (numbers, "m")}
 
 
 @pytest.mark.parametrize("settings", ["same", "other"])
@@ -49,13 +36,13 @@ def test_an_interrupted_stage_keeps_its_finished_parts(tmp_path, settings):
     parts = split_into_parts(StageContext("powers", tmp_path, "same", None), names, 6, more=kept, batch=2)
     assert [part.names for part in parts] == [("2", "3"), ("5",)]
     with pytest.raises(KeyboardInterrupt):
-        work_on(parts, Growing, Workers(1))
+        work_on(parts, growing, Workers(1))
     assert [part.done for part in parts] == [True, False]
     del kept["fails_at"]
     kept["computed"].clear()
     context = StageContext("powers", tmp_path, settings, None)
     parts = split_into_parts(context, names, 6, more=kept, batch=2)
-    work_on(parts, Growing, Workers(1))
+    work_on(parts, growing, Workers(1))
     assert len(kept["computed"]) == (5 if settings == "same" else 10)
     np.testing.assert_array_equal(read_parts(parts, "power"), [[n**k for k in range(6)] for n in (2, 3, 5)])
     assert parts[0].read("number").tolist() == [2.0, 3.0]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.rigid_bodies import arms
-from warp_resphys.experiment.sensitivity import Sensitivity
-from warp_resphys.experiment.spread import left_out_changes, parameter_spread
+from warp_resphys.experiment.sensitivity import Sensitivity, left_out_changes, parameter_spread
 from warp_resphys.settings.trials import CORNERS
 
 RANDOM = np.random.default_rng(0)

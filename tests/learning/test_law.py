@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from support.known_law import STIFF, beam, released
-from warp_resphys.learning.law import Library, _constants, fit_classes
+from warp_resphys.learning.law import _constants, fit_classes
 from warp_resphys.learning.weak_form import WeakForm
 
-LIBRARY = Library(terms=("c20", "c01", "ogden_4"), times=tuple(np.geomspace(0.01, 0.2, 8).tolist()), families=0)
+TERMS, TIMES = ("c20", "c01", "ogden_4"), np.geomspace(0.01, 0.2, 8).tolist()
 PULLS = [(0.4, 0.0, -0.15), (-0.2, 0.15, 0.05), (0.1, -0.1, 0.15)]  # N
 HELD_OUT = [(0.25, 0.12, 0.12)]
 NEO_HOOKEAN = {"c10": 30e3, "bulk_1": 2e6}
@@ -17,13 +17,13 @@ SHAPE = {"prony_time_1": 0.05, "fibre_toe_1": 0.02}
 FIBRE = {f"fibre_{name}_1": 0.0 for name in ("azimuth", "elevation", "slack", "tension", "stiffening", "compression")}
 
 
-def classes(truth, library=LIBRARY, steps=12):
+def classes(truth, terms=TERMS, times=TIMES, families=0, steps=12):
     """Classes that fit motions of a law, by their groups."""
-    zero = dict.fromkeys((*library.terms, "c10", "bulk_1", "shear_viscosity", "prony_modulus_1"), 0.0)
+    zero = dict.fromkeys((*terms, "c10", "bulk_1", "shear_viscosity", "prony_modulus_1"), 0.0)
     unknown = beam({**zero, **FIBRE, **SHAPE})
     true = beam(truth)
     forms = [WeakForm(unknown, [released(true, pulls, steps)], SHAPE, STIFF, 3) for pulls in (PULLS, HELD_OUT)]
-    laws = fit_classes(*forms, library)
+    laws = fit_classes(*forms, terms, times, families)
     sizes = [len(law.groups) for law in laws]
     assert sizes == sorted(sizes)
     assert laws[0].groups == ()
@@ -44,8 +44,7 @@ def test_terms_that_the_beam_has_are_found_and_no_others():
 
 
 def test_a_branch_between_two_times_of_the_grid_is_one_branch():
-    times = LIBRARY.times
-    truth = {**NEO_HOOKEAN, "prony_modulus_1": 15e3, "prony_time_1": math.sqrt(times[3] * times[4])}
+    truth = {**NEO_HOOKEAN, "prony_modulus_1": 15e3, "prony_time_1": math.sqrt(TIMES[3] * TIMES[4])}
     laws = classes(truth)
     found = laws["branches",]
     assert {name for name in found.constants if name.startswith("prony")} == {"prony_modulus_1", "prony_time_1"}
@@ -58,7 +57,7 @@ def test_the_direction_of_a_family_of_fibres_is_found():
     azimuth, elevation = 0.5, -0.35
     fibre = {"fibre_azimuth_1": azimuth, "fibre_elevation_1": elevation, "fibre_tension_1": 60e3}
     truth = {**NEO_HOOKEAN, **FIBRE, "fibre_toe_1": 0.02, **fibre}
-    laws = classes(truth, Library(terms=("c20",), viscous=False, times=(), families=1))
+    laws = classes(truth, ("c20",), (), 1)
     found = laws["fibres",]
     axes = [axis(law["fibre_azimuth_1"], law["fibre_elevation_1"]) for law in (truth, found.constants)]
     assert abs(float(axes[0] @ axes[1])) > math.cos(math.radians(15.0))

@@ -11,8 +11,8 @@ from warp_resphys.data.observation import WHOLE_STATE
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.learning.bounds import Bounds
 from warp_resphys.learning.misfit import Misfit
+from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.stepping.inputs import Inputs
@@ -82,7 +82,7 @@ def test_the_error_of_a_prediction_is_of_second_order():
     unit, direction = np.array([0.5, 0.5]), np.array([0.7, -0.7])
     misfit.linearise(unit)
     motion, tensor = misfit._motions[0], misfit.simulator.tensor
-    predicted = [motion.predict(tensor(unit + size * direction), 8) for size in (0.0, 0.05, 0.025)]
+    predicted = [motion.predict(tensor(unit + size * direction), 9) for size in (0.0, 0.05, 0.025)]
     errors = []
     for size, guess in zip((0.0, 0.05, 0.025), predicted, strict=True):
         other = Misfit([replayed(10)], RANGES)
@@ -91,7 +91,7 @@ def test_the_error_of_a_prediction_is_of_second_order():
     assert errors[0] < 1e-9
     assert 3.0 < errors[1] / errors[2] < 5.0
     assert errors[1] < 0.2 * float((predicted[1] - predicted[0]).norm())
-    assert motion.predict(tensor(unit), 9) is None
+    assert motion.predict(tensor(unit), 10) is None
 
 
 def test_predicted_motions_take_fewer_iterations_and_have_the_same_derivatives():
@@ -115,5 +115,5 @@ def test_a_step_that_fails_from_its_prediction_is_solved_without():
     replay = Replay(replace(replay.simulator, solver=SolverSettings(max_iterations=20)), WHOLE_STATE, replay.trials)
     with pytest.raises(ConvergenceError):
         replay.simulator.step(wanted[0], replay.trials.inputs.at(0), replay.prepare(values)[0], near=turned)
-    again = replay.states(start, values, lambda step: turned if step == 0 else None)
+    again = replay.states(start, values, lambda number: turned if number == 1 else None)
     torch.testing.assert_close(again[-1].q, wanted[-1].q, rtol=0.0, atol=1e-6)

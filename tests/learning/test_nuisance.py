@@ -9,9 +9,9 @@ import torch
 from warp_resphys import Body, Simulator
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.data.trials import Trials
-from warp_resphys.learning.bounds import Bounds
-from warp_resphys.learning.identification import Identifier
+from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.misfit import Misfit
+from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
@@ -66,12 +66,12 @@ def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
     more = {"accuracy": ACCURACY, "labels": LABELS} if placed else {}
     pair = (Replay(SIM, bound(), trials), start)
     first = {"youngs_modulus": 300e3, "stiffness_damping": 0.002}
-    result = Identifier([pair], RANGES, delay=0.02, **more).run([first], 40)
+    result = ParameterSearch(Misfit([pair], RANGES, delay=0.02, **more)).run([first], 40)
     assert result.parameters["youngs_modulus"] == pytest.approx(
         215e3, rel=1e-2 if placed else 1e-3
     )  # Places are held by a prior.
     assert result.parameters["stiffness_damping"] == pytest.approx(0.004, rel=0.05)
-    on_time = Identifier([pair], RANGES, **more).run([first], 40)
+    on_time = ParameterSearch(Misfit([pair], RANGES, **more)).run([first], 40)
     assert result.loss < (0.2 if placed else 0.02) * on_time.loss
 
 

@@ -14,15 +14,15 @@ from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_ver
 from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.data.trials import Trials
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.bounds import Bounds, Prior
-from warp_resphys.learning.identification import Identifier
+from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.misfit import Misfit
+from warp_resphys.learning.nuisance import NuisanceFit
+from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import (
     Accuracy,
     DisplacedMarkers,
     PlacedMarkers,
     Placement,
-    estimate_placement,
     placement_of,
 )
 from warp_resphys.learning.replay import Replay, Start
@@ -104,8 +104,13 @@ def test_the_placement_minimises_its_sum_of_squares():
         scaled = torch.cat([b[:12] / 1e-3, b[12:15] / 2e-3, b[15:] / 0.1])
         return (left.square().sum((1, 2, 3)) * weights[0]).sum() + 1e-5 * scaled.square().sum()
 
-    placed = estimate_placement(accuracy, CENTRE, errors, seen, [at], [turns], weights, 1e-5)
-    result, inside = placed.common, placed.deviations
+    held, names = torch.as_tensor(PLACES).expand(2, -1, -1), ("first", "second")
+    observed = torch.where(seen[0][..., None], at - errors[0], torch.nan)
+    trials = Trials(names, torch.arange(3).double().expand(2, -1), observed, held)
+    group = (Replay(SIM, DisplacedMarkers(bind(), 4), trials), Start.resting(REST.expand(2, -1, -1)))
+    series = [torch.cat([at, *(at + turn for turn in turns.unbind(-1))], 2)[None]]
+    placed = NuisanceFit([group], weights, accuracy, CENTRE, 0.0)(series, 1e-5)[1]
+    result, inside = placed.common, placed.rows / math.sqrt(1e-5)
     assert float(result.turn.norm()) > 0.02
     gradients = []
     for b in (torch.zeros(18).double(), torch.cat([result.offsets.flatten(), result.shift, result.turn])):
@@ -113,7 +118,7 @@ def test_the_placement_minimises_its_sum_of_squares():
         gradients.append(torch.autograd.grad(loss(b), b)[0])
     assert float(gradients[1].norm()) < 1e-4 * float(gradients[0].norm())
     np.testing.assert_allclose(inside[12:15], result.shift / 2e-3, rtol=1e-9)
-    held = estimate_placement(Accuracy(shift=2e-3), CENTRE, errors, seen, [at], [turns], weights, 1e-5).common
+    held = NuisanceFit([group], weights, Accuracy(shift=2e-3), CENTRE, 0.0)(series, 1e-5)[1].common
     assert float(held.offsets.abs().max()) == float(held.turn.abs().max()) == 0.0 < float(held.shift.abs().max())
 
 
@@ -150,12 +155,12 @@ ACCURACY = Accuracy(2e-3, 2e-3, 0.03)
 
 
 def identifier(pair, bounds=RANGES, accuracy=ACCURACY):
-    return Identifier([pair], bounds, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist())
+    return ParameterSearch(Misfit([pair], bounds, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist()))
 
 
 def test_the_modulus_is_recovered_from_misplaced_markers():
     pair = posed(PlacedMarkers.of(bind(), ASKEW), noise=1e-5)
-    naive = Identifier([pair], RANGES).run([{"youngs_modulus": 4e5}], 30)
+    naive = ParameterSearch(Misfit([pair], RANGES)).run([{"youngs_modulus": 4e5}], 30)
     result = identifier(pair).run([{"youngs_modulus": 4e5}], 30)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
     assert abs(naive.parameters["youngs_modulus"] - 215e3) > 3.0 * abs(result.parameters["youngs_modulus"] - 215e3)
@@ -186,11 +191,13 @@ def test_a_prior_determines_what_poses_do_not():
     still, start = posed(bind(), noise=1e-5, truth={"youngs_modulus": 215e3, "density": 1070.0})
     own = still.trials.select([0])
     pair = Replay(SIM, bind(), own), start.select([0])
-    result = Identifier([pair], {**ranges, "density": prior}).run([{"youngs_modulus": 3e5, "density": 1000.0}], 30)
+    result = ParameterSearch(Misfit([pair], {**ranges, "density": prior})).run(
+        [{"youngs_modulus": 3e5, "density": 1000.0}], 30
+    )
     assert result.parameters["density"] == pytest.approx(1200.0, abs=4.0)
     assert result.parameters["youngs_modulus"] / 215e3 == pytest.approx(1200.0 / 1070.0, rel=0.01)
     assert result.uncertainty.deviation["density"] == pytest.approx(40.0, rel=0.1)
-    apart = Identifier([(still, start)], {**ranges, "density": prior}).run(
+    apart = ParameterSearch(Misfit([(still, start)], {**ranges, "density": prior})).run(
         [{"youngs_modulus": 3e5, "density": 1e3}], 30
     )
     assert apart.parameters["density"] == pytest.approx(1070.0, rel=0.02)  # the weights tell
@@ -229,12 +236,16 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
     ranges, guess = {"beam_youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}, [{"beam_youngs_modulus": 4e5}]
     bodies = ((0, nominal - middle),)
     accuracy = Accuracy(markers=2e-3, mounting=0.03, rigid_bodies=bodies)
-    result = Identifier([pair], ranges, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist()).run(guess, 30)
-    naive = Identifier([pair], ranges).run(guess, 30)
+    result = ParameterSearch(Misfit([pair], ranges, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist())).run(
+        guess, 30
+    )
+    naive = ParameterSearch(Misfit([pair], ranges)).run(guess, 30)
     off, plain = (abs(x.parameters["beam_youngs_modulus"] / 215e3 - 1.0) for x in (result, naive))
     assert off < 0.03
     assert plain > 3.0 * off
-    halved = Identifier([pair], ranges, shares=[0.5] * 4).run(guess, 30)  # Six of twelve coordinates are independent.
+    halved = ParameterSearch(Misfit([pair], ranges, shares=[0.5] * 4)).run(
+        guess, 30
+    )  # Six of twelve coordinates are independent.
     wider, narrow = (x.uncertainty.deviation["beam_youngs_modulus"] for x in (halved, naive))
     assert wider / narrow == pytest.approx(math.sqrt(2.0 * (1.0 - 1.0 / 36.0) / (1.0 - 1.0 / 18.0)), rel=1e-3)
     places = nominal + Placement.from_plain(result.placement, LABELS).offsets.numpy()
@@ -245,7 +256,7 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
 def test_misplaced_vertices_and_priors_out_of_range_are_refused():
     replay, start = posed(bind())
     with pytest.raises(InputError, match=r"leave identify\.placement out"):
-        Identifier([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY)
+        ParameterSearch(Misfit([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY))
     with pytest.raises(InputError, match="can be placed elsewhere"):
         MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved(MOVED[:2])
     with pytest.raises(InputError, match=r"the prior has the mean 2e\+06, outside of the range"):
@@ -309,7 +320,7 @@ def test_every_session_has_its_placement():
         replay, start = posed(PlacedMarkers.of(bind(), placement), noise=1e-5)
         names = tuple(f"{session}_{name}" for name in replay.trials.names)
         pairs.append((Replay(SIM, bind(), replace(replay.trials, names=names, session=session)), start))
-    whole = Identifier(pairs, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist())
+    whole = ParameterSearch(Misfit(pairs, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist()))
     result = whole.run([{"youngs_modulus": 4e5}], 30)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
     assert list(result.placement["sessions"]) == ["monday", "friday"]
@@ -321,7 +332,7 @@ def test_every_session_has_its_placement():
     unknown = PlacedMarkers.of(bind(), placement_of(result.placement, LABELS, "sunday"))
     assert torch.isfinite(unknown(q)).all()
     one_session = [(Replay(SIM, bind(), replace(r.trials, session="")), start) for r, start in pairs]
-    mixed = Identifier(one_session, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist())
+    mixed = ParameterSearch(Misfit(one_session, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist()))
     assert mixed.run([{"youngs_modulus": 4e5}], 30).loss > 10.0 * result.loss
 
 
@@ -350,7 +361,7 @@ def test_a_trial_is_left_out_as_if_the_others_were_identified():
         for _ in range(5):
             linear = misfit.linearise(unit)
             unit = unit - np.linalg.solve(linear.gauss_newton, linear.gradient)
-        placed = misfit.placed(unit).common
+        placed = misfit.nuisances(unit).common
         return misfit, unit, np.concatenate([placed.offsets.ravel(), placed.shift, placed.turn])
 
     whole, unit, placement = best([*range(count)], 1e-5)

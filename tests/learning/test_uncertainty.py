@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_resphys.learning.bounds import Bounds
+from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.uncertainty import redundancy, uncertainty_of
 
 BOUNDS = {"stiffness": Bounds(1.0, 3.0), "damping": Bounds(0.1, 10.0, logarithmic=True)}

@@ -12,7 +12,7 @@ import warp_resphys as wr
 from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
 from warp_resphys.experiment.pictures.laboratory import depth_image
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.bounds import Bounds, Prior
+from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
 from warp_resphys.pictures.clouds import Cloud, distances_of
 from warp_resphys.pictures.misfit import PictureMisfit, values_of

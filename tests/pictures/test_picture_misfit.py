@@ -12,8 +12,8 @@ import warp_resphys as wr
 from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.experiment.pictures.laboratory import noisy_mask
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.misfit import PictureMisfit, values_of
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
 from warp_resphys.pictures.seen import Photo, SeenPose

@@ -11,8 +11,8 @@ import torch
 import warp_resphys as wr
 from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.bounds import Bounds, Prior
 from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.clouds import Cloud
 from warp_resphys.pictures.misfit import PictureMisfit
 from warp_resphys.pictures.motion import ReleasedForce, at_own_times

@@ -367,7 +367,7 @@ def write_arm_run(
         own = {"parameters": found, "loss": 0.02, "history": history, "at_bounds": [], "uncertainty": None}
         write_json(folder / "identification.json", {"sysid": own})
     _write_trainings(folder, models)
-    write_json(folder / "reconstruction.json", {"resphys": {"mean_mm": 0.12, "max_mm": 0.61, "replayed_mm": 0.17}})
+    write_json(folder / "reconstruction.json", {"resphys": {"mean_mm": 0.12, "max_mm": 0.61}})
     _write_stages(folder, **{"import": 75.0})
 
 

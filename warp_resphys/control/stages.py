@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
-from typing_extensions import override
 
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
-from ..experiment.parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
+from ..experiment.parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import resume_checkpoint, write_checkpoint, write_json
@@ -20,7 +18,6 @@ from ..robot.loading import load
 from ..robot.robot import Robot
 from ..settings.control import ControlSettings, FigureSettings
 from ..settings.stages import BaselinesStage, DriveStage, PlanStage, ReduceStage
-from ..stepping.state import State
 from .baselines import fit_linear
 from .controllers import (
     Controller,
@@ -175,13 +172,13 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     for seconds in control.seconds:
         for name in _names(task, seconds):
             parts += split_into_parts(context, (name,), task.steps(seconds) + 1, name)
-    work_on(parts, _Drive, workers)
+    work_on(parts, _driven, workers)
     motions = {}
     for part in parts:
         (name,) = part.names
         points, inputs, took = (part.read(key) for key in ("points", "inputs", "seconds"))
         path = read_plan(context.run_dir / plans_file(control.models[-1]), name).path
-        motions[name] = DrivenMotion(path, points[:, 1:], inputs[:, 1:], took[:, 1:])
+        motions[name] = DrivenMotion(path, points, inputs, took)
     write_driven(context.run_dir / DRIVEN, controllers, robot.time_step, motions)
     write_json(context.run_dir / CONTROL, _summary(context.run_dir, control, controllers, motions))
     remove_parts(context)
@@ -220,53 +217,33 @@ def receding_controllers(
     return [*controllers, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest)]
 
 
-class _Drive(PartRollout):
-    """Drives one motion with all controllers, each on a body of its own."""
-
-    def __init__(self, part: TrialPart) -> None:
-        settings: DriveStage = part.context.settings
-        self._settings, self._folder, (self._name,) = settings, part.context.run_dir, part.names
-        control = settings.control
-        names = controllers_of(control)
-        robot = load(self._folder, control.models[-1], settings.device)
-        self._task, driven = task_of(control, robot), driven_input(robot)
-        number = motions_of(control).index(self._name)
-        self._laboratory = Laboratory(settings.played, self._folder, driven.name, len(names), number)
-        self._controllers = self._made(robot)
-        self.frames, count = part.frames, len(names)
-        self.units = {"points": "m", "inputs": driven.unit, "seconds": "s"}
-        self._inputs, self._seconds = np.zeros((count, self._task.parts)), np.zeros(count)
-
-    def _made(self, robot: Robot) -> list[Controller]:
-        control, task, folder = self._settings.control, self._task, self._folder
-        plans = {model: read_plan(folder / plans_file(model), self._name) for model in control.models}
-        rest, path = self._laboratory.rest(), plans[control.models[-1]].path
-        controllers: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
-        controllers += receding_controllers(self._settings, folder, robot, path, rest[len(controllers) :])
-        limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
-        for gain in control.feedback.gains:
-            own = rest[len(controllers)]
-            controllers.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
-        return controllers
-
-    @override
-    def begin(self) -> State:
-        return self._laboratory.state
-
-    @override
-    def step(self, number: int) -> State:
-        seen = self._laboratory.seen(number - 1)
-        commands = [
-            timed_command(controller, number - 1, seen[row]) for row, controller in enumerate(self._controllers)
-        ]
-        self._inputs, self._seconds = (np.array(column) for column in zip(*commands, strict=True))
-        self._laboratory.step(self._inputs)
-        return self._laboratory.state
-
-    @override
-    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        points = self._laboratory.markers().reshape(len(self._controllers), -1) @ self._task.tracked.T
-        return {"points": points, "inputs": self._inputs, "seconds": self._seconds}
+def _driven(part: TrialPart, report: Report) -> Arrays:
+    """One motion with all controllers, each on a body of its own: points, inputs and computing times."""
+    settings: DriveStage = part.context.settings
+    control, folder, (name,) = settings.control, part.context.run_dir, part.names
+    robot, plans = load(folder, control.models[-1], settings.device), {}
+    task, driven, count = task_of(control, robot), driven_input(robot), len(controllers_of(control))
+    laboratory = Laboratory(settings.played, folder, driven.name, count, motions_of(control).index(name))
+    plans = {model: read_plan(folder / plans_file(model), name) for model in control.models}
+    rest, path = laboratory.rest(), plans[control.models[-1]].path
+    controllers: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
+    controllers += receding_controllers(settings, folder, robot, path, rest[len(controllers) :])
+    limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
+    for gain in control.feedback.gains:
+        own = rest[len(controllers)]
+        controllers.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
+    points, inputs, seconds = list[FloatArray](), list[FloatArray](), list[FloatArray]()
+    for step in range(part.frames - 1):
+        seen = laboratory.seen(step)
+        commands = [timed_command(controller, step, seen[row]) for row, controller in enumerate(controllers)]
+        acting, took = (np.array(column) for column in zip(*commands, strict=True))
+        laboratory.step(acting)
+        points.append(laboratory.markers().reshape(count, -1) @ task.tracked.T)
+        inputs.append(acting)
+        seconds.append(took)
+        report()
+    series = (("points", points, "m"), ("inputs", inputs, driven.unit), ("seconds", seconds, "s"))
+    return {key: (np.stack(values, 1), unit) for key, values, unit in series}
 
 
 def _summary(

@@ -13,14 +13,13 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
-from typing_extensions import override
 
 from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..io.stages import Stage, StageContext, package_versions, resources_used
-from ..learning.reconstruction import make_reconstructor
+from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..report.page import number_text
 from ..settings.run import RunSettings
@@ -28,8 +27,7 @@ from ..settings.stages import AblationStage, ReportStage
 from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
-from .parts import TrialPart, remove_parts, split_into_parts, work_on, workers_for
-from .reconstruct import Reconstructing
+from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on, workers_for
 from .simulate import build_target, held_state
 
 MOTION = "motion.h5"
@@ -97,9 +95,8 @@ def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     parts = {}
     for count in sorted(counts, reverse=True):  # Longest first, to balance the load of the processes.
         (parts[count],) = split_into_parts(context, (str(count),), len(motion), f"markers_{count}", count)
-    work_on([*parts.values()], _FromMarkers, workers)
+    work_on([*parts.values()], _from_markers, workers)
     draws = {name: np.stack([parts[count].read(name) for count in counts]) for name in ("markers", "error", "misfit")}
-    draws |= {name: draws[name][..., 1:] for name in ("error", "misfit")}  # The first frame is given.
     with atomic_hdf5(context.run_dir / DRAWS, "marker ablation", {"fingerprint": context.fingerprint}) as file:
         create(file, "count", counts)
         for name, values in draws.items():
@@ -117,47 +114,33 @@ def read_motion(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]
         return read_array(file, "q"), read_array(file, "uncorrected_q")
 
 
-class _FromMarkers(Reconstructing):
+def _from_markers(part: TrialPart, report: Report) -> Arrays:
     """Reconstruction of the motion from random sets of a given number of markers.
 
-    Saves the mean distances (draws,) of all vertices and of the markers [m], and the marker sets.
+    The mean distances (draws, T) of all vertices and of the markers, and the marker sets.
     """
-
-    def __init__(self, part: TrialPart) -> None:
-        settings: AblationStage = part.context.settings
-        self._count, draws = part.more, settings.draws
-        simulator = build_simulator(settings, settings.simulation)
-        like = simulator.rest_positions
-        self._motion = simulator.tensor(read_motion(part.context.run_dir)[0])
-        self._vertices = draw_markers(simulator, self._count, draws, settings.seed)
-        self._markers = MarkerMap.at_vertices(torch.as_tensor(self._vertices, device=like.device), like.dtype)
-        more = dict(settings.reconstruction) | {"modes": settings.modes}
-        self.method = make_reconstructor(simulator, **more, observation=self._markers)
-        self.force = like.new_zeros(draws, *like.shape)
-        self._padding = max(settings.counts) - self._count
-        self.frames, self.units = len(self._motion), {"error": "m", "misfit": "m"}
-
-    @override
-    def begin(self) -> State:
-        q = self._motion[0].expand_as(self.force)
-        return State(q, torch.zeros_like(q))
-
-    @override
-    def step(self, number: int) -> State:
-        return self.bring_to(self._markers(self._motion[number].expand_as(self.force)))
-
-    @override
-    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        away = self.state.q - self._motion[number]
-        return {
-            "error": away.norm(dim=-1).mean(-1).cpu().numpy(),
-            "misfit": self._markers(away).norm(dim=-1).mean(-1).cpu().numpy(),
-        }
-
-    @override
-    def constants(self) -> dict[str, tuple[NDArray[Any], str]]:
-        sets = np.pad(self._vertices, ((0, 0), (0, self._padding)), constant_values=-1)  # -1 where a set is smaller
-        return {"markers": (sets, "1")}
+    settings: AblationStage = part.context.settings
+    count, draws = part.more, settings.draws
+    simulator = build_simulator(settings, settings.simulation)
+    motion, like = simulator.tensor(read_motion(part.context.run_dir)[0]), simulator.rest_positions
+    vertices = draw_markers(simulator, count, draws, settings.seed)
+    markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=like.device), like.dtype)
+    more = dict(settings.reconstruction) | {"modes": settings.modes}
+    method = make_reconstructor(simulator, **more, observation=markers)
+    q = motion[0].expand(draws, *like.shape)
+    error, misfit = list[torch.Tensor](), list[torch.Tensor]()
+    targets = (markers(one.expand_as(q)) for one in motion[1:])
+    report()
+    for step, wanted in zip(follow(method, State(q, torch.zeros_like(q)), targets), motion[1:], strict=True):
+        away = step.state.q - wanted
+        error.append(away.norm(dim=-1).mean(-1))
+        misfit.append(markers(away).norm(dim=-1).mean(-1))
+        report(iterations=step.iterations)
+    padding = max(settings.counts) - count
+    sets = np.pad(vertices, ((0, 0), (0, padding)), constant_values=-1)  # -1 where a set is smaller
+    distances = {"error": error, "misfit": misfit}
+    series = {name: (torch.stack(values, 1).cpu().numpy(), "m") for name, values in distances.items()}
+    return {"markers": (sets, "1"), **series}
 
 
 def draw_markers(simulator: Simulator, count: int, draws: int, seed: int) -> NDArray[np.int64]:

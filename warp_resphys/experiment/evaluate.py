@@ -20,14 +20,12 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
-from ..learning.replay import Start
 from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
-from ..stepping.state import State
 from .build import finer
 from .experiment import LEARNED, Experiment
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
-from .parts import TrialPart, padded, remove_parts, split_into_parts, work_on
+from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
 from .without_physics import without_physics
 
@@ -53,7 +51,8 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     order = [*chain(*experiment.batches(names))]
     rows = [order.index(name) for name in names]
     observed, plain = without_physics(experiment, names)
-    observed |= {model: _all_observed(experiment, model, its_parts)[rows] for model, its_parts in parts.items()}
+    frames = experiment.dataset.observed.shape[1]
+    observed |= {model: read_parts(its_parts, "observed", frames)[rows] for model, its_parts in parts.items()}
     test = settings.groups["1"]
     linear = linearised(experiment, test)
     spreads = spreads_of(experiment, test, linear)
@@ -64,14 +63,14 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
             create(file, f"{model}_observed", values, "m", time_axis=1)
             if model not in parts:
                 continue
-            bodies = next(part.read("film")[0] for part in parts[model] if filmed in part.names)
+            bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
             substeps = round(settings.time_step / experiment.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
         for model, spread in spreads.items():
             create(file, f"{model}_spread", spread, "m^2", time_axis=1)
     left = {
-        model: np.concatenate([part.read("left")[:, -1] for part in its_parts])[rows]
+        model: np.concatenate([part.read("left") for part in its_parts])[rows]
         for model, its_parts in parts.items()
         if model in LEARNED and settings.range_guard
     }
@@ -79,7 +78,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     errors |= remaining(experiment, test, linear, observed)
     if settings.calibration:
         calibrated = [*chain(*experiment.batches(settings.calibration))]
-        known = {model: _all_observed(experiment, model, own) for model, own in calibrating.items()}
+        known = {model: read_parts(own, "observed", frames) for model, own in calibrating.items()}
         errors |= intervals_of(experiment, calibrated, known, observed, spreads)
     write_json(context.run_dir / ERRORS, errors)
     remove_parts(context)
@@ -106,25 +105,25 @@ def _parts(
     return parts
 
 
-def _all_observed(experiment: Experiment, model: str, parts: Sequence[TrialPart]) -> FloatArray:
-    """(R, T, M, 3) observed points of a model's roll-outs [m], in the order of the parts."""
-    return padded([_observed(experiment, model, part) for part in parts], experiment.dataset.observed.shape[1])
-
-
-def _rolled_out(part: TrialPart) -> ModelRollout:
-    """Makes the roll-out of a part."""
+def _rolled_out(part: TrialPart, report: Report) -> Arrays:
+    """Roll-outs by a model: points at the frames, steps at which trials left the training range, filmed vertices."""
     experiment = Experiment(part.context.settings, part.context.run_dir, "count")
     model, filmed = part.more
-    return ModelRollout(experiment, model, part.names, learned_of(experiment, model), filmed=filmed)
-
-
-def _observed(experiment: Experiment, model: str, part: TrialPart) -> FloatArray:
-    """(R, T, M, 3) observed points of a part's roll-outs at the frames of the trials [m]."""
-    series, delay, shift = (torch.from_numpy(part.read(name)) for name in ("points", "delay", "shift"))
-    replay = experiment.replay(experiment.model_simulator(model), part.names)
-    start = Start(State(series[:, 0], series[:, 0]), delay, shift).to(replay.trials.observed)
-    series = (series[:, -1:] if replay.is_static else series).to(replay.trials.observed)
-    return np.asarray(replay.at_frames(series, start).cpu().numpy())
+    run, points, bodies = ModelRollout(experiment, model, part.names), list[torch.Tensor](), list[torch.Tensor]()
+    predictor = run.predictor(learned_of(experiment, model))
+    for state, lost in run.roll(predictor):
+        points.append(run.points(state, lost))
+        bodies += [
+            torch.where(lost[row], torch.nan, state.q[row]).float()
+            for row, name in enumerate(part.names)
+            if name == filmed
+        ]
+        report()
+    arrays: dict[str, tuple[NDArray[Any], str]] = {"observed": (run.at_frames(points), "m")}
+    if predictor is not None:
+        left = predictor.left_at
+        arrays["left"] = (np.full(len(part.names), -1) if left is None else left.cpu().numpy(), "1")
+    return arrays | ({"film": (torch.stack(bodies).cpu().numpy(), "m")} if bodies else {})
 
 
 def _film_trial(experiment: Experiment, names: Sequence[str]) -> str:
@@ -319,16 +318,20 @@ def time_models(context: StageContext) -> None:
     steps = 0
     with Progress(context.name, len(rows) * len(names), "trials") as progress, torch.no_grad():
         for row, (model, network, stepping) in rows.items():
-            runs = [ModelRollout(experiment, model, [name], network, starts[name], stepping) for name in names]
+            runs = [ModelRollout(experiment, model, [name], starts[name], stepping) for name in names]
             seconds = []
             for number, run in enumerate((runs[0], *runs)):
-                state, steps = run.begin(), min(run.frames - 1, _WARM_UP) if number == 0 else run.frames - 1
-                predictor, before = run.predictor, time.perf_counter()
+                steps = min(run.steps, _WARM_UP) if number == 0 else run.steps
+                predictor = run.predictor(network)
+                state = run.begin(predictor)
+                rolled = run.roll(predictor)
+                next(rolled)
+                before = time.perf_counter()
                 for step in range(steps):
                     if row == "inference" and predictor is not None:
                         predictor(state, step)
                     else:
-                        state = run.rollout.step(state)
+                        next(rolled)
                 seconds.append(time.perf_counter() - before)
             progress.advance(len(names))
             times[row] = {"mean": mean(seconds[1:]), "std": pstdev(seconds[1:])}

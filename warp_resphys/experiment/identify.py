@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,12 @@ from ..io.errors import ConvergenceError
 from ..io.files import resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.bounds import Bounds, Prior
-from ..learning.identification import Identifier, ParameterSearch
-from ..learning.parameters import configured_parameters, own_name, split_name
+from ..learning.identification import ParameterSearch
+from ..learning.misfit import Misfit
+from ..learning.parameters import Bounds, Prior, configured_parameters, own_name, split_name
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
-from ..settings.learning import IdentifySettings, RangeSettings
+from ..settings.learning import IdentifySettings, LawSettings, RangeSettings
 from ..settings.stages import IdentifyStage
 from .experiment import MODELS, Experiment
 from .files import IDENTIFICATION, RESTING
@@ -32,6 +31,8 @@ ELASTIC = ("youngs_modulus", "poissons_ratio")
 _MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
 
 Replays = Sequence[tuple[Replay, Start]]
+Found = dict[str, Any]  # an `Identification` as plain data
+IsLast = Callable[[float], bool]
 
 
 def identify(context: StageContext) -> None:
@@ -44,53 +45,71 @@ def identify(context: StageContext) -> None:
     """
     settings: IdentifyStage = context.settings
     wanted, names = settings.identify, settings.split.train
-    experiment = Experiment(settings, context.run_dir)
+    experiment, kept = Experiment(settings, context.run_dir), Checkpoint(context)
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-    ranges = {model: _bounds(experiment, search, names) for model, search in searches.items() if search}
-    kinds = {model: MODELS[model][0] for model in ranges}
+    searches = {model: search for model, search in searches.items() if search}
     released = any(experiment.begins(name) == "released" for name in names)
-    evaluations = len(ranges) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
-    parts = (*ranges, *(again for model in ranges for again in again_of(model)))
-    kept = {part: Checkpoint(context, part) for part in parts}
-    done = sum(part.evaluations for part in kept.values())
-    identified, replays = {}, {}
-    with Progress(context.name, evaluations, "evaluations at most", done) as progress:
-        for model, bounds in ranges.items():
-            replays[model] = experiment.replays(experiment.simulator(kinds[model]), names)
-            nuisances = _nuisances(experiment) | (_placement(experiment) if model == "sysid" else {})
-            identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
-            known = configured_parameters(experiment.simulator(kinds[model]), [split_name(name)[0] for name in bounds])
-            guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
-            arguments = wanted, settings.seed, identifier, guess, kept[model], progress, wanted.starts
-            found = search_parameters(*arguments, is_last=lambda loss: not released)
-            history = [[*records] for records in found["history"]]
-            best = min((records for records in history if records), key=lambda own: min(one["loss"] for one in own))
-            for again in again_of(model) if released else ():  # The starts were estimated with other parameters.
-                values, before = found["parameters"], found["loss"]
-                is_last = partial(_ends, before, again == again_of(model)[-1])
-                replays[model] = [(own, experiment.start(own, parameters=values)) for own, _ in replays[model]]
-                identifier = Identifier(replays[model], bounds, _seconds(settings, replays[model]), **nuisances)
-                arguments = wanted, settings.seed, identifier, values, kept[again], progress, 1
-                found = search_parameters(*arguments, is_last=is_last)
-                best.extend(found["history"][0])
-                if is_last(found["loss"]):
-                    break
-            if sessions := (found["placement"] or {}).get("sessions"):
-                like = torch.zeros(len(experiment.dataset.labels), 3, dtype=torch.float64)
-                expected = nuisances["accuracy"].of_new_session(like, len(sessions)).tolist()
-                found = {**found, "placement": {**found["placement"], "new_session": expected}}
-            identified[model] = _separated(found, searches[model]) | {"history": history, "first_guess": guess}
+    evaluations = len(searches) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
+    with Progress(context.name, evaluations, "evaluations at most", kept.evaluations) as progress:
+        identified = {
+            model: _identified(experiment, model, search, names, released, kept, progress)
+            for model, search in searches.items()
+        }
     write_json(context.run_dir / IDENTIFICATION, identified)
-    for model in ranges:  # First frames are compared with the identified simulator, as later stages read it.
-        values, deviations = _of_first_frames(experiment, model, searches[model], names)
+    for (
+        model,
+        search,
+    ) in searches.items():  # First frames are compared with the identified simulator, as it was written.
+        values, deviations = _of_first_frames(experiment, model, search, names)
         if values:
             own = {"own": identified[model]["own"] | values}
             own["own_deviation"] = identified[model].get("own_deviation", {}) | deviations
             identified[model] = identified[model] | own
     write_json(context.run_dir / IDENTIFICATION, identified)
-    for part in kept.values():
-        part.path.unlink(missing_ok=True)
+    kept.path.unlink(missing_ok=True)
+
+
+def _identified(
+    experiment: Experiment,
+    model: str,
+    search: Mapping[str, RangeSettings],
+    names: Sequence[str],
+    released: bool,
+    kept: "Checkpoint",
+    progress: Progress,
+) -> dict[str, Any]:
+    """Identifies the parameters of a model; returns its content of identification.json."""
+    settings = experiment.settings
+    assert isinstance(settings, IdentifyStage)
+    wanted, simulator = settings.identify, experiment.simulator(MODELS[model][0])
+    bounds, replays = _bounds(experiment, search, names), experiment.replays(simulator, names)
+    nuisances = _nuisances(experiment, placed=model == "sysid")
+    known = configured_parameters(simulator, [split_name(name)[0] for name in bounds])
+    guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
+
+    def searched(number: int, before: Found | None, is_last: IsLast) -> Found:
+        def work() -> Found:
+            first, begins, many = guess, replays, dict[str, int]()
+            if before is None:
+                many = {"count": wanted.starts, "candidates": wanted.candidates, "seed": settings.seed}
+            else:
+                first = before["parameters"]
+                begins = [(own, experiment.start(own, parameters=first)) for own, _ in replays]
+            misfit = Misfit(begins, bounds, _seconds(settings, begins), **nuisances)
+            return search_parameters(ParameterSearch(misfit), first, wanted, progress, is_last, **many)
+
+        return dict(kept.once(f"{model} {number}", work))
+
+    rounds = refined_searches(searched, released)
+    found, history = rounds[-1], [[*records] for records in rounds[0]["history"]]
+    best = min((records for records in history if records), key=lambda own: min(one["loss"] for one in own))
+    best.extend(record for own in rounds[1:] for record in own["history"][0])
+    if sessions := (found["placement"] or {}).get("sessions"):
+        like = torch.zeros(len(experiment.dataset.labels), 3, dtype=torch.float64)
+        expected = nuisances["accuracy"].of_new_session(like, len(sessions)).tolist()
+        found = {**found, "placement": {**found["placement"], "new_session": expected}}
+    return _separated(found, search) | {"history": history, "first_guess": guess}
 
 
 def _bounds(experiment: Experiment, search: Mapping[str, RangeSettings], names: Sequence[str]) -> dict[str, Bounds]:
@@ -156,8 +175,8 @@ def _of_first_frames(
         guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
         try:
             replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
-            identifier = Identifier(replays, bounds, settings.release.window, known=known, **_nuisances(experiment))
-            result = identifier.run([guess], settings.identify.max_evaluations)
+            misfit = Misfit(replays, bounds, settings.release.window, known=known, **_nuisances(experiment))
+            result = ParameterSearch(misfit).run([guess], settings.identify.max_evaluations)
         except ConvergenceError as error:
             log.warning("identify: the first frames of %s show none of its own values: %s", name, error)
             continue
@@ -172,61 +191,64 @@ def bounds_of(settings: RangeSettings) -> Bounds:
     return Bounds(settings.lower, settings.upper, settings.logarithmic, prior)
 
 
-def _nuisances(experiment: Experiment) -> dict[str, Any]:
-    """Arguments of an `Identifier`: delays of the trials, and which observed coordinates are independent."""
+def _nuisances(experiment: Experiment, placed: bool = False) -> dict[str, Any]:
+    """Arguments of a `Misfit`: delays, which observed coordinates are independent, and how markers may be placed."""
     settings = experiment.settings
     assert isinstance(settings, IdentifyStage)
-    return {"delay": settings.release.delay, "shares": independent(experiment.dataset.labels)}
-
-
-def _placement(experiment: Experiment) -> dict[str, Any]:
-    """Arguments of an `Identifier` to estimate the placement of the markers; empty if it is not to be estimated."""
-    settings = experiment.settings
-    assert isinstance(settings, IdentifyStage)
+    labels, bound = experiment.dataset.labels, experiment.dataset.bound
+    result: dict[str, Any] = {"delay": settings.release.delay, "shares": independent(labels)}
     wanted, markers = settings.identify.placement, settings.markers
-    if wanted is None or markers is None:
-        return {}
+    if not placed or wanted is None or markers is None:
+        return result
     turn, mounting = (None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting))
     standing = [*markers.reference.values()] or [*markers.tracked.values()]
-    labels, bound = experiment.dataset.labels, experiment.dataset.bound
     assert bound is not None
     bodies = tuple((own.start, bound[own] - bound[own].mean(axis=0)) for own in corners_of(labels).values())
     accuracy = Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies)
-    return {"accuracy": accuracy, "labels": labels, "centre": np.mean(standing, axis=0).tolist()}
+    return result | {"accuracy": accuracy, "labels": labels, "centre": np.mean(standing, axis=0).tolist()}
 
 
-def again_of(key: str) -> list[str]:
-    """Keys of the searches after a release was estimated again."""
-    return [f"{key}_again_{number}" for number in range(1, _MOST_AGAIN + 1)]
+def refined_searches(search: Callable[[int, Found | None, IsLast], Found], released: bool) -> list[Found]:
+    """Returns the results of a search, and of those with releases that are estimated again with the last result.
 
+    They end when the loss changes by less than 2 %.
 
-def changes(before: float, after: float) -> bool:
-    """Whether a loss still changes from one estimation of a release to the next."""
-    return not _UNCHANGED < after / max(before, 1e-300) < 1.0 / _UNCHANGED
+    Args:
+        search: of its number, the last result, None at first, and whether it is the last one with some loss.
+        released: whether there are released trials.
+    """
+    results = [search(0, None, lambda loss: not released)]
+    for number in range(1, _MOST_AGAIN + 1) if released else ():
+        before = max(results[-1]["loss"], 1e-300)
 
+        def ends(after: float, before: float = before, number: int = number) -> bool:
+            return number == _MOST_AGAIN or _UNCHANGED < after / before < 1.0 / _UNCHANGED
 
-def _ends(before: float, is_last: bool, after: float) -> bool:
-    """Whether no estimation of a release follows, after the last one or where the loss does not change any more."""
-    return is_last or not changes(before, after)
+        results.append(search(number, results[-1], ends))
+        if ends(results[-1]["loss"]):
+            break
+    return results
 
 
 class Checkpoint:
-    """Checkpoint of the finished work of a part, deleted at the end of the stage; ignored if the settings changed."""
+    """Finished parts of the work of a stage, in a file that is ignored if the settings changed."""
 
-    def __init__(self, context: StageContext, part: str) -> None:
-        self.path, self._fingerprint = context.run_dir / f"identify_{part}.safetensors", context.fingerprint
-        checkpoint = resume_checkpoint(self.path, "identify", context.fingerprint)
-        self.content: dict[str, Any] = {} if checkpoint is None else checkpoint[1]
+    def __init__(self, context: StageContext) -> None:
+        self.path, self._fingerprint = context.run_dir / f"{context.name}_parts.safetensors", context.fingerprint
+        checkpoint = resume_checkpoint(self.path, "parts", context.fingerprint)
+        self.parts: dict[str, Any] = {} if checkpoint is None else checkpoint[1]["parts"]
 
-    def keep(self, **content: Any) -> None:
-        """Adds finished work."""
-        self.content |= {"fingerprint": self._fingerprint, **content}
-        write_checkpoint(self.path, "identify", {}, self.content)
+    def once(self, key: str, work: Callable[[], Any]) -> Any:
+        """Returns the result of a part, as JSON data, which is worked on unless it was finished before."""
+        if key not in self.parts:
+            self.parts = {**self.parts, key: work()}
+            write_checkpoint(self.path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self.parts})
+        return self.parts[key]
 
     @property
     def evaluations(self) -> int:
-        """Number of evaluations of a finished search."""
-        return sum(map(len, self.content["found"]["history"])) if "found" in self.content else 0
+        """Number of evaluations of finished searches."""
+        return sum(len(records) for found in self.parts.values() for records in found["history"])
 
 
 def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
@@ -238,38 +260,34 @@ def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
 
 
 def search_parameters(
-    wanted: IdentifySettings,
-    seed: int,
     search: ParameterSearch,
     guess: Mapping[str, float],
-    kept: Checkpoint,
+    wanted: IdentifySettings | LawSettings,
     progress: Progress,
-    count: int,
-    is_last: Callable[[float], bool] = lambda loss: True,
-) -> dict[str, Any]:
-    """Returns the `Identification` of a search, as plain data, unless it was finished before.
+    is_last: IsLast = lambda loss: True,
+    count: int = 1,
+    candidates: int = 0,
+    seed: int = 0,
+) -> Found:
+    """Returns the `Identification` of a search, as plain data.
 
     Args:
-        wanted: its settings.
-        seed: of the random candidates.
         search: the search.
         guess: first guess of each parameter.
-        kept: finished search.
+        wanted: evaluations and tolerance.
         progress: advanced by every evaluation.
-        count: number of starts.
         is_last: see `ParameterSearch.run`.
+        count: number of starts.
+        candidates: see `ParameterSearch.starts`.
+        seed: of these.
 
     Raises:
         ConvergenceError: the simulation fails at every start.
     """
-    if "found" in kept.content:
-        return dict(kept.content["found"])
 
     def report(start: int, loss: float, values: Mapping[str, float]) -> None:
         name, value = next(iter(values.items()))
         progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
 
-    starts = search.starts(guess, count, wanted.candidates, seed)
-    found = search.run(starts, wanted.max_evaluations, report, wanted.tolerance, is_last)
-    kept.keep(found=asdict(found))
-    return dict(kept.content["found"])
+    starts = search.starts(guess, count, candidates, seed)
+    return asdict(search.run(starts, wanted.max_evaluations, report, wanted.tolerance, is_last))

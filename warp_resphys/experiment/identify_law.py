@@ -22,15 +22,16 @@ from ..energies.catalogue import LAW_FORMAT, read_law, unit_of
 from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions
-from ..learning.bounds import Bounds
-from ..learning.identification import Identifier
-from ..learning.law import VISCOSITIES, LawClass, Library, fit_classes
+from ..learning.identification import ParameterSearch
+from ..learning.law import VISCOSITIES, LawClass, fit_classes
+from ..learning.misfit import Misfit
+from ..learning.parameters import Bounds
 from ..learning.replay import Replay
 from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.stages import IdentifyLawStage
 from .experiment import LAW, Experiment
 from .files import LAW_FILE
-from .identify import Checkpoint, again_of, changes
+from .identify import Checkpoint, Found, IsLast, refined_searches, search_parameters
 from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names
 from .trials import evenly
 
@@ -59,23 +60,13 @@ def identify_law(context: StageContext) -> None:
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Result of a search."""
-
-    parameters: dict[str, float]
-    loss: float
-    at_bounds: Sequence[str]  # parameters that ended on a bound
-    deviation: dict[str, float]  # standard deviations; empty if they are not known
-
-
-@dataclass(frozen=True)
 class _Refined:
     """A law that is refined through the simulator."""
 
     law: LawClass
     others: dict[str, float]  # identified parameters that are not those of the material
     names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
-    found: _Found
+    found: Found
     score: Score  # on the validation trials
 
 
@@ -84,7 +75,7 @@ class _LawSearch:
 
     def __init__(self, context: StageContext, experiment: Experiment) -> None:
         self.context, self.experiment, self.trials = context, experiment, LawTrials(experiment)
-        self.kept = Checkpoint(context, "law")
+        self.kept = Checkpoint(context)
         self.settings: IdentifyLawStage = context.settings
         self.released = any(experiment.begins(name) == "released" for name in self.settings.split.train)
 
@@ -95,22 +86,14 @@ class _LawSearch:
 
     def run(self) -> dict[str, Any]:
         """Identifies a law; returns the content of law.json."""
-        wanted = self.settings.law
-        shortest, longest = wanted.relaxation_times
-        library = Library(
-            terms=tuple(wanted.terms),
-            times=tuple(np.geomspace(shortest, longest, wanted.branches).tolist()),
-            families=wanted.families,
-        )
         if self.trials.states:
-            if "classes" not in self.kept.content:
-                self.kept.keep(classes=[asdict(own) for own in self._from_states(library)])
-            classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in self.kept.content["classes"]]
+            fitted = self.kept.once("classes", lambda: [asdict(own) for own in self._from_states()])
+            classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in fitted]
             scores = [score.error for score in self.trials.scores([law.constants for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
-            refined = self._from_markers(library)
+            refined = self._from_markers()
             classes, scores = [own.law for own in refined], [own.score.error for own in refined]
             best = refined[-1]
         if self.trials.holds_out:
@@ -118,7 +101,7 @@ class _LawSearch:
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
         mass = {name: best.others.get(name, value) for name, value in self.trials.mass.items()}
         constants = mass | best.law.constants
-        below, deviation = self.trials.score_below(), best.found.deviation
+        below, deviation = self.trials.score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
             "format": LAW_FORMAT,
@@ -129,8 +112,8 @@ class _LawSearch:
             "units": {name: unit_of(name) for name in constants},
             "parameters": best.others,
             "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
-            "at_bounds": [name for name, old in best.names.items() if old in best.found.at_bounds],
-            "loss": best.found.loss,
+            "at_bounds": [name for name, old in best.names.items() if old in best.found["at_bounds"]],
+            "loss": best.found["loss"],
             "validation": self.trials.validation(best.score, below),
             "classes": tried,
             "stretches": self._stretches(best),
@@ -143,10 +126,10 @@ class _LawSearch:
         content = read_law(file)
         content["constants"] |= self.trials.mass  # density and damping by mass are those of this body
         simulator = self.trials.simulator(content["constants"], content["model"])
-        others, found = dict[str, float](), None
+        others, found = dict[str, float](), Found()
         if bounds := self.trials.bounds_of_others(simulator):
             found = self._search("given", simulator, bounds, {})
-            others = found.parameters
+            others = found["parameters"]
         values = {name: simulator.tensor([value]) for name, value in others.items()}
         score = self.trials.errors(simulator, values, 1)[0]
         return {
@@ -155,8 +138,8 @@ class _LawSearch:
             "accepted_there": content.get("accepted_there", content.get("accepted", True)),
             "file": file,
             "parameters": others,
-            "deviation": content.get("deviation", {}) | ({} if found is None else found.deviation),
-            "at_bounds": [*content.get("at_bounds", ()), *(() if found is None else found.at_bounds)],
+            "deviation": content.get("deviation", {}) | _deviation(found),
+            "at_bounds": [*content.get("at_bounds", ()), *found.get("at_bounds", ())],
             "validation": self.trials.validation(score, self.trials.score_below()),
         }
 
@@ -176,18 +159,19 @@ class _LawSearch:
         values = {name: simulator.tensor([value]) for name, value in best.others.items()}
         return stretches_of(self.experiment, self.trials.replays(simulator, self._names(whole=True)), values)
 
-    def _from_states(self, library: Library) -> list[LawClass]:
+    def _from_states(self) -> list[LawClass]:
         """Returns the classes of the weak form."""
-        zero = dict.fromkeys((*library.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
+        wanted, forms = self.settings.law, []
+        times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
+        zero = dict.fromkeys((*wanted.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
         zero |= branches_of([0.0], [0.1]) | _family(0.0)
         simulator, guess = self.trials.simulator(zero), self.trials.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
-        forms = []
         for names in (self.settings.split.train, self.settings.split.validation):
             motions = [self._motion(simulator, own) for own in self.experiment.batches(names)] if names else []
             forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
         assert forms[0] is not None
-        return fit_classes(forms[0], forms[1], library)
+        return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
 
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         trials = self.experiment.trials(names, simulator)
@@ -195,22 +179,22 @@ class _LawSearch:
         _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self.trials.others(simulator))
         return KnownMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
 
-    def _from_markers(self, library: Library) -> list["_Refined"]:
+    def _from_markers(self) -> list["_Refined"]:
         """Returns the classes that were tried through the simulator, the best last.
 
         The search begins with all groups of terms, and takes away those without which validation trials are as close:
         a class that lacks a group makes up for it with others, from where the group no longer helps.
         """
-        guess = dict(self.trials.guess)
+        guess, wanted = dict(self.trials.guess), self.settings.law
         own = {name: value for name, value in guess.items() if name.startswith("prony")}
         known = [value for name, value in own.items() if name.startswith("prony_time")]
-        shortest, longest = self.settings.law.relaxation_times
-        middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: len(library.times)]
+        shortest, longest = wanted.relaxation_times
+        middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
         times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
         groups = {
-            "elastic": dict.fromkeys(library.terms, 0.0),
+            "elastic": dict.fromkeys(wanted.terms, 0.0),
             "branches": branches_of([0.1 * self.trials.shear] * len(times), times, len(known) + 1),
-            "fibres": _family(0.3 * self.trials.shear, self._longest_side()) if library.families else {},
+            "fibres": _family(0.3 * self.trials.shear, self._longest_side()) if wanted.families else {},
         }
         groups = {name: added for name, added in groups.items() if added}
         guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.trials.shear)
@@ -218,7 +202,7 @@ class _LawSearch:
         best = self._refine(LawClass(tuple(groups), guess | whole, math.nan))
         tried = [best]
         for name in groups:
-            left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, library.terms))}
+            left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
             if name == "branches":
                 left |= own
             if name == "elastic":  # They may have been all that resists shear.
@@ -250,18 +234,19 @@ class _LawSearch:
         others = self.trials.bounds_of_others(simulator)
         bounds = {name: self.trials.bounds(name, value) for name, value in guess.items() if is_refined(name)} | others
         key = " ".join([*law.groups, *(["whole"] if whole else [])])
-        found = self._search(key, simulator, bounds, guess)
-        for again in again_of(key) if self.released else ():  # The release was estimated with another law.
-            guess |= {name: value for name, value in found.parameters.items() if name in guess}
-            before = found.loss
-            found = self._search(again, self.trials.simulator(guess), bounds, guess, found.parameters)
-            if not changes(before, found.loss):
-                break
-        refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
+
+        def searched(number: int, before: Found | None, is_last: IsLast) -> Found:
+            first = {} if before is None else before["parameters"]
+            own = guess | {name: value for name, value in first.items() if name in guess}
+            return self._search(f"{key} {number}", self.trials.simulator(own), bounds, first | own, is_last)
+
+        found = refined_searches(searched, self.released)[-1]  # A release is estimated with a law.
+        after = found["parameters"]
+        refined = {name: after.get(name, value) for name, value in guess.items()}
         names = strong_names(refined, self.trials.shear)
-        kept, after = ({n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others})
-        score = self.trials.scores([kept], after)[0]
-        return _Refined(replace(law, constants=kept), after, {**names, **{n: n for n in others}}, found, score)
+        kept, beside = {n: refined[old] for n, old in names.items()}, {n: after[n] for n in others}
+        score = self.trials.scores([kept], beside)[0]
+        return _Refined(replace(law, constants=kept), beside, {**names, **{n: n for n in others}}, found, score)
 
     def _search(
         self,
@@ -269,42 +254,38 @@ class _LawSearch:
         simulator: Simulator,
         bounds: Mapping[str, Bounds],
         guess: Mapping[str, float],
-        others: Mapping[str, float] | None = None,
-    ) -> _Found:
+        is_last: IsLast = lambda loss: True,
+    ) -> Found:
         """Returns the parameters that are closest to the training trials, from a guess and SysID's values.
 
         Args:
             key: of the checkpoint.
             simulator: with a law.
             bounds: of the parameters.
-            guess: of the constants of the law that are among them.
-            others: guess of the other ones, in place of SysID's values.
+            guess: of some of them, in place of SysID's values.
+            is_last: see `ParameterSearch.run`.
         """
-        wanted, finished = self.settings.law, self.kept.content.get("searches", {})
-        if key in finished:
-            return _Found(**finished[key])
-        whole, given = "whole" in key, key == "given"
+        wanted, whole, given = self.settings.law, "whole" in key, key == "given"
         limits = (
             self.trials.seconds,
             None if whole else wanted.seconds,
             None if whole or given else self.trials.early,
         )
-        seconds = min((limit for limit in limits if limit is not None), default=None)
-        shares = independent(self.experiment.dataset.labels)
-        replays = self.trials.replays(simulator, self._names(whole or given))
-        identifier = Identifier(replays, bounds, seconds, shares=shares)
-        with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
 
-            def report(_: int, loss: float, values: Mapping[str, float]) -> None:
-                name, value = next(iter(values.items()))
-                progress.advance(1, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
+        def work() -> Found:
+            seconds = min((limit for limit in limits if limit is not None), default=None)
+            replays = self.trials.replays(simulator, self._names(whole or given))
+            misfit = Misfit(replays, bounds, seconds, shares=independent(self.experiment.dataset.labels))
+            first = {name: {**self.trials.sysid, **guess}[name] for name in bounds}
+            with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
+                return search_parameters(ParameterSearch(misfit), first, wanted, progress, is_last)
 
-            start = {name: {**self.trials.sysid, **(others or {}), **guess}[name] for name in bounds}
-            best = identifier.run([start], wanted.max_evaluations, report, wanted.tolerance)
-        deviation = {} if best.uncertainty is None else best.uncertainty.deviation
-        found = _Found(best.parameters, best.loss, best.at_bounds, deviation)
-        self.kept.keep(searches={**finished, key: asdict(found)})
-        return found
+        return dict(self.kept.once(key, work))
+
+
+def _deviation(found: Found) -> dict[str, float]:
+    """Standard deviations of identified parameters; empty if they are not known."""
+    return dict((found.get("uncertainty") or {}).get("deviation", {}))
 
 
 def _refined_groups(law: LawClass) -> set[str]:

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from typing_extensions import override
 
 from ..data.actuation import InputSequences, InputWaves
 from ..data.base_motion import in_frame, rigid
@@ -22,7 +21,7 @@ from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
 from ..data.rigid import RigidTransform
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
-from ..dynamics.simulator import Simulator
+from ..dynamics.simulator import Constants, Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.stages import StageContext
@@ -35,7 +34,7 @@ from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
-from .parts import PartRollout, TrialPart, remove_parts, split_into_parts, work_on
+from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from .recordings.reading import vertical
 from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of, substeps_of, target_settings
 
@@ -97,7 +96,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
         parts += split_into_parts(context, names, _frame_count(settings, begins), begins, batch=settings.batch)
-    work_on(parts, _Played, workers)
+    work_on(parts, _played, workers)
     setup = make_setup(settings)
     markers = {name: row for part in parts for name, row in zip(part.names, part.read("markers"), strict=True)}
     noise = [_record(context, setup, trial, markers[trial.name]) for trial in trials]
@@ -275,80 +274,69 @@ def _frame_count(settings: PlayedSettings, begins: str) -> int:
     return max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
 
 
-class _Played(PartRollout):
-    """Roll-out of bodies in the laboratory: released, driven by their inputs, or in a static pose.
+def _played(part: TrialPart, report: Report) -> Arrays:
+    """Tracked markers of bodies in the laboratory in the frame of the body: released, driven, or in a static pose.
 
-    Saves the tracked markers in the frame of the body: at every step of released bodies, from time zero on, and at the
-    frames of driven bodies, with several steps from frame to frame.
+    At every step of released bodies, from time zero on, and at the frames of driven bodies, with several steps from
+    frame to frame.
     """
+    settings: LaboratoryStage = part.context.settings
+    setup, binding = make_setup(settings), settings.binding
+    simulator = laboratory_simulator(settings, setup.gravity)
+    by_name, constants = {trial.name: trial for trial in settings.trials}, simulator.prepare()
+    trials = [by_name[name] for name in part.names]
+    begins, released = trials[0].begins, trials[0].is_released
+    substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
+    markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed)
+    markers = markers.to(simulator.rest_positions)
+    payload = np.array([trial.payload for trial in trials])
+    hung = payload_inputs(simulator.body, settings.payload_at, payload)
+    weights = Inputs(**{key: simulator.tensor(masses) for key, masses in hung.items()} if payload.any() else {})
+    driven: torch.Tensor | None = None
+    quantity = driving_quantity(settings.laboratory)
+    if all(trial.is_driven for trial in trials) and quantity is not None:
+        driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in trials]))
+    common, times = settings.data.base_motion, simulator.time_step * np.arange((part.frames - 1) * substeps + 1)
+    moved = contact_series(simulator, settings.data.obstacle_motion, trials, times)
+    fixed: list[torch.Tensor] | None = None
+    if common is not None or any(trial.base_motion is not None for trial in trials):
+        poses = [base_of(common, trial, times[1:]) for trial in trials]
+        fixed = fixed_positions(simulator, np.stack(poses, axis=1))
 
-    def __init__(self, part: TrialPart) -> None:
-        settings: LaboratoryStage = part.context.settings
-        setup, binding = make_setup(settings), settings.binding
-        simulator = self._simulator = laboratory_simulator(settings, setup.gravity)
-        self._constants = simulator.prepare()
-        by_name = {trial.name: trial for trial in settings.trials}
-        self._trials = [by_name[name] for name in part.names]
-        self._tip, released = settings.tip, self._trials[0].is_released
-        self._substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
-        markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed)
-        self._markers = markers.to(simulator.rest_positions)
-        payload = np.array([trial.payload for trial in self._trials])
-        hung = payload_inputs(simulator.body, settings.payload_at, payload)
-        self._payload = Inputs(
-            **{key: simulator.tensor(masses) for key, masses in hung.items()} if payload.any() else {}
-        )
-        self._driven: torch.Tensor | None = None
-        quantity = driving_quantity(settings.laboratory)
-        if all(trial.is_driven for trial in self._trials) and quantity is not None:
-            self._driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in self._trials]))
-            self._name = quantity.name
-        self.frames, self.units = part.frames, {"markers": "m"}
-        self._fixed: list[torch.Tensor] | None = None
-        common = settings.data.base_motion
-        times = simulator.time_step * np.arange((part.frames - 1) * self._substeps + 1)
-        self._moved = contact_series(simulator, settings.data.obstacle_motion, self._trials, times)
-        if common is not None or any(trial.base_motion is not None for trial in self._trials):
-            poses = [base_of(common, trial, times[1:]) for trial in self._trials]
-            self._fixed = fixed_positions(simulator, np.stack(poses, axis=1))
-
-    def _inputs(self, frame: int, share: float = 0.0) -> Inputs:
+    def inputs_at(frame: int, share: float = 0.0) -> Inputs:
         """Inputs at a share of the time from a frame to the next, interpolated linearly."""
-        if self._driven is None:
-            return self._payload
-        before, after = self._driven[:, frame], self._driven[:, frame + (share > 0.0)]
-        return self._payload.replace(**{self._name: torch.lerp(before, after, share)})
+        if driven is None:
+            return weights
+        assert quantity is not None
+        before, after = driven[:, frame], driven[:, frame + (share > 0.0)]
+        return weights.replace(**{quantity.name: torch.lerp(before, after, share)})
 
-    @override
-    def begin(self) -> State:
-        """Returns held bodies undeformed or pulled at the tip, other bodies in equilibrium with their inputs."""
-        simulator, batch = self._simulator, len(self._trials)
-        if not self._trials[0].is_released:
-            return simulator.static_equilibrium(self._inputs(0), self._constants, batch=batch)
-        pulls = np.array([trial.pull or (0.0, 0.0, 0.0) for trial in self._trials])
-        if not any(trial.pull for trial in self._trials):
-            return simulator.rest_state(batch)
-        tip = select_vertices(simulator.body.mesh, **self._tip.arguments())
-        force = distributed(simulator, tip, simulator.tensor(pulls))
-        held = simulator.static_equilibrium(self._inputs(0).plus(force), self._constants)
-        return State(held.q, torch.zeros_like(held.q))
-
-    @override
-    def step(self, number: int) -> State:
-        state, begins = self.state, self._trials[0].begins
-        if begins == STATIC:
-            return state
-        for i in range(1, self._substeps + 1):
+    state = _beginning(simulator, settings, trials, inputs_at(0), constants)
+    seen = [markers(state.q)]
+    report()
+    for number in range(part.frames - 1):
+        for i in range(1, 1 + (0 if begins == STATIC else substeps)):
             # Inputs are taken at the end of a substep, or in its middle.
-            share = (i - 0.5 * (self._simulator.integrator == "midpoint")) / self._substeps
-            inputs = self._inputs(number - 1, share) if begins in RESTING else self._inputs(0)
-            at = (number - 1) * self._substeps + i
-            inputs = inputs.replace(**{name: values[at] for name, values in self._moved.items()})
-            if self._fixed is not None:
-                inputs = inputs.replace(fixed_positions=self._fixed[at - 1])
-            state, _ = self._simulator.step(state, inputs, self._constants)
-        return state
+            share = (i - 0.5 * (simulator.integrator == "midpoint")) / substeps
+            inputs, at = inputs_at(number, share) if begins in RESTING else inputs_at(0), number * substeps + i
+            inputs = inputs.replace(**{name: values[at] for name, values in moved.items()})
+            if fixed is not None:
+                inputs = inputs.replace(fixed_positions=fixed[at - 1])
+            state, _ = simulator.step(state, inputs, constants)
+        seen.append(markers(state.q))
+        report()
+    return {"markers": (torch.stack(seen, 1).cpu().numpy(), "m")}
 
-    @override
-    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        return {"markers": self._markers(self.state.q).cpu().numpy()}
+
+def _beginning(
+    simulator: Simulator, settings: LaboratoryStage, trials: Sequence[Trial], inputs: Inputs, constants: Constants
+) -> State:
+    """Held bodies undeformed or pulled at the tip, other bodies in equilibrium with their inputs."""
+    if not trials[0].is_released:
+        return simulator.static_equilibrium(inputs, constants, batch=len(trials))
+    pulls = np.array([trial.pull or (0.0, 0.0, 0.0) for trial in trials])
+    if not any(trial.pull for trial in trials):
+        return simulator.rest_state(len(trials))
+    tip = select_vertices(simulator.body.mesh, **settings.tip.arguments())
+    held = simulator.static_equilibrium(inputs.plus(distributed(simulator, tip, simulator.tensor(pulls))), constants)
+    return State(held.q, torch.zeros_like(held.q))

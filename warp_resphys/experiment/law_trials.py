@@ -15,8 +15,8 @@ from ..dynamics.simulator import Simulator
 from ..energies.catalogue import unit_of
 from ..energies.materials import MASS_DAMPING
 from ..fem.elements import principal_stretches
-from ..learning.bounds import Bounds, Prior
 from ..learning.law import VISCOSITIES
+from ..learning.parameters import Bounds, Prior
 from ..learning.replay import Replay, Start
 from ..learning.uncertainty import redundancy
 from ..settings.body import MaterialSettings

@@ -5,7 +5,6 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -40,28 +39,24 @@ def samples_of(experiment: Experiment, model: str, names: Sequence[str], device:
     marker are left out.
     """
     parts = [_samples(experiment, model, batch, device) for batch in experiment.batches(names)]
-    samples = parts[0] if len(parts) == 1 else _joined(parts)
+    actuation = [part.actuation for part in parts if part.actuation is not None]
+    samples = Samples(
+        q=torch.cat([part.q for part in parts]),
+        v=torch.cat([part.v for part in parts]),
+        outputs=tuple(map(torch.cat, zip(*(part.outputs for part in parts), strict=True))),
+        actuation=torch.cat(actuation) if actuation else None,
+        lengths=tuple(length for part in parts for length in part.lengths),
+    )
     frames = None if model == SIMFREE else experiment.frames(experiment.model_simulator(model))
     if frames is None:
         return samples
     return dataclasses.replace(samples, outputs=(frames.to_rest(samples.q, samples.v, *samples.outputs),))
 
 
-def _joined(parts: Sequence[Samples]) -> Samples:
-    q, v = torch.cat([part.q for part in parts]), torch.cat([part.v for part in parts])
-    outputs = tuple(map(torch.cat, zip(*(part.outputs for part in parts), strict=True)))
-    inputs = [part.actuation for part in parts if part.actuation is not None]
-    lengths = tuple(length for part in parts for length in part.lengths)
-    return Samples(q, v, outputs, torch.cat(inputs) if inputs else None, lengths)
-
-
 def _samples(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> Samples:
     """Samples of trials that begin in the same way, with forces in the world frame."""
     simulator = experiment.model_simulator(model)
-    if model == SIMFREE and experiment.dataset.velocity is not None:
-        q, v, force, seen = _simulated(experiment, names, device)
-    else:
-        q, v, force, seen = _reconstructed(experiment, model, names, device)
+    q, v, force, seen = _states(experiment, model, names, device, simulated=model == SIMFREE)
     base, like = experiment.base(names, simulator), simulator.rest_positions
     if base is not None:
         pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
@@ -87,19 +82,17 @@ def _samples(experiment: Experiment, model: str, names: Sequence[str], device: t
     return Samples(*now, (pick(q[:, 1:]) - experiment.like.to(q), pick(v[:, 1:])), inputs, lengths)
 
 
-States = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+def _states(
+    experiment: Experiment, model: str, names: Sequence[str], device: torch.device, simulated: bool = True
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Positions, velocities and forces (R, K + 1, N, 3) of trials, and (R, K) whether steps were seen.
 
-
-def _simulated(experiment: Experiment, names: Sequence[str], device: torch.device) -> States:
-    """States of simulated trials with zero forces, in the format of `_reconstructed`."""
+    States are the reconstructed ones; those of the trials themselves, with zero forces, if `simulated` and known.
+    """
     dataset, rows = experiment.dataset, experiment.dataset.rows(names)
-    assert dataset.velocity is not None
-    q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
-    return q, v, torch.zeros((), device=device).expand_as(q), torch.ones(q.shape[0], q.shape[1] - 1, dtype=torch.bool)
-
-
-def _reconstructed(experiment: Experiment, model: str, names: Sequence[str], device: torch.device) -> States:
-    """Reconstructed positions, velocities and forces (R, K + 1, N, 3), and (R, K) whether steps were seen."""
+    if simulated and dataset.velocity is not None:
+        q, v = (torch.as_tensor(field[rows], device=device) for field in (dataset.observed, dataset.velocity))
+        return q, v, q.new_zeros(()).expand_as(q), torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool)
     source = "resphys" if model == SIMFREE else model
     with read_hdf5(experiment.folder / reconstruction_file(source), "reconstruction") as file:
         order = [str(name) for name in file.attrs["names"]]
@@ -111,43 +104,19 @@ def _reconstructed(experiment: Experiment, model: str, names: Sequence[str], dev
     return q, v, force, error[:, 1:].isfinite()
 
 
-@dataclass(frozen=True)
-class Learning:
-    """A learning task: the training data and the validation of a model, for any network and training settings.
+Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
 
-    Attributes:
-        experiment: the experiment.
-        model: name of the model.
+
+def trainer_of(experiment: Experiment, model: str, settings: TrainingSettings) -> Prepared:
+    """Prepares the trainer of a new model; the result depends on the settings only.
+
+    Raises:
+        InputError: a setting out of range, or an empty split.
     """
-
-    experiment: Experiment
-    model: str
-
-    def trainer(self, settings: TrainingSettings) -> "Prepared":
-        """Prepares the trainer of a new model; the result depends on the settings only.
-
-        Raises:
-            InputError: a setting out of range, or an empty split.
-        """
-        split = self.experiment.settings.split
-        device = choose_device(self.experiment.settings.device)
-        train = samples_of(self.experiment, self.model, split.train, device)
-        if settings.in_the_loop is not None:
-            return _in_the_loop(self.experiment, self.model, train, settings, settings.in_the_loop)
-        return _supervised(self.experiment, self.model, train, settings)
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A trainer with the model that it trains.
-
-    Attributes:
-        trainer: trainer, ready to run.
-        learned: network with the settings of its roll-outs.
-    """
-
-    trainer: EpochTrainer[Any]
-    learned: Learned
+    train = samples_of(experiment, model, experiment.settings.split.train, choose_device(experiment.settings.device))
+    if settings.in_the_loop is not None:
+        return _in_the_loop(experiment, model, train, settings, settings.in_the_loop)
+    return _supervised(experiment, model, train, settings)
 
 
 def new_network(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
@@ -186,7 +155,7 @@ def _supervised(experiment: Experiment, model: str, train: Samples, settings: Tr
     def judge(weights: StateMap) -> float:
         return error(dataclasses.replace(learned, network=weights))
 
-    return Prepared(kind(network, train, validation, judge, settings.trainer, settings.seed), learned)
+    return kind(network, train, validation, judge, settings.trainer, settings.seed), learned
 
 
 def _range_of(experiment: Experiment, model: str, network: StateMap, train: Samples) -> Range | None:
@@ -225,7 +194,11 @@ def _in_the_loop(
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
                 inputs = experiment.conditions(part, parameters)
                 base = experiment.base(part.trials.names, simulator)
-                windows = None if window is None else _windows(experiment, model, part, window)
+                windows = None
+                if window is not None:
+                    like = simulator.rest_positions
+                    q, v, *_ = _states(experiment, model, part.trials.names, like.device)
+                    windows = Windows(q.to(like), v.to(like), window)
                 watched.append(TrialGroup(part, start.select(rows), inputs, frames, base, windows))
         return MotionLoss(watched, parameters)
 
@@ -236,7 +209,9 @@ def _in_the_loop(
 
     epochs, after, train, validation = None, 0, split.train, split.validation
     if loop.start == "steps":
-        network, after = _trained_on_steps(experiment, model, samples, settings)
+        first, _ = _supervised(experiment, model, samples, settings)
+        run_epochs(f"{model}: steps", first, lambda _: None)
+        network, after = first.use_best().double().train(), first.state.best_epoch
     elif loop.hold_out and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
@@ -248,46 +223,17 @@ def _in_the_loop(
     trainer = InTheLoop(network, loss(train, loop.window), loss(validation or train), loop, epochs, after)
     trainer.begin()
     range_ = _range_of(experiment, model, trainer.model, samples)
-    return Prepared(trainer, Learned(trainer.model, range_, experiment.settings.force_frame))
-
-
-def _trained_on_steps(
-    experiment: Experiment, model: str, samples: Samples, settings: TrainingSettings
-) -> tuple[ResidualForce, int]:
-    """Returns a residual force that was trained on reconstructed steps, and the epoch of its weights."""
-    trainer = _supervised(experiment, model, samples, settings).trainer
-    run_epochs(f"{model}: steps", trainer, lambda _: None)
-    network = trainer.use_best()
-    assert isinstance(network, ResidualForce)
-    return network.double().train(), trainer.state.best_epoch
-
-
-def _windows(experiment: Experiment, model: str, replay: Replay, steps: int) -> Windows:
-    """The known or reconstructed states of the trials of a replay."""
-    like = replay.simulator.rest_positions
-    if experiment.dataset.velocity is None:
-        q, v, *_ = _reconstructed(experiment, model, replay.trials.names, like.device)
-    else:
-        q, v, *_ = _simulated(experiment, replay.trials.names, like.device)
-    return Windows(q.to(like), v.to(like), steps)
+    return trainer, Learned(trainer.model, range_, experiment.settings.force_frame)
 
 
 def train(context: StageContext) -> None:
-    """Trains a model; writes <model>.safetensors, with the selected weights, and training_<model>.json."""
-    settings: TrainStage = context.settings
-    learning = Learning(Experiment(settings, context.run_dir), settings.model)
-    fit(context, settings.model, learning.trainer(settings.training))
+    """Trains a model; writes <model>.safetensors, with the selected weights, and training_<model>.json.
 
-
-def fit(context: StageContext, model: str, prepared: Prepared) -> None:
-    """Trains, resuming an interrupted run, and writes the selected weights and the history.
-
-    Args:
-        context: context of the stage.
-        model: name of the model.
-        prepared: the trainer with its model.
+    An interrupted training resumes.
     """
-    trainer = prepared.trainer
+    settings: TrainStage = context.settings
+    model = settings.model
+    trainer, learned = trainer_of(Experiment(settings, context.run_dir), model, settings.training)
     checkpoint = context.run_dir / f"{context.name}.safetensors"
     if (snapshot := resume_checkpoint(checkpoint, "training", context.fingerprint)) is not None:
         trainer.resume(*snapshot)
@@ -309,7 +255,7 @@ def fit(context: StageContext, model: str, prepared: Prepared) -> None:
         context.run_dir / weights_file(model),
         kind_of(model)[1],
         best.state_dict(),
-        {**best.description(), **prepared.learned.description(), **kept, "fingerprint": context.fingerprint},
+        {**best.description(), **learned.description(), **kept, "fingerprint": context.fingerprint},
     )
     checkpoint.unlink(missing_ok=True)
 

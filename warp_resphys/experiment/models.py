@@ -1,16 +1,15 @@
 """Roll-outs of the models of an experiment: a simulator, a simulator with a learned force, or a network alone."""
 
 import contextlib
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError
@@ -24,7 +23,6 @@ from ..settings.stages import TestStage
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment
 from .files import GIVEN, weights_file
-from .parts import PartRollout
 
 FloatArray = NDArray[np.float64]
 
@@ -80,17 +78,19 @@ def load(folder: Path, model: str, device: torch.device) -> Learned:
     return Learned(network, range_, str(description["force_frame"]))
 
 
-class ModelRollout(PartRollout):
-    """Step-by-step roll-out of a model over trials that begin in the same way.
+class ModelRollout:
+    """Trials that begin in the same way, rolled out by a model.
 
     Args:
         experiment: the experiment.
         model: name of the model.
         names: names of the trials.
-        learned: trained network; None for a simulator alone.
         start: how the trials begin; estimated by default.
         simulator: simulator to use instead of the model's own.
-        filmed: trial of which all vertex positions are saved, too.
+
+    Attributes:
+        replay: of the trials.
+        steps: number of steps that covers all frames, rounded up to whole time steps of the experiment.
     """
 
     def __init__(
@@ -98,121 +98,91 @@ class ModelRollout(PartRollout):
         experiment: Experiment,
         model: str,
         names: Sequence[str],
-        learned: Learned | None = None,
         start: Start | None = None,
         simulator: Simulator | None = None,
-        filmed: str | None = None,
     ) -> None:
-        self.experiment, self.model = experiment, model
-        self.simulator = experiment.model_simulator(model) if simulator is None else simulator
-        self.replay = experiment.replay(self.simulator, names, model)
-        self.start = experiment.start(self.replay, model) if start is None else start
+        self._experiment, self._model = experiment, model
+        self._simulator = experiment.model_simulator(model) if simulator is None else simulator
+        self.replay = experiment.replay(self._simulator, names, model)
+        self._start = experiment.start(self.replay, model) if start is None else start
         parameters = experiment.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.prepare(parameters)
-        self._conditions = None if learned is None else experiment.conditions(self.replay, parameters, model == SIMFREE)
-        self._first: State | None = None
-        self._failed = False
-        self._filmed = names.index(filmed) if filmed in names else None
-        self.rollout, self.predictor = self._make(learned)
-        self.frames, self.units = self._steps() + 1, {"points": "m", "left": "1", "film": "m"}
-
-    def _make(self, learned: Learned | None) -> tuple[Rollout, LearnedPredictor | None]:
-        predict = None
-        if learned is not None:
-            replaces = isinstance(learned.network, NextState)
-            frames = None if replaces else self.experiment.frames(self.simulator, learned.force_frame)
-            base = self.experiment.base(self.replay.trials.names, self.simulator)
-            predict = LearnedPredictor(learned.network, self._conditions, learned.range_, frames, base)
-        return Rollout(self.simulator, predict, self._inputs, self._constants), predict
-
-    def with_learned(self, learned: Learned) -> "ModelRollout":
-        """Returns a roll-out of the same trials from their beginning with another network."""
-        if not self.replay.is_static:
-            self.beginning()  # Computed once and shared by the copies.
-        other = copy.copy(self)
-        other.rollout, other.predictor = self._make(learned)
-        return other
-
-    def _steps(self) -> int:
-        """Number of steps that covers all frames, rounded up to whole time steps of the experiment."""
+        self._conditions = (
+            experiment.conditions(self.replay, parameters, model == SIMFREE) if model in LEARNED else None
+        )
+        self._first: State | None = None  # of motions, whatever the network
+        substeps = round(experiment.settings.time_step / self._simulator.time_step)
+        self.steps = -(-self.replay.steps(self._start) // substeps) * substeps
         if self.replay.is_static:
-            return POSE_STEPS if self.model == SIMFREE else 0
-        substeps = round(self.experiment.settings.time_step / self.simulator.time_step)
-        return -(-self.replay.steps(self.start) // substeps) * substeps
+            self.steps = POSE_STEPS if model == SIMFREE else 0
+
+    def predictor(self, learned: Learned | None) -> LearnedPredictor | None:
+        """Returns the predictor of a network in these trials; None without a network."""
+        if learned is None:
+            return None
+        replaces = isinstance(learned.network, NextState)
+        frames = None if replaces else self._experiment.frames(self._simulator, learned.force_frame)
+        base = self._experiment.base(self.replay.trials.names, self._simulator)
+        return LearnedPredictor(learned.network, self._conditions, learned.range_, frames, base)
 
     @torch.no_grad()
-    def beginning(self) -> State:
+    def begin(self, predictor: LearnedPredictor | None) -> State:
         """Initial states of the trials; for static poses these are the final states, too.
 
         Raises:
             ConvergenceError: the equilibrium of an initial state was not found.
         """
-        if self.replay.is_static and self.predictor is not None and self.model != SIMFREE:
-            force: Any = self.predictor
-            return self.replay.initial_state(self.start, self._constants, self._resting, force=force)
+        force: Any = predictor if self.replay.is_static and self._model != SIMFREE else None
+        if force is not None:
+            return self.replay.initial_state(self._start, self._constants, self._resting, force=force)
         if self._first is None:
-            self._first = self.replay.initial_state(self.start, self._constants, self._resting)
+            self._first = self.replay.initial_state(self._start, self._constants, self._resting)
         return self._first
 
-    @override
-    def begin(self) -> State:
-        """Returns the `beginning`; a static pose without equilibrium is marked as diverged."""
+    def roll(self, predictor: LearnedPredictor | None) -> Iterator[tuple[State, torch.Tensor]]:
+        """Yields the state of each step, and which trials (R,) have diverged; so has a pose without equilibrium.
+
+        Raises:
+            ConvergenceError: the equilibrium from which a motion begins was not found.
+        """
+        rollout, failed = Rollout(self._simulator, predictor, self._inputs, self._constants), False
         try:
-            return self.beginning()
+            state = self.begin(predictor)
         except ConvergenceError:
             if not self.replay.is_static:
                 raise
-            self._failed = True
-            return self.simulator.rest_state(len(self.replay.trials.names))
+            state, failed = self._simulator.rest_state(len(self.replay.trials.names)), True
+        yield state, rollout.lost(state) | failed
+        for _ in range(self.steps):
+            state = rollout.step(state)
+            yield state, rollout.lost(state) | failed
 
-    @override
-    def step(self, number: int) -> State:
-        return self.rollout.step(self.state)
+    def points(self, state: State, lost: torch.Tensor) -> torch.Tensor:
+        """(R, M, 3) observed points of a state [m]; NaN where the roll-out has diverged."""
+        return torch.where(lost[:, None, None], torch.nan, self.replay.observe(state.q))
 
-    @property
-    def _lost(self) -> torch.Tensor:
-        return self.rollout.lost(self.state) | self._failed
+    def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
+        """(R, T, M, 3) observed points at the frames of the trials [m], from those of all steps (R, M, 3)."""
+        series = torch.stack([*points[-1:]] if self.replay.is_static else [*points], 1)
+        return np.asarray(self.replay.at_frames(series, self._start).cpu().numpy())
 
-    def points(self) -> torch.Tensor:
-        """(R, M, 3) observed points of the last state [m]; NaN where the roll-out has diverged."""
-        return torch.where(self._lost[:, None, None], torch.nan, self.replay.observe(self.state.q))
-
-    @override
-    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        """Observed points, steps at which trials left the training range (-1 before that), and filmed vertices."""
-        points = self.points()
-        kept = {"points": points.cpu().numpy()}
-        if self.predictor is not None:
-            left = self.predictor.left_at
-            kept["left"] = np.full(len(points), -1) if left is None else left.cpu().numpy()
-        if self._filmed is not None:
-            body = self.state.q[self._filmed, None].float().cpu().numpy()
-            kept["film"] = np.full_like(body, np.nan) if self._lost[self._filmed] else body
-        return kept
-
-    @override
-    def constants(self) -> dict[str, tuple[NDArray[Any], str]]:
-        shift = torch.zeros_like(self.replay.trials.held) if self.start.shift is None else self.start.shift
-        return {"delay": (self.start.delay.cpu().numpy(), "s"), "shift": (shift.cpu().numpy(), "m")}
-
-    def errors(self) -> list[FloatArray]:
+    def errors(self, learned: Learned) -> list[FloatArray]:
         """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged."""
-        observed, steps = self.replay.trials.observed, self.frames - 1
-        observed = observed[:, : self.experiment.learned_steps(observed.shape[1] - 1) + 1]
-        if self.experiment.settings.train_fraction < 1.0:
-            steps = min(steps, self.experiment.learned_steps(steps))
+        observed, steps = self.replay.trials.observed, self.steps
+        observed = observed[:, : self._experiment.learned_steps(observed.shape[1] - 1) + 1]
+        if self._experiment.settings.train_fraction < 1.0:
+            steps = min(steps, self._experiment.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
-            self.state = self.beginning()
-            series.append(self.points())
-        while series and len(series) <= steps:
-            self.state = self.step(len(series))
-            series = [] if bool(self._lost.all()) else [*series, self.points()]
+            for state, lost in islice(self.roll(self.predictor(learned)), steps + 1):
+                if series and bool(lost.all()):
+                    series = []
+                    break
+                series.append(self.points(state, lost))
         if not series:
             return [np.full(1, np.nan) for _ in observed]
-        simulated = self.replay.at_frames(torch.stack(series[-1:] if self.replay.is_static else series, 1), self.start)
-        first = first_frame(self.experiment, self.replay.trials.names)
-        pairs = zip(simulated[:, first:].cpu().numpy(), observed[:, first:].cpu().numpy(), strict=True)
+        first = first_frame(self._experiment, self.replay.trials.names)
+        pairs = zip(self.at_frames(series)[:, first:], observed[:, first:].cpu().numpy(), strict=True)
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
@@ -233,8 +203,8 @@ def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> C
 
     def error(learned: Learned) -> float:
         if not runs:  # The starts of the trials are estimated once, at the first call.
-            runs.extend(ModelRollout(experiment, model, batch, learned) for batch in experiment.batches(names))
-        rows = [row for run in runs for row in run.with_learned(learned).errors()]
+            runs.extend(ModelRollout(experiment, model, batch) for batch in experiment.batches(names))
+        rows = [row for run in runs for row in run.errors(learned)]
         mean = summarise(rows)["mean"]
         return float("inf") if mean is None else mean
 

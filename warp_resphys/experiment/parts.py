@@ -1,10 +1,9 @@
 """Rolls trials out in parts, in one process or several; an interrupted stage keeps its finished parts.
 
-A stage splits its trials into parts, with one file per part, and a `PartRollout` computes a part.
+A stage splits its trials into parts, with one file per part, and a function computes the arrays of a part.
 """
 
 import shutil
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,53 +22,10 @@ from ..io.machine import available_cores
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..settings.run import ParallelSettings
-from ..stepping.state import State
 from .build import simulation_device
 
-
-class PartRollout(ABC):
-    """Rolls a batch of trials out.
-
-    Attributes:
-        frames: number of frames.
-        units: units of the arrays of a frame, by name.
-        state: state of the last frame.
-        shown: named values displayed beside the progress bar.
-    """
-
-    frames: int
-    units: Mapping[str, str]
-    state: State
-    shown: Mapping[str, object] = {}
-
-    @abstractmethod
-    def begin(self) -> State:
-        """Returns the state of the first frame."""
-
-    @abstractmethod
-    def step(self, number: int) -> State:
-        """Returns the state of frame `number`, computed from the state of the previous frame."""
-
-    @abstractmethod
-    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        """Returns arrays (R, ...) of the current `state`, frame `number`; a row need not be a trial."""
-
-    def constants(self) -> dict[str, tuple[NDArray[Any], str]]:
-        """Returns arrays independent of the frame, with their units."""
-        return {}
-
-    @torch.no_grad()
-    def arrays(self, report: Callable[..., None]) -> dict[str, NDArray[Any]]:
-        """Computes all frames, and returns their arrays (R, T, ...); `report` is called after each."""
-        series = dict[str, NDArray[Any]]()
-        for number in range(self.frames):
-            self.state = self.begin() if number == 0 else self.step(number)
-            for name, values in self.frame_arrays(number).items():
-                if number == 0:
-                    series[name] = np.empty((len(values), self.frames, *values.shape[1:]), values.dtype)
-                series[name][:, number] = values
-            report(**self.shown)
-        return series
+Report = Callable[..., None]
+Arrays = Mapping[str, tuple[NDArray[Any], str]]  # with their units
 
 
 @dataclass(frozen=True)
@@ -81,7 +37,7 @@ class TrialPart:
         names: names of the trials.
         path: path of the file.
         frames: number of frames per trial that the progress bar expects; the roll-out may have a few more or less.
-        more: further arguments for the function that makes the roll-out.
+        more: further arguments for the function that computes it.
     """
 
     context: StageContext
@@ -90,26 +46,24 @@ class TrialPart:
     frames: int
     more: Any = None
 
-    def write(self, make: "Callable[[TrialPart], PartRollout]", advance: Callable[..., None]) -> None:
-        """Computes the frames and writes the file, unless it is done; `advance` counts the frames."""
+    def write(self, work: "Work", advance: Callable[..., None]) -> None:
+        """Computes the arrays and writes the file, unless it is done; `advance` counts the frames."""
         count, rolled = len(self.names), 0
         if self.done:
             advance(count * self.frames)
             return
-        rollout = make(self)
 
         def report(**shown: object) -> None:
             nonlocal rolled
             rolled += 1
             advance(count if rolled <= self.frames else 0, **shown)
 
-        series = rollout.arrays(report)
+        with torch.no_grad():
+            arrays = work(self, report)
         advance(count * max(self.frames - rolled, 0))
         with atomic_hdf5(self.path, self.context.name, {"fingerprint": self.context.fingerprint}) as file:
-            for name, (values, unit) in rollout.constants().items():
+            for name, (values, unit) in arrays.items():
                 create(file, name, values, unit)
-            for name, values in series.items():
-                create(file, name, values, rollout.units[name], time_axis=1)
 
     def read(self, name: str) -> NDArray[Any]:
         """Reads an array of the file.
@@ -124,6 +78,11 @@ class TrialPart:
     def done(self) -> bool:
         """Whether a complete file made from the same settings exists."""
         return is_final(self.path, self.context.name, self.context.fingerprint)
+
+
+# Computes the arrays (R, ...) of a part; the second argument is to be called after each frame, with named values that
+# are displayed beside the progress bar. A top-level function, so that it can be pickled.
+Work = Callable[[TrialPart, Report], Arrays]
 
 
 def split_into_parts(
@@ -175,12 +134,12 @@ def workers_for(parallel: ParallelSettings, wanted: int | None, device: str) -> 
     return Workers(wanted, parallel.address)
 
 
-def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], PartRollout], workers: Workers) -> None:
+def work_on(parts: Sequence[TrialPart], work: Work, workers: Workers) -> None:
     """Computes the parts that are not done yet and writes their files.
 
     Args:
         parts: parts of one stage.
-        make: makes the roll-out of a part; a top-level function or class, so that it can be pickled.
+        work: computes a part.
         workers: workers that share the parts.
 
     Raises:
@@ -193,21 +152,21 @@ def work_on(parts: Sequence[TrialPart], make: Callable[[TrialPart], PartRollout]
         if workers.alone or (workers.address is None and len(parts) == 1):
             with threadpool_limits(1):  # As in worker processes, for the same results.
                 for part in left:
-                    part.write(make, progress.advance)
+                    part.write(work, progress.advance)
         else:
             first.path.parent.mkdir(parents=True, exist_ok=True)
             frames = [part.frames * len(part.names) for part in left]
             crew = workers.at_most(len(left))
-            fan_out(partial(_write, make), left, crew, first.path.parent, lambda at: progress.advance(frames[at]))
+            fan_out(partial(_write, work), left, crew, first.path.parent, lambda at: progress.advance(frames[at]))
 
 
-def _write(make: Callable[[TrialPart], PartRollout], part: TrialPart) -> None:
-    part.write(make, lambda count=1, **shown: None)
+def _write(work: Work, part: TrialPart) -> None:
+    part.write(work, lambda count=1, **shown: None)
 
 
-def read_parts(parts: Sequence[TrialPart], name: str) -> NDArray[Any]:
-    """Reads an array from all parts and joins them, (R, T, ...); NaN past the end of shorter trials."""
-    return padded([part.read(name) for part in parts])
+def read_parts(parts: Sequence[TrialPart], name: str, frames: int = 0) -> NDArray[Any]:
+    """Reads an array from all parts and joins them, (R, T, ...), see `padded`."""
+    return padded([part.read(name) for part in parts], frames)
 
 
 def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:

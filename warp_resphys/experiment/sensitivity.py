@@ -1,7 +1,14 @@
-"""Derivatives of predicted markers by the identified parameters and the responses of the inputs."""
+"""Derivatives of predicted markers by the identified parameters, and what follows from them.
+
+That is how uncertain predictions are because the parameters are, predictions without a trial that was identified from,
+and what could explain the errors that remain: gain and zero of the inputs, or marker places. Every such quantity is
+fitted to the trial itself, so that the fits tell where an error comes from and are no predictions: where a scale of the
+inputs takes most of an error away, the simulator lacks physics of the actuator, or the recording does not contain what
+the actuator did.
+"""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,10 +18,11 @@ from numpy.typing import NDArray
 
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
+from ..data.rigid_bodies import as_markers, owners
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
-from ..learning.parameters import HUNG, configured_parameters, split_name
+from ..learning.parameters import HUNG, configured_parameters, own_name, split_name
 from ..learning.placement import DisplacedMarkers, Placement, by_placement, placement_of
 from ..learning.replay import Replay, exact
 from .experiment import Experiment
@@ -42,14 +50,14 @@ class Sensitivity:
     by_placement: FloatArray | None
 
 
-def responses(experiment: Experiment) -> dict[str, str]:
+def _responses(experiment: Experiment) -> dict[str, str]:
     """Parameters for a scale and a zero of the inputs that drive an experiment, by name, with their word."""
     driven = [name for name, values in experiment.dataset.inputs.items() if name not in HUNG and values.any()]
     return {f"{name}_{word}": word for name in driven for word in ("factor", "zero")}
 
 
 def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> dict[str, Sensitivity]:
-    """Returns the derivatives of trials by the parameters of a model's simulator and the `responses` of its inputs.
+    """Returns the derivatives of trials by the parameters of a model's simulator and the gains and zeros of its inputs.
 
     Args:
         experiment: the experiment.
@@ -57,30 +65,24 @@ def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> d
         names: names of the trials; those that cannot be simulated are left out, which a warning says.
     """
     simulator, found = exact(experiment.model_simulator(model)), dict[str, Sensitivity]()
-    deviation = (experiment.identification(model).get("uncertainty") or {}).get("deviation", {})
-    largest = {name: float(np.abs(values).max()) for name, values in experiment.dataset.inputs.items()}
-    added = responses(experiment)
-    sizes = {name: largest[name.removesuffix("_zero")] if word == "zero" else 1.0 for name, word in added.items()}
-    moved = {name: _DIFFERENCE * size for name, size in {**sizes, **deviation}.items()}
-    values = {**_tensors(simulator, configured_parameters(simulator, moved)), **experiment.parameters(model)}
+    moved = (experiment.identification(model).get("uncertainty") or {}).get("deviation", {})
+    inputs = experiment.dataset.inputs
+    for name, word in _responses(experiment).items():
+        size = 1.0 if word == "factor" else float(np.abs(inputs[name.removesuffix("_zero")]).max())
+        moved = {name: size} | moved
+    moved = {name: _DIFFERENCE * size for name, size in moved.items()}
+    configured = configured_parameters(simulator, moved)
+    values = {name: simulator.tensor([value]) for name, value in configured.items()} | experiment.parameters(model)
     with Progress("evaluate: derivatives by the parameters", len(names), "trials") as progress, torch.no_grad():
-        for batch in _batches(experiment, names):
-            try:
-                found |= _of_batch(experiment, model, simulator, batch, values, moved)
-            except ConvergenceError as error:
-                log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(batch), error)
-            progress.advance(len(batch))
+        for whole in experiment.batches(names):
+            size = experiment.settings.batch or len(whole)
+            for batch in (whole[first : first + size] for first in range(0, len(whole), size)):
+                try:
+                    found |= _of_batch(experiment, model, simulator, batch, values, moved)
+                except ConvergenceError as error:
+                    log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(batch), error)
+                progress.advance(len(batch))
     return found
-
-
-def _batches(experiment: Experiment, names: Sequence[str]) -> Iterator[Sequence[str]]:
-    for whole in experiment.batches(names):
-        size = experiment.settings.batch or len(whole)
-        yield from (whole[first : first + size] for first in range(0, len(whole), size))
-
-
-def _tensors(simulator: Simulator, values: Mapping[str, float]) -> dict[str, torch.Tensor]:
-    return {name: simulator.tensor([value]) for name, value in values.items()}
 
 
 def _of_batch(
@@ -92,13 +94,16 @@ def _of_batch(
     moved: Mapping[str, float],
 ) -> dict[str, Sensitivity]:
     """Derivatives of trials of one of `Experiment.batches`, from values (1,) of all parameters and steps of some."""
-    own = experiment.replay(simulator, names, model)
-    replay, start, observe = own, experiment.start(own, model), experiment.observe
-    placement = None
+    replay, observe, dataset = experiment.replay(simulator, names, model), experiment.observe, experiment.dataset
+    start, placement = experiment.start(replay, model), None
     if isinstance(observe, Markers) and not isinstance(observe, ViewedMarkers):
-        placement = _placement(experiment, model, names[0])
-        displaced = DisplacedMarkers(observe, len(experiment.dataset.labels))
-        replay = Replay(own.simulator, displaced, own.trials)
+        assert dataset.bound is not None
+        count, plain = len(dataset.labels), experiment.identification(model).get("placement")
+        placement = Placement.none(count, experiment.like.new_tensor(np.mean(dataset.bound, axis=0)))
+        if plain is not None:
+            placement = placement_of(plain, dataset.labels, dataset.session(names[0])).to(experiment.like)
+        displaced = DisplacedMarkers(observe, count)
+        replay = Replay(simulator, displaced, replay.trials)
         start = replace(start, shift=None if start.shift is None else start.shift.repeat(1, displaced.copies, 1))
     rows = {parameter: row for row, parameter in enumerate(moved, 1)}
     sets = {name: value.repeat(1 + len(moved)) for name, value in values.items()}
@@ -122,10 +127,142 @@ def _of_batch(
     }
 
 
-def _placement(experiment: Experiment, model: str, name: str) -> Placement:
-    """Placement of the markers of a trial, nominal if none is identified."""
-    dataset, plain = experiment.dataset, experiment.identification(model).get("placement")
-    if plain is not None:
-        return placement_of(plain, dataset.labels, dataset.session(name)).to(experiment.like)
-    assert dataset.bound is not None
-    return Placement.none(len(dataset.labels), experiment.like.new_tensor(np.mean(dataset.bound, axis=0)))
+def parameter_spread(
+    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity], left_out: bool = False
+) -> FloatArray | None:
+    """Returns the variance of predicted markers under the posterior of a model's identified parameters.
+
+    The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
+    of these, so that it grows with the distance from the trials that determine them. In a session without identified
+    trials, the prior of its placement adds its variance. The ranges of the parameters limit their covariance.
+
+    Args:
+        experiment: the experiment.
+        model: with identified parameters.
+        names: names of the R trials; those without derivatives have no spread.
+        linear: derivatives by trial, from `sensitivities`.
+        left_out: whether the posterior of a trial that was identified from is that without it.
+
+    Returns:
+        Means (R, T, M) over the coordinates, of markers and of the positions of rigid bodies [m^2]; None if the
+        uncertainty of the parameters is not known.
+    """
+    identified, dataset = experiment.identification(model), experiment.dataset
+    uncertainty, placement = identified.get("uncertainty"), identified.get("placement") or {}
+    if uncertainty is None:
+        return None
+    parameters, own = [*uncertainty["deviation"]], identified.get("own_deviation", {})
+    ranges = [uncertainty.get("ranges", {}).get(name, np.inf) for name in parameters]
+    spread = np.zeros((len(names), dataset.observed.shape[1], len(owners(dataset.labels))))
+    for row, name in ((row, name) for row, name in enumerate(names) if name in linear):
+        posterior = uncertainty.get("left_out", {}).get(name, uncertainty) if left_out else uncertainty
+        deviation = np.array([posterior["deviation"][parameter] for parameter in parameters])
+        correlation, session = np.array(posterior["correlation"]), dataset.session(name)
+        for at, parameter in enumerate(parameters):
+            of_trial = (own.get(own_name(parameter, owner)) for owner in (name, session))
+            if (known := next((value for value in of_trial if value is not None), None)) is not None:
+                deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
+                correlation[at, at] = 1.0
+        root = deviation[:, None] * _root(correlation, deviation / ranges)
+        slopes = np.stack([linear[name].by_parameter[parameter] for parameter in parameters])
+        moved = as_markers(np.einsum("eTmc,ei->iTmc", slopes, root), dataset.labels)
+        spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
+        places = linear[name].by_placement
+        if "sessions" in placement and session not in placement["sessions"] and places is not None:
+            moved = as_markers(places @ np.array(placement["new_session"]), dataset.labels, -3)
+            spread[row, : len(moved)] += np.nan_to_num(np.square(moved).sum(-1).mean(-1))
+    return spread
+
+
+def _root(correlation: FloatArray, shares: FloatArray) -> FloatArray:
+    """R with R R^T the covariance of parameters over their standard deviations, which their ranges limit.
+
+    A range counts as a normal distribution of the variance of a uniform one: where the data leave a parameter open, the
+    linearised posterior would reach far beyond it.
+
+    Args:
+        correlation: (P, P) of the posterior.
+        shares: (P,) standard deviations over the ranges.
+    """
+    limited = np.linalg.solve(np.eye(len(shares)) + correlation * (12.0 * shares**2), correlation)
+    sizes, vectors = np.linalg.eigh(0.5 * (limited + limited.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(sizes, 0.0)))
+
+
+def left_out_changes(
+    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity]
+) -> FloatArray | None:
+    """Returns by what predictions of trials change if a model's parameters are identified without them, to first order.
+
+    Returns:
+        (R, T, M, 3) [m]; None if no trial changes, as those from which nothing was identified.
+    """
+    left_out = (experiment.identification(model).get("uncertainty") or {}).get("left_out", {})
+    changes = np.zeros((len(names), *experiment.dataset.observed.shape[1:]))
+    used = [row for row, name in enumerate(names) if name in left_out and name in linear]
+    for row in used:
+        slopes, without = linear[names[row]], left_out[names[row]]
+        change = sum(slopes.by_parameter[name] * by for name, by in without["change"].items())
+        if without["placement"] is not None and slopes.by_placement is not None:
+            change = change + slopes.by_placement @ np.array(without["placement"])
+        changes[row, : len(slopes.points)] = change
+    return changes if used else None
+
+
+def free_fits(
+    experiment: Experiment,
+    observed: Mapping[str, FloatArray],
+    simulated: Mapping[str, FloatArray],
+    linear: Mapping[str, Sensitivity],
+) -> list[dict[str, Any]]:
+    """Returns what would remain of the errors of trials if something were free, by trial.
+
+    The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change) and their ``zero`` (in their unit),
+    common to all of a trial's inputs; and the ``places`` of the markers and the frame of the recordings, which all
+    tested trials of a session share. What the trials do not determine is left out.
+
+    Args:
+        experiment: the experiment.
+        observed: (T, M, 3) markers by trial [m], NaN in frames that do not count.
+        simulated: (T, M, 3) predicted markers by trial [m].
+        linear: derivatives by trial; those without are left out.
+    """
+    labels, words = experiment.dataset.labels, _responses(experiment)
+    counts = {name: len(own.points) for name, own in linear.items()}  # one frame of a pose
+    errors = {n: (simulated[n] - seen)[: counts[n]] for n, seen in observed.items() if n in linear}
+    errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
+
+    def mean(error: FloatArray) -> float:
+        """Mean length of errors (T, M, 3) of markers and rigid bodies that were seen [mm]."""
+        return float(1e3 * np.nanmean(np.linalg.norm(as_markers(error, labels), axis=-1)))
+
+    left: dict[str, dict[str, float]] = {name: {} for name in errors}
+    values: dict[str, dict[str, float]] = {name: {} for name in errors}
+    for name, error in errors.items():
+        for quantity, word in (("scale", "factor"), ("zero", "zero")):  # all inputs move together
+            slopes = [linear[name].by_parameter[n] for n, other in words.items() if other == word]
+            if slopes and (own := _least([error], [np.sum(slopes, axis=0)[..., None]])) is not None:
+                left[name][quantity] = mean(error + np.sum(slopes, axis=0) * own[0])
+                values[name][quantity] = float(own[0])
+    for session in dict.fromkeys(map(experiment.dataset.session, errors)):
+        members = [name for name in errors if experiment.dataset.session(name) == session]
+        places = [slopes for name in members if (slopes := linear[name].by_placement) is not None]
+        if len(places) < len(members):
+            continue
+        own_errors = [errors[name] for name in members]
+        sizes = [float(np.sqrt(np.nanmean(np.square(error)))) or 1.0 for error in own_errors]  # Trials count alike.
+        scaled = ([x / size for x, size in zip(of, sizes, strict=True)] for of in (own_errors, places))
+        if (own := _least(*scaled)) is not None:
+            for name, slopes in zip(members, places, strict=True):
+                left[name]["places"] = mean(errors[name] + slopes @ own)
+    return [{"name": n, "as_is_mm": mean(e), "left_mm": left[n], "values": values[n]} for n, e in errors.items()]
+
+
+def _least(errors: Sequence[FloatArray], columns: Sequence[FloatArray]) -> FloatArray | None:
+    """(K,) values with the least squares of errors (T, M, 3) + columns (T, M, 3, K) values; None if not determined."""
+    seen = [np.isfinite(error) & np.isfinite(slopes).all(-1) for error, slopes in zip(errors, columns, strict=True)]
+    right = np.concatenate([error[where] for error, where in zip(errors, seen, strict=True)])
+    matrix = np.concatenate([slopes[where] for slopes, where in zip(columns, seen, strict=True)])
+    if len(right) <= 2 * matrix.shape[1] or not matrix.any():
+        return None
+    return np.asarray(np.linalg.lstsq(matrix, -right)[0])

@@ -6,6 +6,7 @@ simulated trials of a run (`experiment.simulate`).
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,21 +47,16 @@ def try_shapes(context: StageContext) -> None:
     """
     settings: ShapesStage = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    kept = Checkpoint(context, "shapes")
-    results: dict[str, Any] = dict(kept.content.get("shapes", {}))
-    with Progress(context.name, len(settings.shapes), "bodies", len(results)) as progress:
+    kept, results = Checkpoint(context), {}
+    with Progress(context.name, len(settings.shapes), "bodies") as progress:
         for name, shape in settings.shapes.items():
-            if name not in results:
-                try:
-                    results[name] = _compared(experiment, settings, shape)
-                except InputError as error:
-                    raise InputError(f"shapes.{name}: {error}") from error
-                except ConvergenceError as error:
-                    raise ConvergenceError(
-                        f"shapes.{name}, its target: {error}", error.positions, error.report
-                    ) from error
-                kept.keep(shapes=results)
-                progress.advance(1, body=name)
+            try:
+                results[name] = kept.once(name, partial(_compared, experiment, settings, shape))
+            except InputError as error:
+                raise InputError(f"shapes.{name}: {error}") from error
+            except ConvergenceError as error:
+                raise ConvergenceError(f"shapes.{name}, its target: {error}", error.positions, error.report) from error
+            progress.advance(1, body=name)
     write_json(context.run_dir / SHAPES, results)
     kept.path.unlink(missing_ok=True)
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from ..data.base_motion import check_steps, prescribed, rigid
 from ..data.markers import MarkerMap
@@ -48,7 +47,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET, GIVEN, Dataset
-from .parts import PartRollout, TrialPart, read_parts, remove_parts, split_into_parts, work_on
+from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +145,7 @@ def simulate(context: StageContext) -> None:
     for name, moved in obstacles.items():
         check_steps(moved[0], points, f"data.obstacle_motion.{name}", f"the obstacle {name!r}")
     parts = split_into_parts(context, names, frames)
-    work_on(parts, _FreeMotion, ALONE)
+    work_on(parts, _free_motion, ALONE)
     observed = read_parts(parts, "observed")
     Dataset(
         names,
@@ -214,40 +213,32 @@ def contact_series(
     return {name: simulator.tensor(values) for name, values in inputs.items()}
 
 
-class _FreeMotion(PartRollout):
-    """Roll-out of released bodies, or of bodies with a moving base."""
-
-    def __init__(self, part: TrialPart) -> None:
-        settings: SimulateStage = part.context.settings
-        self._data, self._target = settings.data, build_target(settings, settings.target)
-        self._simulator = self._target.simulator
-        self._trials = [trial for trial in settings.trials if trial.name in part.names]
-        self._constants = self._simulator.prepare()
-        self.frames, self.units = part.frames, {"observed": "m", "velocity": "m/s"}
-        times = self._simulator.time_step * np.arange((part.frames - 1) * self._target.substeps + 1)
-        self._moved = contact_series(self._simulator, settings.data.obstacle_motion, self._trials, times)
-        self._fixed: list[torch.Tensor] | None = None
-        if (motion := settings.data.base_motion) is not None:
-            poses = [base_of(motion, trial, times[1:], _motion_scale(settings, trial)) for trial in self._trials]
-            self._fixed = fixed_positions(self._simulator, np.stack(poses, axis=1))
-
-    @override
-    def begin(self) -> State:
-        return initial_state(self._simulator, self._data, self._trials)
-
-    @override
-    def step(self, number: int) -> State:
-        state, substeps = self.state, self._target.substeps
-        for at in range((number - 1) * substeps, number * substeps):
-            moved = {name: values[at + 1] for name, values in self._moved.items()}
-            inputs = Inputs(fixed_positions=None if self._fixed is None else self._fixed[at], **moved)
-            state = self._simulator.step(state, inputs, self._constants)[0]
-        return state
-
-    @override
-    def frame_arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        seen = {"observed": self.state.q, "velocity": self.state.v}
-        return {name: self._target.seen(values).cpu().numpy() for name, values in seen.items()}
+def _free_motion(part: TrialPart, report: Report) -> Arrays:
+    """Positions and velocities of released bodies, or of bodies with a moving base."""
+    settings: SimulateStage = part.context.settings
+    target, data = build_target(settings, settings.target), settings.data
+    simulator, trials = target.simulator, [trial for trial in settings.trials if trial.name in part.names]
+    constants, fixed = simulator.prepare(), None
+    times = simulator.time_step * np.arange((part.frames - 1) * target.substeps + 1)
+    moved = contact_series(simulator, data.obstacle_motion, trials, times)
+    if (motion := data.base_motion) is not None:
+        poses = [base_of(motion, trial, times[1:], _motion_scale(settings, trial)) for trial in trials]
+        fixed = fixed_positions(simulator, np.stack(poses, axis=1))
+    states = [initial_state(simulator, data, trials)]
+    report()
+    for number in range(part.frames - 1):
+        state = states[-1]
+        for at in range(number * target.substeps, (number + 1) * target.substeps):
+            acting = {name: values[at + 1] for name, values in moved.items()}
+            inputs = Inputs(fixed_positions=None if fixed is None else fixed[at], **acting)
+            state = simulator.step(state, inputs, constants)[0]
+        states.append(state)
+        report()
+    series = {"observed": ([state.q for state in states], "m"), "velocity": ([state.v for state in states], "m/s")}
+    return {
+        name: (torch.stack([target.seen(x) for x in values], 1).cpu().numpy(), unit)
+        for name, (values, unit) in series.items()
+    }
 
 
 def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Trial]) -> State:

@@ -1,53 +1,26 @@
 """Misfits of parameters that are searched in ranges, with normal priors: a sum of squares and its linearisation.
 
-Parameters are fractions of their ranges, "units" from 0 to 1. Prior knowledge (`bounds.Prior`, and whatever a subclass
-fits for each set of parameters) adds its squares, weighted as much as one independent residual of the data: by their
-mean square, times the number of residuals that are correlated. That weight is computed at the start of a search and
-again at the minimum.
+Parameters are fractions of their ranges, "units" from 0 to 1. Prior knowledge (`parameters.Prior`, and whatever a
+subclass fits for each set of parameters) adds its squares, weighted as much as one independent residual of the data: by
+their mean square, times the number of residuals that are correlated. That weight is computed at the start of a search
+and again at the minimum.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .bounds import Bounds
-from .uncertainty import Linearised, Uncertainty, redundancy, uncertainty_of
+from .parameters import Bounds
+from .uncertainty import LinearMisfit, Uncertainty, redundancy, uncertainty_of
 
 FloatArray = NDArray[np.float64]
 
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
-
-
-@dataclass(frozen=True)
-class LinearMisfit:
-    """Weighted residuals at some parameters and their derivatives, whose squares sum to the loss."""
-
-    trials: list[Linearised]
-    prior: FloatArray  # (K,) weighted residuals of the priors
-    prior_slopes: FloatArray  # (K, P)
-
-    @property
-    def loss(self) -> float:
-        """Sum of the squares."""
-        return float(sum(np.square(rows).sum() for rows, _, _ in self.trials) + np.square(self.prior).sum())
-
-    @property
-    def gradient(self) -> FloatArray:
-        """(P,) gradient of the loss."""
-        parts = [jacobian.T @ rows.ravel() for rows, jacobian, _ in self.trials]
-        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
-
-    @property
-    def gauss_newton(self) -> FloatArray:
-        """(P, P) Gauss-Newton matrix of the loss."""
-        parts = [jacobian.T @ jacobian for _, jacobian, _ in self.trials]
-        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
 
 
 class BoundedMisfit(ABC):
@@ -91,7 +64,7 @@ class BoundedMisfit(ABC):
     def forget(self) -> None:
         """Forgets the results of earlier parameters, from which the next are predicted."""
 
-    def placement(self, unit: FloatArray, labels: Sequence[str]) -> dict[str, Any] | None:
+    def placement(self, unit: FloatArray) -> dict[str, Any] | None:
         """Returns the best placement of markers with (P,) parameters, as JSON data; None without uncertain places."""
         return None
 
@@ -113,9 +86,13 @@ class BoundedMisfit(ABC):
         }
 
     def losses_or_infinite(self, points: FloatArray) -> FloatArray:
-        """(E,) losses of (E, P) parameters; infinite where the simulation fails."""
-        linear = [self.linearise(point, derivatives=False) for point in points]
-        return np.array([math.inf if own is None else own.loss for own in linear])
+        """(E,) losses of (E, P) parameters, each as if it were the first; infinite where the simulation fails."""
+        losses = np.full(len(points), np.inf)
+        for number, point in enumerate(points):
+            self.forget()
+            linear = self.linearise(point, derivatives=False)
+            losses[number] = np.inf if linear is None else linear.loss
+        return losses
 
     def prior_rows(self, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(K,) weighted residuals of the priors of parameters, and their derivatives (K, P)."""

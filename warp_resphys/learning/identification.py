@@ -1,7 +1,7 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
-The `Misfit` is minimised within bounds, from the best of a coarse set of starts (`linalg.least_squares.UnitBox`), with
-derivatives along the motions (`Replay.varied`).
+A misfit, such as `misfit.Misfit`, is minimised within bounds, from the best of a coarse set of starts
+(`linalg.least_squares.UnitBox`), with derivatives along the motions (`Replay.varied`).
 """
 
 import math
@@ -15,10 +15,7 @@ import torch
 from ..io.errors import ConvergenceError
 from ..linalg.least_squares import Point, UnitBox, minimise
 from .bounded_misfit import BoundedMisfit, FloatArray
-from .bounds import Bounds
-from .misfit import Misfit
-from .placement import Accuracy
-from .replay import Replay, Start
+from .parameters import Bounds
 from .uncertainty import Uncertainty
 
 Report = Callable[[int, float, Mapping[str, float]], None]
@@ -37,7 +34,7 @@ class Identification:
     # may be that of the linearisation
     history: list[list[dict[str, float]]] = field(default_factory=list)
     at_bounds: tuple[str, ...] = ()  # parameters that ended on a bound
-    placement: dict[str, Any] | None = None  # of the markers, as `placement.Placed.plain` has it
+    placement: dict[str, Any] | None = None  # of the markers, as `nuisance.Nuisances.plain` has it
     uncertainty: Uncertainty | None = None  # None if the simulation fails beside the minimum
 
 
@@ -46,11 +43,10 @@ class ParameterSearch:
 
     Args:
         misfit: of the parameters.
-        labels: names of the markers, where their places are uncertain.
     """
 
-    def __init__(self, misfit: BoundedMisfit, labels: Sequence[str] = ()) -> None:
-        self._misfit, self._labels = misfit, tuple(labels)
+    def __init__(self, misfit: BoundedMisfit) -> None:
+        self._misfit = misfit
 
     @property
     def bounds(self) -> dict[str, Bounds]:
@@ -72,8 +68,7 @@ class ParameterSearch:
 
             sampler = qmc.LatinHypercube(len(self.bounds), rng=np.random.default_rng(seed))
             points = sampler.random(max(candidates, count - 1))
-            parts = [self._misfit.losses_or_infinite(points[i : i + 8]) for i in range(0, len(points), 8)]
-            losses = np.concatenate(parts)
+            losses = self._misfit.losses_or_infinite(points)
             units += [points[i] for i in np.argsort(losses)[: count - 1] if np.isfinite(losses[i])]
         return [self._misfit.from_unit(unit) for unit in units]
 
@@ -112,7 +107,7 @@ class ParameterSearch:
             loss=best["loss"],
             history=[attempt["history"] for attempt in attempts],
             at_bounds=tuple(n for n, u in zip(self.bounds, unit, strict=True) if min(u, 1.0 - u) < 1e-4),
-            placement=misfit.placement(unit, self._labels) if last else None,
+            placement=misfit.placement(unit) if last else None,
             uncertainty=misfit.uncertainty(unit) if last else None,
         )
         misfit.forget()
@@ -159,37 +154,3 @@ class ParameterSearch:
             return start
         end = minimise(problem, start, tolerance, max_evaluations - 1).point
         return replace(end, value=torch.full_like(end.value, torch.inf)) if problem.differentiates is False else end
-
-
-class Identifier(ParameterSearch):
-    """Searches for the parameters with which simulated motions come closest to observed ones.
-
-    Args:
-        replays: groups of trials that begin alike, such as motions or static poses, with their starts; all with one
-            simulator.
-        bounds: range of each parameter to identify.
-        seconds: length of each motion that is compared [s]; the whole motion if None.
-        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
-        labels: names of the markers, where `accuracy` is given.
-        centre: (3,) about which recordings may be rotated [m].
-        known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
-        delay: standard deviation of the delay of motions that their inputs begin, fitted to each [s]; zero for none.
-        shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
-
-    Raises:
-        InputError: an unknown parameter, or none; or a motion in which nothing moves.
-    """
-
-    def __init__(
-        self,
-        replays: Sequence[tuple[Replay, Start]],
-        bounds: Mapping[str, Bounds],
-        seconds: float | None = None,
-        accuracy: Accuracy | None = None,
-        labels: Sequence[str] = (),
-        centre: Sequence[float] = (0.0, 0.0, 0.0),
-        known: Mapping[str, float] | None = None,
-        delay: float = 0.0,
-        shares: Sequence[float] | None = None,
-    ) -> None:
-        super().__init__(Misfit(replays, bounds, seconds, accuracy, centre, known, delay, shares), labels)

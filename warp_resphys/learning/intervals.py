@@ -54,12 +54,10 @@ class Predicted:
 
     def quarters(self) -> "list[Predicted]":
         """The four quarters of the frames; the whole of fewer frames."""
-        if len(self.since) < _QUARTERS:
-            return [self]
-        parts = np.array_split(np.arange(len(self.since)), _QUARTERS)
-        spreads = [None if self.spread is None else self.spread[own] for own in parts]
-        rows = zip(parts, spreads, strict=True)
-        return [Predicted(self.simulated[own], self.observed[own], self.since[own], spread) for own, spread in rows]
+        count = _QUARTERS if len(self.since) >= _QUARTERS else 1
+        spreads = [None] * count if self.spread is None else np.array_split(self.spread, count)
+        series = (np.array_split(values, count) for values in (self.simulated, self.observed, self.since))
+        return [Predicted(*own) for own in zip(*series, spreads, strict=True)]
 
     @property
     def errors(self) -> FloatArray:
@@ -82,7 +80,9 @@ class Intervals:
     variance: tuple[float, ...]
 
     @classmethod
-    def calibrated(cls, trials: Sequence[Predicted], rest: FloatArray, level: float = LEVEL) -> "Intervals | None":
+    def calibrated(
+        cls, predicted: Mapping[str, Predicted], rest: FloatArray, level: float = LEVEL
+    ) -> "Intervals | None":
         """Calibrates intervals on trials that the model was not trained on; None if a roll-out diverged.
 
         The quantile is the lowest for which intervals from all trials but one have the wanted mean coverage on the
@@ -91,11 +91,11 @@ class Intervals:
         Markers that are seen in no trial get the largest quantile of the others, without a guarantee.
 
         Args:
-            trials: predicted by the model.
+            predicted: trials that the model predicted, by name.
             rest: (M, 3) markers on the undeformed body [m].
             level: wanted coverage, a share of the coordinates.
         """
-        trials = [trial for trial in trials if trial.seen.any()]
+        trials = [trial for trial in predicted.values() if trial.seen.any()]
         if not trials or not all(np.isfinite(trial.simulated[trial.seen]).all() for trial in trials):
             return None
         if len(trials) == 1:
@@ -137,35 +137,24 @@ class Intervals:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any] | None) -> "Intervals | None":
-        """Returns the intervals that `plain` wrote; None without any, or for those of an earlier version."""
+        """Returns the intervals that `plain` wrote; None without any, as in summaries of folds."""
         return cls(tuple(plain["factor"]), tuple(plain["variance"])) if plain and "variance" in plain else None
 
-    def covered(self, trial: Predicted, rest: FloatArray) -> "Covered":
+    def covered(self, trial: Predicted, rest: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Measures a trial that was not used for calibration.
 
         Args:
             trial: predicted by the same model.
             rest: (M, 3) [m].
+
+        Returns:
+            (K,) share of the coordinates inside their interval, and (K,) half-widths [m], of the K markers and frames
+            that were seen.
         """
         seen, width = trial.seen, self.half_widths(trial.simulated, rest, trial.since, trial.spread)
         with np.errstate(invalid="ignore"):
             inside = (trial.errors <= width[..., None])[seen].mean(-1)
-        return Covered(inside, width[seen], np.linalg.norm(trial.simulated - rest, axis=-1)[seen])
-
-
-@dataclass(frozen=True)
-class Covered:
-    """Intervals at the K seen markers and frames of a trial.
-
-    Attributes:
-        inside: (K,) share of the coordinates inside their interval.
-        half_widths: (K,) [m].
-        moved: (K,) predicted displacement [m].
-    """
-
-    inside: FloatArray
-    half_widths: FloatArray
-    moved: FloatArray
+        return inside, width[seen]
 
 
 def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatArray:
@@ -191,25 +180,16 @@ def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatA
     return np.asarray(times - last)
 
 
-def coverage(trials: Sequence[Covered]) -> dict[str, Any]:
-    """Summarises trials with equal weight; those without a seen marker are left out.
+def coverage(covered: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, Any]:
+    """Summarises trials with equal weight, from `Intervals.covered`; those without a seen marker are left out.
 
     Returns:
-        ``coverage``, the share of the coordinates inside their interval; the mean ``half_width_mm``; ``by_amplitude``,
-        the coverage in the thirds of the predicted displacements, from the smallest.
+        ``coverage``, the share of the coordinates inside their interval, also ``by_trial``; the mean ``half_width_mm``.
     """
-    trials = [trial for trial in trials if len(trial.inside)]
-    weights = np.concatenate([np.full(len(trial.inside), 1.0 / len(trial.inside)) for trial in trials])
-    inside, widths, moved = (
-        np.concatenate([getattr(trial, name) for trial in trials]) for name in ("inside", "half_widths", "moved")
-    )
-    order = np.argsort(moved)
-    thirds = np.array_split(order, np.searchsorted(np.cumsum(weights[order]), len(trials) * np.array([1, 2]) / 3.0))
-    return {
-        "coverage": float(np.average(inside, weights=weights)),
-        "half_width_mm": 1e3 * float(np.average(widths, weights=weights)),
-        "by_amplitude": [float(np.average(inside[own], weights=weights[own])) if len(own) else None for own in thirds],
-    }
+    seen = {name: (float(x.mean()), float(w.mean())) for name, (x, w) in covered.items() if len(x)}
+    inside, widths = np.mean([*seen.values()], axis=0)
+    by_trial = {name: share for name, (share, _) in seen.items()}
+    return {"coverage": float(inside), "half_width_mm": 1e3 * float(widths), "by_trial": by_trial}
 
 
 def _parts(moved: FloatArray, since: FloatArray, spread: FloatArray | None) -> FloatArray:

@@ -30,23 +30,6 @@ _SMALLEST: Final = 1e-3  # fraction of the shear modulus below which a branch or
 
 
 @dataclass(frozen=True)
-class Library:
-    """Terms that a law may have.
-
-    Attributes:
-        terms: elastic terms by name, as in `ConvexMaterial`, besides `MODULUS`.
-        viscous: whether the law may have viscosities of shear and of bulk.
-        times: relaxation times of branches [s], ascending; none: no branches.
-        families: largest number of families of fibres.
-    """
-
-    terms: tuple[str, ...] = ("c20", "c01", "dilation", "ogden_3", "ogden_6")
-    viscous: bool = True
-    times: tuple[float, ...] = tuple(np.geomspace(0.01, 1.0, 13).tolist())
-    families: int = 1
-
-
-@dataclass(frozen=True)
 class LawClass:
     """A class of laws with the coefficients of the weak form.
 
@@ -88,24 +71,28 @@ class _Columns:
         return found, self._normal[-1].residual(indices, found)
 
 
-def fit_classes(train: WeakForm, held_out: WeakForm | None, library: Library) -> list[LawClass]:
+def fit_classes(
+    train: WeakForm, held_out: WeakForm | None, terms: Sequence[str], times: Sequence[float], families: int = 1
+) -> list[LawClass]:
     """Returns the law of every class, from the smallest to the largest; of equal laws, that of the smallest class.
 
     Args:
         train: balance of the training motions; its simulator has the terms of the library, one branch and a family of
             fibres.
         held_out: balance of the held-out motions; None: residuals are those of the training motions.
-        library: terms to choose from.
+        terms: elastic terms by name, as in `ConvexMaterial`, besides `MODULUS`.
+        times: relaxation times of branches [s], ascending; none: no branches.
+        families: largest number of families of fibres.
     """
     columns = _Columns(train, held_out)
     modulus = columns.add([{name: UNIT} for name in MODULUS])
     groups = {
-        "elastic": columns.add([{name: UNIT} for name in library.terms]),
-        "viscosity": columns.add([{name: _UNIT_VISCOSITY} for name in VISCOSITIES] if library.viscous else []),
-        "branches": columns.add([{"prony_modulus_1": UNIT, "prony_time_1": time} for time in library.times]),
+        "elastic": columns.add([{name: UNIT} for name in terms]),
+        "viscosity": columns.add([{name: _UNIT_VISCOSITY} for name in VISCOSITIES]),
+        "branches": columns.add([{"prony_modulus_1": UNIT, "prony_time_1": time} for time in times]),
     }
     base = modulus + list(chain.from_iterable(groups.values()))
-    groups["fibres"] = _families(columns, base, library.families)
+    groups["fibres"] = _families(columns, base, families)
     names = [name for name, members in groups.items() if members]
     laws = dict[tuple[int, ...], LawClass]()
     for chosen in chain.from_iterable(combinations(names, size) for size in range(len(names) + 1)):

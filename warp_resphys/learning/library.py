@@ -25,12 +25,12 @@ from ..io.errors import InputError
 from ..settings.learning import NetworkSettings, ReconstructionSettings, TrainerSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .bounds import Bounds
-from .identification import Identification, Identifier
+from .identification import Identification, ParameterSearch
+from .misfit import Misfit
 from .networks import ResidualForce, build_model
-from .parameters import configured_parameters
+from .parameters import Bounds, configured_parameters
 from .predictors import LearnedPredictor
-from .reconstruction import make_reconstructor, without_ringing
+from .reconstruction import follow, make_reconstructor, without_ringing
 from .replay import Replay, Start
 from .rollout import Predictor, Rollout, closed_loop
 from .training import Samples, Trainer
@@ -114,9 +114,9 @@ def identify(
         ConvergenceError: the simulation fails at every start.
     """
     ranges = {n: b if isinstance(b, Bounds) else Bounds(*b, logarithmic=min(b) > 0.0) for n, b in parameters.items()}
-    identifier = Identifier([motion.replay(simulator)], ranges)
+    search = ParameterSearch(Misfit([motion.replay(simulator)], ranges))
     guess = {**configured_parameters(simulator, ranges), **(first_guess or {})}
-    return identifier.run(identifier.starts(guess, starts, 4 * starts, seed), max_evaluations, tolerance=tolerance)
+    return search.run(search.starts(guess, starts, 4 * starts, seed), max_evaluations, tolerance=tolerance)
 
 
 def reconstruct(
@@ -149,17 +149,14 @@ def reconstruct(
         state = replay.initial_state(start, constants, resting)
         method = make_reconstructor(used, **dict(settings or ReconstructionSettings()), observation=motion.observation)
         method = method.with_constants(constants)
-        force, rows = torch.zeros_like(state.q), []
-        for step in range(replay.trials.observed.shape[1] - 1):
-            with torch.enable_grad():
-                reconstruction = method.step(state, replay.trials.observed[:, step + 1], inputs.at(step), force)
-            force = reconstruction.force.detach()
-            rows.append((state.q, state.v, force))
-            state = reconstruction.state.detach()
-        q, v, f = (torch.stack(series, 1).flatten(0, 1) for series in zip(*rows, strict=True))
-        context = _context(inputs, len(rows))
+        targets = replay.trials.observed[:, 1:].unbind(1)
+        steps = [*follow(method, state, targets, inputs)]
+        states = [state, *(step.state for step in steps)][:-1]
+        series = ([one.q for one in states], [one.v for one in states], [step.force for step in steps])
+        q, v, f = (torch.stack(values, 1).flatten(0, 1) for values in series)
+        context = _context(inputs, len(steps))
         actuation = None if context is None else context.transpose(0, 1).flatten(0, 1)
-    return Samples(q, v, (f,), actuation, (len(rows),) * replay.trials.observed.shape[0])
+    return Samples(q, v, (f,), actuation, (len(steps),) * replay.trials.observed.shape[0])
 
 
 def fit_force(

@@ -1,16 +1,15 @@
 """The misfit of a simulator to observed motions, as a function of the physical parameters to identify.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. Prior knowledge (`bounded_misfit`) is that of the parameters and of marker places (`placement`).
+all motions at once. Prior knowledge (`bounded_misfit`) is that of the parameters and of marker places (`nuisance`).
 
 A parameter may have a value for each trial or session (`parameters.own_name`), held by its prior; all others have the
 mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,18 +20,17 @@ from typing_extensions import override
 from ..data.markers import Markers
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
-from .bounded_misfit import BoundedMisfit, FloatArray, LinearMisfit
-from .bounds import Bounds
-from .left_out import LinearSystem, left_out
-from .nearby import NearbyMotion
-from .nuisance import NuisanceFit
-from .parameters import check_names, split_name
-from .placement import Accuracy, DisplacedMarkers, Placed
+from ..stepping.state import State
+from .bounded_misfit import BoundedMisfit, FloatArray
+from .nuisance import NuisanceFit, Nuisances
+from .parameters import Bounds, check_names, split_name
+from .placement import Accuracy, DisplacedMarkers
 from .replay import Replay, Start, exact
-from .uncertainty import Uncertainty, uncertainty_of
+from .uncertainty import LinearMisfit, LinearSystem, Uncertainty, left_out, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
+_MOST_BYTES = 2**30  # of the states, and of the derivatives, that are kept
 
 
 class Misfit(BoundedMisfit):
@@ -44,8 +42,9 @@ class Misfit(BoundedMisfit):
         bounds: range of each of the P parameters to identify.
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
+        labels: names of the markers, where `accuracy` is given.
         centre: (3,) about which recordings may be rotated [m].
-        known: values of further parameters, which are not identified.
+        known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
         delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisance.NuisanceFit`.
         shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
 
@@ -62,6 +61,7 @@ class Misfit(BoundedMisfit):
         bounds: Mapping[str, Bounds],
         seconds: float | None = None,
         accuracy: Accuracy | None = None,
+        labels: Sequence[str] = (),
         centre: Sequence[float] = (0.0, 0.0, 0.0),
         known: Mapping[str, float] | None = None,
         delay: float = 0.0,
@@ -77,7 +77,8 @@ class Misfit(BoundedMisfit):
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
         self._known = {} if known is None else dict(known)
-        self._accuracy, self._shares = accuracy, None if shares is None else np.array(shares)
+        self._accuracy, self._labels = accuracy, tuple(labels)
+        self._shares = None if shares is None else np.array(shares)
         self._replays: list[tuple[Replay, Start]] = []
         self._weights: list[torch.Tensor] = []
         count = sum(len(replay.trials.names) for replay, _ in replays)
@@ -106,35 +107,9 @@ class Misfit(BoundedMisfit):
 
     @override
     def forget(self) -> None:
-        """Forgets equilibria and motions with earlier parameters, from which the next ones are predicted."""
-        self._equilibria: list[_Equilibria | None] = [None] * len(self._replays)
-        owners = (self.simulator.tensor(self._owners(replay.trials)) for replay, _ in self._replays)
-        self._motions = [*map(NearbyMotion, owners)]
+        """Forgets motions with earlier parameters, from which the next ones are predicted."""
+        self._motions = [NearbyMotion(self.simulator.tensor(self._owners(r.trials))) for r, _ in self._replays]
         self._last: tuple[torch.Tensor, list[torch.Tensor]] | None = None  # of `_followed`
-
-    def losses(self, unit: torch.Tensor) -> torch.Tensor:
-        """(E,) losses of (E, P) parameters, differentiable."""
-        residuals, prior = self._residuals(unit)
-        weighted = [
-            (errors.square().sum((2, 3, 4)) * w).sum(1) for errors, w in zip(residuals, self._weights, strict=True)
-        ]
-        return torch.stack(weighted).sum(0) + prior.square().sum(1)
-
-    @override
-    def losses_or_infinite(self, points: FloatArray) -> FloatArray:
-        """(E,) losses of (E, P) parameters, without gradients; infinite where the simulation fails.
-
-        After a failure, the other parameters are simulated again without the failed ones.
-        """
-        losses, left = np.full(len(points), np.inf), np.arange(len(points))
-        while len(left):
-            try:
-                with torch.no_grad():
-                    losses[left] = self.losses(self.simulator.tensor(points[left])).cpu().numpy()
-                break
-            except ConvergenceError as error:
-                left = left[error.report.converged.view(len(left), -1).all(1).cpu().numpy()]
-        return losses
 
     @override
     def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
@@ -224,31 +199,13 @@ class Misfit(BoundedMisfit):
         return super().has_priors or not self._fit.is_empty
 
     @override
-    def placement(self, unit: FloatArray, labels: Sequence[str]) -> dict[str, Any] | None:
-        placed = self.placed(unit)
-        return None if placed is None else placed.plain(labels)
+    def placement(self, unit: FloatArray) -> dict[str, Any] | None:
+        return self.nuisances(unit).plain(self._labels)
 
-    def placed(self, unit: FloatArray) -> Placed | None:
-        """The best placements of the markers with (P,) parameters; None where they are exact."""
-        if self._accuracy is None:
-            return None
+    def nuisances(self, unit: FloatArray) -> Nuisances:
+        """The best places of the markers and delays of the trials with (P,) parameters."""
         with torch.no_grad():
-            series = self._followed(self.simulator.tensor(unit)[None])
-            return self._fit(series, self.prior_weight)[1].placed
-
-    def _residuals(self, unit: torch.Tensor) -> tuple[list[torch.Tensor], torch.Tensor]:
-        """(E, R, T, M, 3) simulated less observed markers of each replay [m], and (E, K) weighted prior residuals."""
-        series = self._simulated(unit)
-        weight = math.sqrt(self.prior_weight)
-        columns = [weight * (unit[:, i] - mean) / deviation for i, mean, deviation in self._priors]
-        rows = torch.stack(columns, 1) if columns else unit.new_zeros(len(unit), 0)
-        fitted, nuisance_rows = [], []
-        for row in range(len(unit)):
-            own, nuisances = self._fit([points[row : row + 1] for points in series], self.prior_weight)
-            fitted.append(own)
-            nuisance_rows.append(unit.new_tensor(nuisances.rows))
-        errors = [torch.cat(parts) for parts in zip(*fitted, strict=True)]
-        return errors, torch.cat([rows, torch.stack(nuisance_rows)], 1)
+            return self._fit(self._followed(self.simulator.tensor(unit)[None]), self.prior_weight)[1]
 
     def _values(self, unit: torch.Tensor) -> dict[str, torch.Tensor]:
         """(E,) values of each parameter; where trials have their own, the common one is the mean of the prior."""
@@ -256,14 +213,6 @@ class Misfit(BoundedMisfit):
         common = {split_name(name)[0]: range_ for name, range_ in self.bounds.items() if split_name(name)[1]}
         others = {name: range_.prior.mean for name, range_ in common.items() if range_.prior is not None} | self._known
         return {name: torch.full_like(unit[:, 0], value) for name, value in others.items()} | values
-
-    def _simulated(self, unit: torch.Tensor) -> list[torch.Tensor]:
-        """(E, R, T, M, 3) simulated points of each replay with (E, P) parameters [m]."""
-        values, simulated = self._values(unit), []
-        for (replay, start), equilibria in zip(self._replays, self._equilibria, strict=True):
-            begin = start if equilibria is None else start.near(equilibria.predicted(unit.detach()))
-            simulated.append(replay(begin, values))
-        return simulated
 
     def _followed(self, points: torch.Tensor) -> list[torch.Tensor]:
         """(E, R, T, M, 3) simulated points of each replay [m], predicted from those with earlier parameters.
@@ -277,9 +226,9 @@ class Misfit(BoundedMisfit):
             return self._last[1]
         unit, values, simulated = points[0], self._values(points), []
         first = {name: value[:1] for name, value in values.items()}
-        rows = zip(self._replays, self._equilibria, self._motions, strict=True)
-        for (replay, start), equilibria, motion in rows:
-            begin = start if equilibria is None else start.near(equilibria.predicted(points[:1]))
+        for (replay, start), motion in zip(self._replays, self._motions, strict=True):
+            guess = motion.predict(unit, 0) if start.at_rest else None
+            begin = start if guess is None else start.near(guess)
             states = motion.states(unit)
             if states is None:
                 states = replay.states(begin, first, partial(motion.predict, unit))
@@ -290,30 +239,65 @@ class Misfit(BoundedMisfit):
                 motion.differentiate(points)
                 simulated.append(replay.varied(begin, values, states, motion.record))
         self._last = points, simulated
-        self._keep_equilibria(points)
         return simulated
 
-    def _keep_equilibria(self, unit: torch.Tensor) -> None:
-        """Keeps the equilibria of the last simulation.
+
+class NearbyMotion:
+    """The last motion of R trials, and the last derivatives of its positions by P parameters.
+
+    A search for parameters simulates nearly the same motion again and again. Its prediction to first order, q(p) =
+    q(p0) + dq/dp (p - p0), is where the solver of an equilibrium or a step starts (`Simulator.step`): the error is of
+    second order in the change of the parameters, and smooth in time, so that the solver extrapolates it from step to
+    step. States are kept, so that derivatives can be computed after a simulation.
+
+    Args:
+        owners: (S, R, P) one where a direction of the derivatives changes a parameter of a trial, else zero.
+    """
+
+    def __init__(self, owners: torch.Tensor) -> None:
+        self._owners = owners
+        self._unit: torch.Tensor | None = None
+        self._states: Sequence[State] = ()
+        self._count = 0  # of the states, of which the first alone is kept where they are large
+        self._slopes: list[torch.Tensor] = []  # (S, R, N, 3) in float32, of each state [m]
+        self._steps = owners.new_zeros(())
+
+    def keep(self, unit: torch.Tensor, states: Sequence[State]) -> None:
+        """Keeps states of the motion with parameters (P,), as fractions of their ranges."""
+        small = sum(state.q.nbytes + state.v.nbytes for state in states) <= _MOST_BYTES
+        self._unit, self._states, self._count = unit, states if small else states[:1], len(states)
+
+    def states(self, unit: torch.Tensor) -> Sequence[State] | None:
+        """Returns the states with parameters (P,), if the last motion had these and they are kept."""
+        whole = len(self._states) == self._count > 0
+        return self._states if whole and self._unit is not None and torch.equal(unit, self._unit) else None
+
+    def predict(self, unit: torch.Tensor, number: int) -> torch.Tensor | None:
+        """Returns positions (R, N, 3) of a state with parameters (P,) [m]; None where nothing predicts them."""
+        if self._unit is None or number >= len(self._states):
+            return None
+        q = self._states[number].q
+        if number >= len(self._slopes):
+            return q if number == 0 else None
+        change = (self._owners @ (unit - self._unit)).to(self._slopes[number])
+        q = q + torch.einsum("sr,srni->rni", change, self._slopes[number])
+        return q if bool(q.isfinite().all()) else None
+
+    def differentiate(self, points: torch.Tensor) -> None:
+        """Begins derivatives by parameters (1 + S, P): those of the motion, and those changed along each direction."""
+        steps = torch.einsum("srp,sp->sr", self._owners, points[1:] - points[0])
+        self._steps, self._slopes = torch.where(steps == 0.0, torch.inf, steps)[..., None, None], []
+
+    def record(self, q: torch.Tensor, others: torch.Tensor) -> None:
+        """Keeps the derivatives of the next state, unless a long motion of a large body needs too much memory.
 
         Args:
-            unit: (1, P) parameters, or more rows in which the parameters of one of `_moves_of` are changed. Equilibria
-                of other rows that were simulated are ignored.
+            q: (R, N, 3) positions [m].
+            others: (S R, N, 3) those with the changed parameters [m].
         """
-        unit, before = unit.detach(), self._equilibria
-        self._equilibria = [None] * len(self._replays)
-        for number, (replay, start) in enumerate(self._replays):
-            if not start.at_rest or replay.settled is None:
-                continue
-            first, *others = replay.settled.split(len(replay.trials.names))[: len(unit)]
-            earlier = before[number]
-            slopes = None if earlier is None else earlier.slopes
-            if others:
-                change = (torch.stack(others) - first).flatten(2).cpu().numpy()
-                steps = (unit[1:] - unit[:1]).abs().sum(0) * (unit[1:] - unit[:1]).sum(0).sign()
-                own = self._slopes(change, self._moves, steps.cpu().numpy(), replay.trials)
-                slopes = torch.from_numpy(np.moveaxis(own, -1, 0).copy()).to(first).unflatten(2, first.shape[1:])
-            self._equilibria[number] = _Equilibria(unit[0], first, slopes)
+        slopes = ((others.unflatten(0, (-1, len(q))) - q) / self._steps).float()
+        if (len(self._slopes) + 1) * slopes.nbytes <= _MOST_BYTES:
+            self._slopes.append(slopes)
 
 
 def _moves_of(names: Iterable[str]) -> list[list[int]]:
@@ -323,18 +307,3 @@ def _moves_of(names: Iterable[str]) -> list[list[int]]:
         parameter, owner = split_name(name)
         moves.setdefault(parameter if owner else name, []).append(number)
     return [*moves.values()]
-
-
-@dataclass(frozen=True)
-class _Equilibria:
-    """Equilibria of R trials and their derivatives by the parameters."""
-
-    unit: torch.Tensor  # (P,) the parameters, as fractions of their ranges
-    q: torch.Tensor  # (R, N, 3) [m]
-    slopes: torch.Tensor | None  # (P, R, N, 3) derivatives [m]; None where not known
-
-    def predicted(self, unit: torch.Tensor) -> torch.Tensor:
-        """(E R, N, 3) equilibria with (E, P) other parameters, to first order [m]."""
-        if self.slopes is None:
-            return self.q.repeat(len(unit), 1, 1)
-        return (self.q + torch.einsum("ep,prni->erni", unit - self.unit, self.slopes)).flatten(0, 1)

@@ -2,24 +2,27 @@
 
 Both are nuisance parameters with a normal prior around zero: the marker places of `placement`, and the time by which
 the inputs of each trial act later than recorded, as clocks differ, frames are lost, and a valve opens when it likes. A
-delay moves a motion in time, so that it needs no simulation of its own.
+delay moves a motion in time, so that it needs no simulation of its own. For each set of physical parameters, they take
+the values with the least sum of squares, prior included (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413).
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .placement import Accuracy, DisplacedMarkers, Placed, estimate_placement
+from .placement import Accuracy, DisplacedMarkers, Placement, by_placement
 from .replay import Replay, Start, sample
 
 FloatArray = NDArray[np.float64]
 
 _FURTHEST, _TRIED = 3.0, 61  # largest delay, in expected deviations, and number of delays from which the search begins
-_STEPS, _ROUNDS = 6, 3  # Gauss-Newton steps of a delay; estimates of places and delays in turn
+_TURNS, _STEPS = 4, 6  # Gauss-Newton steps of places, as rotations by a few degrees are nearly linear; with delays
+_LONGEST = 0.5  # change of a delay in a step, in expected deviations
 _DIFFERENCE = 1e-2  # of the time between frames, for the derivative by a delay
 
 
@@ -28,15 +31,26 @@ class Nuisances:
     """The best places and delays for one set of parameters.
 
     Attributes:
-        placed: places of the markers; None if they are exact.
         columns: (R, D, K) derivatives of the weighted residuals of each group, in standard deviations of the prior;
             empty if nothing was fitted.
         rows: (K,) weighted residuals of the prior.
+        sessions: placement of the markers in each session; empty if it is exact.
+        common: placement in a session that is not known.
+        moves: (3 M + 6, k) change of the offsets, the shift and the turn of a session by the first k nuisances.
     """
 
-    placed: Placed | None
-    columns: list[FloatArray]
-    rows: FloatArray
+    columns: Sequence[FloatArray] = ()
+    rows: FloatArray = field(default_factory=lambda: np.zeros(0))
+    sessions: Mapping[str, Placement] = field(default_factory=dict)
+    common: Placement | None = None
+    moves: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def plain(self, labels: Sequence[str]) -> dict[str, Any] | None:
+        """Returns the placements as JSON data: the common one, and those of the named `sessions`; None without any."""
+        if self.common is None:
+            return None
+        named = {session: placement.plain(labels) for session, placement in self.sessions.items() if session}
+        return self.common.plain(labels) | ({"sessions": named} if named else {})
 
     def projected(self, jacobians: Sequence[FloatArray], weight: float) -> tuple[list[FloatArray], FloatArray]:
         """Derivatives of the residuals, and of those of the prior, where places and delays follow the parameters.
@@ -57,20 +71,31 @@ class Nuisances:
         follows = np.linalg.solve(rows.T @ rows + weight**2 * np.eye(rows.shape[1]), rows.T @ slopes)
         return [own for a, j in pairs for own in j - a @ follows], -weight * follows
 
-    def change(self, residuals: Sequence[FloatArray], weight: float) -> FloatArray:
-        """(K,) change of places and delays, in standard deviations, by which residuals have their least squares.
+    def change(self, session: str, residuals: Sequence[FloatArray], weight: float) -> list[float] | None:
+        """(3 M + 6,) change of a session's placement by which residuals have their least squares.
 
         Args:
+            session: name of the session.
             residuals: (R, D) of each group, to first order with the places and delays as they are.
             weight: root of the weight of the prior.
+
+        Returns:
+            The change; None if places are exact.
         """
+        if self.common is None:
+            return None
         columns = np.concatenate([own.reshape(-1, own.shape[-1]) for own in self.columns])
         right = columns.T @ np.concatenate([own.ravel() for own in residuals]) + weight * self.rows
-        return np.asarray(-np.linalg.solve(columns.T @ columns + weight**2 * np.eye(len(right)), right))
+        moved = -np.linalg.solve(columns.T @ columns + weight**2 * np.eye(len(right)), right)
+        moves = self.moves[session]
+        return [float(value) for value in moves @ moved[: moves.shape[1]]]
 
 
 class NuisanceFit:
-    """Fits places and delays to simulated points.
+    """Fits places and delays to simulated points, by Gauss-Newton.
+
+    The unknowns are in standard deviations of the prior: the common placement; what each session's differs from it by,
+    if there are several; and the delays of trials whose motion inputs begin, with those of their starts.
 
     Args:
         replays: groups of trials, whose points are `DisplacedMarkers` where places are uncertain.
@@ -90,13 +115,28 @@ class NuisanceFit:
     ) -> None:
         self._replays, self._weights = [*replays], [*weights]
         self._accuracy, self._centre, self._delay = accuracy, centre, delay
-        frames = [replay.trials.observed.shape[1] for replay, _ in replays]
-        self._late = [delay > 0.0 and own[1].at_rest and count > 2 for own, count in zip(replays, frames, strict=True)]
+        self._moves: dict[str | None, torch.Tensor] = {}  # None: of the common placement
+        self._places = 0
+        if accuracy is not None:
+            names = [*dict.fromkeys(replay.trials.session for replay, _ in replays)]
+            names = names if len(names) > 1 else []
+            common = accuracy.directions(replays[0][0].trials.observed)
+            shares = torch.eye(len(names)).to(common) * accuracy.between_sessions
+            for name, share in zip((None, *names), (torch.zeros(len(names)), *shares), strict=True):
+                self._moves[name] = torch.cat([common, *(own * common for own in share)], 1)
+            self._moves.setdefault(replays[0][0].trials.session, common)
+            self._places = self._moves[None].shape[1]
+        self._late, count = list[slice | None](), self._places
+        for replay, start in replays:
+            is_late = delay > 0.0 and start.at_rest and replay.trials.observed.shape[1] > 2
+            self._late.append(slice(count, count + len(start.delay)) if is_late else None)
+            count += len(start.delay) if is_late else 0
+        self._count = count
 
     @property
     def is_empty(self) -> bool:
         """Whether there is nothing to fit."""
-        return self._accuracy is None and not any(self._late)
+        return self._count == 0
 
     def __call__(self, series: Sequence[torch.Tensor], prior_weight: float) -> tuple[list[torch.Tensor], Nuisances]:
         """Residuals with the best places and delays for the first set of parameters, at which the loss is stationary.
@@ -110,108 +150,107 @@ class NuisanceFit:
         Returns:
             (E, R, T, M, 3) by group [m], and what was fitted.
         """
-        delays = [torch.zeros_like(start.delay) for _, start in self._replays]
+        solution = self._centre.new_zeros(self._count)
+        for (_, start), late in zip(self._replays, self._late, strict=True):
+            if late is not None:
+                solution[late] = start.delay / self._delay
         if self.is_empty or not prior_weight:
-            errors = [self._errors(n, own, delays[n], None) for n, own in enumerate(series)]
-            return errors, Nuisances(None, [], np.zeros(0))
-        first, placed = [own[:1].detach() for own in series], None
+            return [self._errors(n, own, solution) for n, own in enumerate(series)], Nuisances()
+        first = [own[:1].detach() for own in series]
         with torch.no_grad():
-            for turn in range(_ROUNDS if any(self._late) and self._accuracy is not None else 1):
-                placed = self._placed(first, delays, prior_weight)
-                delays = [self._delayed(n, own, delays[n], placed, prior_weight, turn) for n, own in enumerate(first)]
-            if any(self._late):
-                placed = self._placed(first, delays, prior_weight)
-        errors = [self._errors(n, own, delays[n], placed) for n, own in enumerate(series)]
-        return errors, self._fitted(first, delays, placed, math.sqrt(prior_weight))
+            for _ in range(_TURNS if self._accuracy is not None and self._accuracy.turn else 1):
+                solution = self._improved(first, solution, prior_weight, self._places)
+            if self._count > self._places:
+                solution = self._on_grid(first, solution, prior_weight)
+                for _ in range(_STEPS):
+                    solution = self._improved(first, solution, prior_weight, self._count)
+            columns = [own.flatten(1, 3).double().cpu().numpy() for _, own in self._linearised(first, solution)]
+        placed = {name: self._placement(name, solution) for name in self._moves}
+        fitted = Nuisances(
+            columns=columns,
+            rows=math.sqrt(prior_weight) * solution.double().cpu().numpy(),
+            sessions={replay.trials.session: placed[replay.trials.session] for replay, _ in self._replays}
+            if placed
+            else {},
+            common=placed.get(None),
+            moves={name: own.double().cpu().numpy() for name, own in self._moves.items() if name is not None},
+        )
+        return [self._errors(n, own, solution) for n, own in enumerate(series)], fitted
 
-    def _moved(self, number: int, points: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
-        """(E, R, T, M or 4 M, 3) points of a group, later by delays (R,) [s]."""
-        if not self._late[number]:
+    def _placement(self, session: str | None, solution: torch.Tensor) -> Placement:
+        moved = self._moves[session] @ solution[: self._places]
+        return Placement(moved[:-6].view(-1, 3), moved[-6:-3], moved[-3:], self._centre)
+
+    def _points(self, number: int, points: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
+        """(E, R, T, M or 4 M, 3) points of a group, later by its delays."""
+        late, (replay, start) = self._late[number], self._replays[number]
+        if late is None:
             return points
-        times = self._replays[number][0].trials.times
-        step, late = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(points), 1)
-        series, beyond = points.flatten(0, 1), (late - times.max()).clamp_min(0.0)[..., None, None]
+        times, delay = replay.trials.times, self._delay * solution[late] - start.delay
+        step, at = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(points), 1)
+        series, beyond = points.flatten(0, 1), (at - times.max()).clamp_min(0.0)[..., None, None]
         ahead = beyond * (series[:, -1:] - series[:, -2:-1]) / step  # straight on after the last frame
-        return (sample(series, late, step) + ahead).unflatten(0, points.shape[:2])
+        return (sample(series, at, step) + ahead).unflatten(0, points.shape[:2])
 
-    def _errors(self, number: int, points: torch.Tensor, delay: torch.Tensor, placed: Placed | None) -> torch.Tensor:
-        """(E, R, T, M, 3) residuals of a group with places and delays (R,) [m]."""
-        replay, points = self._replays[number][0], self._moved(number, points, delay)
+    def _errors(self, number: int, points: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
+        """(E, R, T, M, 3) residuals of a group [m]."""
+        replay, points = self._replays[number][0], self._points(number, points, solution)
         if self._accuracy is None:
             return replay.errors(points)
         markers, rotations = DisplacedMarkers.split(points)
-        if placed is None:
-            return replay.errors(markers)
-        own = placed.sessions[replay.trials.session]
+        own = self._placement(replay.trials.session, solution)
         return replay.errors(own.apply(markers + (rotations @ own.offsets[..., None])[..., 0]))
 
-    def _placed(
-        self, first: Sequence[torch.Tensor], delays: Sequence[torch.Tensor], prior_weight: float
-    ) -> Placed | None:
-        """The best places of the markers with given delays."""
-        if self._accuracy is None:
-            return None
-        parts = [DisplacedMarkers.split(self._moved(n, own, delays[n])) for n, own in enumerate(first)]
-        return estimate_placement(
-            self._accuracy,
-            self._centre,
-            [self._errors(n, own, delays[n], None)[0] for n, own in enumerate(first)],
-            [replay.trials.seen for replay, _ in self._replays],
-            [points[0] for points, _ in parts],
-            [rotations[0] for _, rotations in parts],
-            self._weights,
-            prior_weight,
-            [replay.trials.session for replay, _ in self._replays],
-        )
+    def _linearised(
+        self, first: Sequence[torch.Tensor], solution: torch.Tensor
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Weighted residuals (R, T, M, 3) of each group and their derivatives (R, T, M, 3, K)."""
+        result = []
+        for number, (points, weight) in enumerate(zip(first, self._weights, strict=True)):
+            replay, late, root = self._replays[number][0], self._late[number], weight.sqrt()[:, None, None, None]
+            errors = self._errors(number, points, solution)[0]
+            columns = errors.new_zeros(*errors.shape, self._count)
+            if self._accuracy is not None:
+                markers, rotations = DisplacedMarkers.split(self._points(number, points, solution)[0])
+                own = self._placement(replay.trials.session, solution)
+                placed = own.apply(markers + (rotations @ own.offsets[..., None])[..., 0])
+                slopes = by_placement(own, placed, rotations) * replay.trials.seen[..., None, None]
+                columns[..., : self._places] = slopes @ self._moves[replay.trials.session]
+            if late is not None:
+                step, rows = _DIFFERENCE * float(replay.trials.times[0, 1]), torch.arange(len(errors))
+                ends = []
+                for by in (step, -step):
+                    moved = solution.clone()
+                    moved[late] += by / self._delay
+                    ends.append(self._errors(number, points, moved)[0])
+                columns[rows, ..., late.start + rows] = (ends[0] - ends[1]) * self._delay / (2.0 * step)
+            result.append((errors * root, columns * root[..., None]))
+        return result
 
-    def _delayed(
-        self, number: int, points: torch.Tensor, delay: torch.Tensor, placed: Placed | None, prior: float, turn: int
+    def _improved(
+        self, first: Sequence[torch.Tensor], solution: torch.Tensor, prior_weight: float, count: int
     ) -> torch.Tensor:
-        """The best delays (R,) of a group with given places, in the first turn from the best of a grid."""
-        if not self._late[number]:
-            return delay
-        weight, before = self._weights[number], self._replays[number][1].delay
+        """The solution after a step of the first unknowns of a number."""
+        normal, right = prior_weight * torch.eye(count).to(solution), torch.zeros_like(solution[:count])
+        for residual, columns in self._linearised(first, solution) if count else ():
+            jacobian = columns[..., :count].flatten(0, 3)
+            normal = normal + jacobian.T @ jacobian
+            right = right - jacobian.T @ (residual.flatten() - jacobian @ solution[:count])
+        change = torch.linalg.solve(normal, right) - solution[:count]
+        change[self._places :].clamp_(-_LONGEST, _LONGEST)
+        return torch.cat([solution[:count] + change, solution[count:]])
 
-        def cost(at: torch.Tensor) -> torch.Tensor:
-            squares = self._errors(number, points, at, placed)[0].square().sum((1, 2, 3))
-            return weight * squares + prior * ((before + at) / self._delay).square()
-
-        if turn == 0:
-            grid = self._delay * torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(delay)
-            delay = grid[torch.stack([cost(at.expand_as(delay)) for at in grid]).argmin(0)]
-        for _ in range(_STEPS):
-            errors, slopes = self._errors(number, points, delay, placed)[0], self._slopes(number, points, delay, placed)
-            right = weight * (slopes * errors).sum((1, 2, 3)) + prior * (before + delay) / self._delay**2
-            step = right / (weight * slopes.square().sum((1, 2, 3)) + prior / self._delay**2)
-            delay = delay - step.clamp(-0.5 * self._delay, 0.5 * self._delay)
-        return delay
-
-    def _slopes(self, number: int, points: torch.Tensor, delay: torch.Tensor, placed: Placed | None) -> torch.Tensor:
-        """(R, T, M, 3) derivatives of the residuals of a group by delays (R,) [m/s]."""
-        times = self._replays[number][0].trials.times
-        step = _DIFFERENCE * float(times[0, 1])
-        ends = [self._errors(number, points, delay + by, placed)[0] for by in (step, -step)]
-        return (ends[0] - ends[1]) / (2.0 * step)
-
-    def _fitted(
-        self, first: Sequence[torch.Tensor], delays: list[torch.Tensor], placed: Placed | None, weight: float
-    ) -> Nuisances:
-        """What was fitted, with the derivatives of the residuals and the residuals of the prior."""
-        blocks, rows = list[FloatArray](), list[FloatArray]()
-        counts = [len(delay) if late else 0 for delay, late in zip(delays, self._late, strict=True)]
-        for number, (points, delay) in enumerate(zip(first, delays, strict=True)):
-            size = points.shape[1]
-            columns = np.zeros((size, self._replays[number][0].trials.observed[0].numel(), sum(counts)))
-            if self._late[number]:
-                root = self._weights[number].sqrt()[:, None, None, None] * self._delay
-                slopes = (self._slopes(number, points, delay, placed) * root).flatten(1).double().cpu().numpy()
-                at = sum(counts[:number]) + np.arange(size)
-                columns[np.arange(size), :, at] = slopes
-                before = self._replays[number][1].delay
-                rows.append(weight * ((before + delay) / self._delay).double().cpu().numpy())
-            blocks.append(columns)
-        if placed is not None:
-            places = [own.flatten(1, 3).double().cpu().numpy() for own in placed.columns]
-            blocks = [np.concatenate(pair, 2) for pair in zip(places, blocks, strict=True)]
-            rows.insert(0, weight * placed.deviations.double().cpu().numpy())
-        return Nuisances(placed, blocks, np.concatenate(rows))
+    def _on_grid(self, first: Sequence[torch.Tensor], solution: torch.Tensor, prior_weight: float) -> torch.Tensor:
+        """The solution with the best delays of a grid for each trial."""
+        grid, best = torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(solution), solution.clone()
+        for number, (points, late) in enumerate(zip(first, self._late, strict=True)):
+            if late is None:
+                continue
+            costs = []
+            for by in grid:
+                moved = solution.clone()
+                moved[late] += by
+                squares = self._errors(number, points, moved)[0].square().sum((1, 2, 3))
+                costs.append(self._weights[number] * squares + prior_weight * moved[late].square())
+            best[late] += grid[torch.stack(costs).argmin(0)]
+        return best

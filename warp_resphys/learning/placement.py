@@ -5,9 +5,7 @@ rotated by w about a centre c, so that a simulated marker y_m is observed at
 
     x = c + R(w) (y_m(q; b_m) - c) + t
 
-All of these are nuisance parameters with a normal prior around zero. For each set of physical parameters, they take the
-values with the least sum of squares, prior included (variable projection, Golub and Pereyra, SIAM J. Numer. Anal. 10
-(1973) 413).
+All of these are nuisance parameters with a normal prior around zero (`nuisance`).
 """
 
 import math
@@ -26,7 +24,6 @@ from ..data.observation import Observation
 FloatArray = NDArray[np.float64]
 
 _DIRECTIONS = 3
-_ITERATIONS = 4  # enough, as rotations by a few degrees are nearly linear
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ class Placement:
 
 
 def placement_of(plain: Mapping[str, Any], labels: Sequence[str], session: str = "") -> Placement:
-    """Returns the placement of a session from `Placed.plain`; the common one for a session that is not known."""
+    """Returns the placement of a session from `Nuisances.plain`; the common one for a session that is not known."""
     return Placement.from_plain(plain.get("sessions", {}).get(session, plain), labels)
 
 
@@ -190,109 +187,6 @@ class DisplacedMarkers(Observation):
         """Markers (..., M, 3) [m] and the rotations of the body there (..., M, 3, 3), from points (..., 4 M, 3)."""
         markers, *displaced = points.chunk(1 + _DIRECTIONS, -2)
         return markers, torch.stack([copy - markers for copy in displaced], -1)
-
-
-@dataclass(frozen=True)
-class Placed:
-    """Placements with the least sum of squares.
-
-    Attributes:
-        common: placement of a session that is not known.
-        sessions: placement of each session.
-        deviations: (K,) the common placement and what those of the sessions differ from it by, in standard deviations;
-            the former alone for one session.
-        directions: (3 M + 6, k) offsets, shift and turn by a standard deviation of the common placement.
-        between: those of a session's deviation from it, over these.
-        columns: (R, T, M, 3, K) derivatives of the weighted residuals by these, by group of trials.
-    """
-
-    common: Placement
-    sessions: dict[str, Placement]
-    deviations: torch.Tensor
-    directions: torch.Tensor
-    between: float
-    columns: list[torch.Tensor]
-
-    def change(self, session: str, deviations: torch.Tensor) -> torch.Tensor:
-        """(3 M + 6,) change of the offsets, the shift and the turn of a session by changes (K,) of `deviations`."""
-        moved, *own = deviations.split(self.directions.shape[1])
-        if own:
-            moved = moved + self.between * own[[*self.sessions].index(session)]
-        return self.directions @ moved
-
-    def plain(self, labels: Sequence[str]) -> dict[str, Any]:
-        """Returns the placements as JSON data: the common one, and those of the named `sessions`."""
-        named = {session: placement.plain(labels) for session, placement in self.sessions.items() if session}
-        return self.common.plain(labels) | ({"sessions": named} if named else {})
-
-
-def estimate_placement(
-    accuracy: Accuracy,
-    centre: torch.Tensor,
-    errors: Sequence[torch.Tensor],
-    seen: Sequence[torch.Tensor],
-    points: Sequence[torch.Tensor],
-    rotations: Sequence[torch.Tensor],
-    weights: Sequence[torch.Tensor],
-    prior_weight: float,
-    sessions: Sequence[str] | None = None,
-) -> Placed:
-    """Returns the placement with the least sum of squares for one set of physical parameters (Gauss-Newton).
-
-    Sequences have one entry for each group of trials.
-
-    Args:
-        accuracy: prior standard deviations.
-        centre: (3,) about which recordings are rotated [m].
-        errors: (R, T, M, 3) simulated less observed markers [m], zero where a marker was not seen.
-        seen: (R, T, M) bool, whether a marker was seen.
-        points: (R, T, M, 3) simulated markers [m].
-        rotations: (R, T, M, 3, 3) of the body at the markers.
-        weights: (R,) of each trial's squared errors [1/m^2].
-        prior_weight: of the squared placement in standard deviations.
-        sessions: of the groups; None for one.
-    """
-    own = [""] * len(errors) if sessions is None else [*sessions]
-    names = [*dict.fromkeys(own)]
-    count, common = errors[0].shape[-2], accuracy.directions(errors[0])
-    size, further = common.shape[1], len(names) if len(names) > 1 else 0
-    solution = common.new_zeros(size * (1 + further))
-
-    def placement(values: torch.Tensor) -> Placement:
-        moved = common @ values
-        return Placement(moved[:-6].view(count, 3), moved[-6:-3], moved[-3:], centre)
-
-    def at(values: torch.Tensor) -> dict[str, Placement]:
-        first, *others = values.split(size)
-        own = [accuracy.between_sessions * other for other in others] or [0.0]
-        return {name: placement(first + other) for name, other in zip(names, own, strict=True)}
-
-    def columns(placements: Mapping[str, Placement]) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Residuals (R, T, M, 3) and their derivatives (R, T, M, 3, K), weighted."""
-        result = []
-        for session, error, visible, nominal, rotation, weight in zip(
-            own, errors, seen, points, rotations, weights, strict=True
-        ):
-            root, where = weight.sqrt()[:, None, None, None] * visible[..., None], placements[session]
-            placed = where.apply(nominal + (rotation @ where.offsets[..., None])[..., 0])
-            slopes = error.new_zeros(*error.shape, len(solution))
-            slopes[..., :size] = by_placement(where, placed, rotation) * root[..., None] @ common
-            if further:
-                own_columns = slice((1 + names.index(session)) * size, (2 + names.index(session)) * size)
-                slopes[..., own_columns] = accuracy.between_sessions * slopes[..., :size]
-            result.append(((error + placed - nominal) * root, slopes))
-        return result
-
-    for _ in range(_ITERATIONS if accuracy.turn else 1):
-        normal, right = torch.diag(torch.full_like(solution, prior_weight)), torch.zeros_like(solution)
-        for residual, slopes in columns(at(solution)):
-            jacobian = slopes.flatten(0, 3)
-            normal = normal + jacobian.T @ jacobian
-            right = right - jacobian.T @ (residual.flatten() - jacobian @ solution)
-        solution = torch.linalg.solve(normal, right)
-    placements = at(solution)
-    own_columns = [c for _, c in columns(placements)]
-    return Placed(placement(solution[:size]), placements, solution, common, accuracy.between_sessions, own_columns)
 
 
 def by_placement(placement: Placement, placed: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:

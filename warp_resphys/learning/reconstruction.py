@@ -13,7 +13,7 @@ markers do not determine to zero.
 import copy
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -203,6 +203,25 @@ class LBFGSB(Reconstructor):
         with torch.no_grad():
             new, _ = sim.step(state, acting.plus(force), self._constants)
         return Reconstruction(new, force, int(result.nit))
+
+
+def follow(
+    method: Reconstructor, state: State, targets: Iterable[torch.Tensor], inputs: Inputs | None = None
+) -> Iterator[Reconstruction]:
+    """Yields the steps that bring bodies to observed points; each starts from the force of the last one.
+
+    Args:
+        method: reconstruction method.
+        state: at the start.
+        targets: (B, M, D) measured points at the end of each step [unit].
+        inputs: of the steps.
+    """
+    force = torch.zeros_like(state.q)
+    for number, observed in enumerate(targets):
+        with torch.enable_grad():
+            result = method.step(state, observed, None if inputs is None else inputs.at(number), force)
+        state, force = result.state.detach(), result.force.detach()
+        yield Reconstruction(state, force, result.iterations)
 
 
 def without_ringing(simulator: Simulator, observation: Observation) -> Simulator:

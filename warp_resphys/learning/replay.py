@@ -117,7 +117,6 @@ class Replay:
         trials: observed trials.
 
     Attributes:
-        settled: (E R, N, 3) initial equilibria of the last simulation [m]; None if the trials did not begin at rest.
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
             energy, such as ``tendon_stiffness_left`` of a tendon ``left``; a factor on the weights that hang on the
             body; components of gravity's tilt; and for every input a factor on its commands, their delay [s], the rise
@@ -129,7 +128,6 @@ class Replay:
 
     def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:
         self.simulator, self.observe, self.trials = simulator, observe, trials
-        self.settled: torch.Tensor | None = None
         self.parameter_names = identifiable_parameters(simulator)
         self._shaped = tuple(name for name, q in simulator.parameters.items() if q.shape and name != "gravity")
 
@@ -211,9 +209,7 @@ class Replay:
         if not start.at_rest:
             return State(q, v)
         if force is None or not self.is_static:
-            state = self.simulator.static_equilibrium(resting, constants, start=q)
-            self.settled = state.q.detach()
-            return state
+            return self.simulator.static_equilibrium(resting, constants, start=q)
         return equilibrium_under_feedback(
             self.simulator, resting, constants, State(q, v), lambda state: force(state, 0)
         )
@@ -273,18 +269,17 @@ class Replay:
         """K + 1 states of R trials at the steps, from the release on, with one set of parameters.
 
         Args:
-            start: of the R trials, or of these for several sets of parameters, of which the first are taken.
+            start: of the R trials.
             parameters: (1,) values, by any of `parameter_names`.
-            near: predicts the positions (R, N, 3) at the end of a step [m], see `Simulator.step`.
+            near: predicts the positions (R, N, 3) of a state by its number [m], see `Simulator.step`.
 
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
         constants, inputs, resting = self.prepare(parameters)
-        first = replace(start, state=start.state.map(lambda t: t[: len(self.trials.names)]))
-        states = [self.initial_state(first, constants, resting)]
+        states = [self.initial_state(start, constants, resting)]
         for k in range(self.steps(start)):
-            states.append(self._step(states[-1], inputs.at(k), constants, None if near is None else near(k)))
+            states.append(self._step(states[-1], inputs.at(k), constants, None if near is None else near(k + 1)))
         return states
 
     def _step(self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None) -> State:
@@ -305,7 +300,6 @@ class Replay:
 
     def seen(self, start: Start, states: Sequence[State]) -> torch.Tensor:
         """(1, R, T, M, 3) points at the times of the frames [m], from `states`."""
-        self.settled = states[0].q if start.at_rest else None
         return self.at_frames(self._observed(state.q for state in states), start)[None]
 
     def varied(
@@ -334,10 +328,10 @@ class Replay:
         there: differences to the first set are exact to first order, for one factor and one residual each.
 
         Args:
-            start: of the R trials, or of these for each set of parameters.
+            start: of the R trials.
             parameters: (E,) values, by any of `parameter_names`; E is two or more.
             states: `states` of the first set; simulated if omitted.
-            record: called after each step with the positions (R, N, 3) of the first set and those of the others [m].
+            record: called for each state with the positions (R, N, 3) of the first set and those of the others [m].
 
         Raises:
             ConvergenceError: see `Simulator.step`.
@@ -361,7 +355,8 @@ class Replay:
             here = self._beside[0].linearise_equilibrium(resting, own, state.batch)
             there = self._beside[1].linearise_equilibrium(their_resting, their, sets * state.batch)
             varied = self._varied(state.q, here, there)
-        self.settled = torch.cat([state.q, varied.q]) if start.at_rest else None
+        if record is not None:
+            record(state.q, varied.q)
         yield torch.cat([state.q, varied.q])
         for k, (state, solved) in enumerate(itertools.pairwise(states)):
             here = self._beside[0].linearise(state, inputs.at(k), own)

@@ -46,14 +46,6 @@ class KnownMotion:
     inputs: Inputs = field(default_factory=Inputs)  # during the steps
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Coefficients of a fit."""
-
-    coefficients: FloatArray  # (K,)
-    residual: float  # root mean square over that without these forces
-
-
 class WeakForm:
     """Balance of forces of motions.
 
@@ -179,17 +171,3 @@ class NormalEquations:
         quadratic = float(theta @ self.matrix[np.ix_(members, members)] @ theta)
         left = quadratic - 2.0 * float(theta @ self.right[members]) + self.square
         return math.sqrt(max(left, 0.0) / self.square)
-
-
-def fit(columns: FloatArray, target: FloatArray) -> Fit:
-    """Returns the non-negative least-squares solution of columns (R, K) theta = target (R,).
-
-    The columns are scaled to unit length, and the normal equations are solved, as R is much larger than K.
-    """
-    theta = NormalEquations.of(columns, target).fit(range(columns.shape[1]))
-    return Fit(theta, residual_of(columns @ theta, target))
-
-
-def residual_of(forces: FloatArray, target: FloatArray) -> float:
-    """Returns the root mean square of forces less target, over that of the target."""
-    return float(np.linalg.norm(forces - target) / np.linalg.norm(target))

@@ -228,15 +228,10 @@ def _contributions(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) -> str:
-    text = (
+    return (
         f"The reconstruction for {MODELS[model][0]} leaves the {of} of the training trials at a mean distance of "
-        f"{mm_text(reconstructed['mean_mm'])} from the observed ones, {mm_text(reconstructed['max_mm'])} at most"
+        f"{mm_text(reconstructed['mean_mm'])} from the observed ones, {mm_text(reconstructed['max_mm'])} at most."
     )
-    if "replayed_mm" not in reconstructed:
-        return f"{text}."
-    replayed = reconstructed["replayed_mm"]
-    effect = "make it fail" if replayed is None else f"give an error of {mm_text(replayed)}"
-    return f"{text}; replayed in the simulator, its forces {effect} on the validation trials."
 
 
 def when_text(first: Mapping[str, float]) -> str:

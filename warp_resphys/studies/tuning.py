@@ -10,7 +10,8 @@ import json
 import logging
 import math
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from optuna.trial import Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..experiment.experiment import LEARNED, Experiment
-from ..experiment.learn import Learning, run_epochs
+from ..experiment.learn import Prepared, run_epochs, trainer_of
 from ..experiment.trials import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
@@ -69,7 +70,7 @@ def tune(settings: TunedRun, folder: Path) -> None:
     _, acquired = acquire(run, folder, wait=True)
     *before, trained = _stages(run, search.model, acquired)
     run_stages(before, folder, wait=True)
-    learning = Learning(Experiment(trained.settings, folder), search.model)
+    experiment = Experiment(trained.settings, folder)
     conditions = [training.plain(), str(space), *(stage.settings.plain() for stage in (*before, trained))]
     name = f"{search.model} {hashlib.sha256(json.dumps(conditions, sort_keys=True).encode()).hexdigest()[:12]}"
     optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -77,7 +78,7 @@ def tune(settings: TunedRun, folder: Path) -> None:
         study = optuna.create_study(storage=f"sqlite:///{folder / 'tune.db'}", study_name=name, load_if_exists=True)
         while len(study.get_trials(deepcopy=False, states=_FINISHED)) < search.trials:
             study.sampler = optuna.samplers.TPESampler(seed=search.seed + len(study.trials))
-            _run_trial(study, study.ask(space), learning, training)
+            _run_trial(study, study.ask(space), partial(trainer_of, experiment, search.model), training)
         _print(study, search)
     except (SQLAlchemyError, StorageInternalError) as error:
         raise DataFileError(f"cannot use {folder / 'tune.db'} ({error}): make it writable, or delete it.") from error
@@ -151,7 +152,9 @@ def _stages(run: RunSettings, model: str, acquired: str) -> list[Stage]:
     return [stage for name, stage in stages.items() if name in wanted]
 
 
-def _run_trial(study: optuna.Study, trial: Trial, learning: Learning, training: TrainingSettings) -> None:
+def _run_trial(
+    study: optuna.Study, trial: Trial, prepared: Callable[[TrainingSettings], Prepared], training: TrainingSettings
+) -> None:
     """Trains with the settings of a trial, and stores its error [mm]; infinite where every roll-out diverged."""
     words = ", ".join(f"{key} {_text(value)}" for key, value in trial.params.items())
     log.info("trial %d: %s", trial.number, words)
@@ -163,7 +166,7 @@ def _run_trial(study: optuna.Study, trial: Trial, learning: Learning, training: 
                 raise optuna.TrialPruned
 
     try:
-        trainer = learning.trainer(_changed(training, trial.params)).trainer
+        trainer, _ = prepared(_changed(training, trial.params))
         run_epochs(f"trial {trial.number}", trainer, lambda kept: None, watch)
         error = trainer.best_error if math.isfinite(trainer.best_error) else math.inf
         study.tell(trial, error)

@@ -9,6 +9,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,9 +24,8 @@ from ...io.errors import InputError
 from ...io.files import atomic_hdf5, create, read_json, write_json
 from ...io.progress import Progress
 from ...io.stages import Stage, StageContext, package_versions, resources_used
-from ...learning.bounds import Bounds
 from ...learning.identification import ParameterSearch
-from ...learning.parameters import TILTS, configured_parameters, own_name, split_name
+from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.misfit import PictureMisfit, values_of
 from ...pictures.motion import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
@@ -266,15 +266,16 @@ def identify_pictures(context: StageContext) -> None:
         ConvergenceError: the simulation fails at every start.
     """
     settings: IdentifyPicturesStage = context.settings
-    wanted, kept = settings.identify, Checkpoint(context, "sysid")
+    wanted, kept = settings.identify, Checkpoint(context)
     plan = _Plan(settings, context.run_dir)
     poses = [plan.pose(name, {}) for name in settings.data.train]
     bounds = plan.bounds(poses, lambda name, per: True)
     misfit = PictureMisfit(poses, bounds, plan.given(poses))
     guess, total = plan.guess(bounds, poses), wanted.starts * wanted.max_evaluations
     with Progress(context.name, total, "evaluations at most", kept.evaluations) as progress:
-        search = ParameterSearch(misfit)
-        found = search_parameters(wanted, settings.seed, search, guess, kept, progress, wanted.starts)
+        many: dict[str, Any] = {"count": wanted.starts, "candidates": wanted.candidates, "seed": settings.seed}
+        work = partial(search_parameters, ParameterSearch(misfit), guess, wanted, progress, **many)
+        found = kept.once("sysid", work)
     result = {**found, "first_guess": guess}
     cameras = {
         pose.name: {photo.lens: photo.camera.pose.tolist() for photo in pose.photos if photo.camera.lens is not None}

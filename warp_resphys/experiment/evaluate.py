@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
-from ..data.trials import Trials
 from ..io.errors import ConvergenceError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
@@ -43,7 +42,8 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     experiment = Experiment(settings, context.run_dir, "count")
     compared = experiment.models
     names = [name for group in settings.groups.values() for name in group]
-    filmed = _film_trial(experiment, settings.groups["1"])
+    amplitudes = _amplitudes(experiment, settings.groups["1"])
+    filmed = max(amplitudes, key=lambda name: amplitudes[name])  # the largest motion
     parts = _parts(context, experiment, names, compared, filmed)
     with_intervals = [model for model in INTERVAL_MODELS if model in compared]
     calibrating = _parts(context, experiment, settings.calibration, with_intervals, filmed, "calibration_")
@@ -56,7 +56,8 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     test = settings.groups["1"]
     linear = linearised(experiment, test)
     spreads = spreads_of(experiment, test, linear)
-    shown = _film_steps(int(float(experiment.trials([filmed]).times.max()) / settings.time_step + 1e-6))
+    steps = int(float(experiment.trials([filmed]).times.max()) / settings.time_step + 1e-6)
+    shown = np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
     attributes = {"names": names, "time_step": settings.time_step, "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
@@ -75,6 +76,9 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
         if model in LEARNED and settings.range_guard
     }
     errors = summary(context, experiment, settings.groups, observed, left) | {"baselines": plain}
+    sideways = np.concatenate([part.read("sideways") for part in parts["resphys"]])
+    if known := {name: size for name, size in zip(order, sideways.tolist(), strict=True) if math.isfinite(size)}:
+        errors["sideways_mm"] = {name: known[name] for name in test if name in known}
     errors |= remaining(experiment, test, linear, observed)
     if settings.calibration:
         calibrated = [*chain(*experiment.batches(settings.calibration))]
@@ -106,7 +110,10 @@ def _parts(
 
 
 def _rolled_out(part: TrialPart, report: Report) -> Arrays:
-    """Roll-outs by a model: points at the frames, steps at which trials left the training range, filmed vertices."""
+    """Roll-outs by a model: points at the frames, steps at which trials left the training range, filmed vertices.
+
+    And the estimated sideways displacement of bodies before their release [mm], NaN where it is not estimated.
+    """
     experiment = Experiment(part.context.settings, part.context.run_dir, "count")
     model, filmed = part.more
     run, points, bodies = ModelRollout(experiment, model, part.names), list[torch.Tensor](), list[torch.Tensor]()
@@ -119,17 +126,14 @@ def _rolled_out(part: TrialPart, report: Report) -> Arrays:
             if name == filmed
         ]
         report()
+    shift = run.start.shift
+    sideways = torch.full((len(part.names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)
     arrays: dict[str, tuple[NDArray[Any], str]] = {"observed": (run.at_frames(points), "m")}
+    arrays["sideways"] = (sideways.cpu().numpy(), "mm")
     if predictor is not None:
         left = predictor.left_at
         arrays["left"] = (np.full(len(part.names), -1) if left is None else left.cpu().numpy(), "1")
     return arrays | ({"film": (torch.stack(bodies).cpu().numpy(), "m")} if bodies else {})
-
-
-def _film_trial(experiment: Experiment, names: Sequence[str]) -> str:
-    """The test trial with the largest motion, of which bodies are drawn."""
-    amplitudes = _amplitudes(experiment, names)
-    return max(names, key=lambda name: amplitudes[name])
 
 
 def _amplitudes(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
@@ -144,11 +148,6 @@ def _amplitudes(experiment: Experiment, names: Sequence[str]) -> dict[str, float
         seen = replace(trials, observed=observed, held=held)
         amplitudes |= dict(zip(batch, seen.amplitude.tolist(), strict=True))
     return amplitudes
-
-
-def _film_steps(steps: int) -> IntArray:
-    """Steps at which bodies are saved for pictures."""
-    return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
 
 
 def summary(
@@ -213,8 +212,7 @@ def summary(
                 scale: {m: _range(steps[rows], groups[scale], step) for m, steps in left.items()}
                 for scale, rows in at.items()
             }
-    sideways = _sideways(experiment, names)
-    return {**content, **({"sideways_mm": sideways} if sideways else {})}
+    return content
 
 
 def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
@@ -259,7 +257,8 @@ def _over_time(
         }
     if len(horizons) > 1:
         near, far = (content["horizons"][f"{seconds:g}"] for seconds in (horizons[0], horizons[-1]))
-        content["growth"] = {model: _growth(near[model], far[model]) for model in test}
+        means = {model: (near[model]["mean"], far[model]["mean"]) for model in test}
+        content["growth"] = {m: None if None in pair else float(pair[1] / pair[0] - 1.0) for m, pair in means.items()}
     if horizons and horizons[-1] >= _FILTERED_SECONDS:
         content["median_filtered"] = {model: _largest_filtered(rows, step) for model, rows in errors.items()}
     return content
@@ -271,29 +270,9 @@ def _largest_filtered(errors: Sequence[FloatArray], step: float) -> float | None
     return None if diverged else max(float(median_filter(series, step).max()) for series in errors)
 
 
-def _growth(first: Mapping[str, Any], last: Mapping[str, Any]) -> float | None:
-    """Relative growth of the mean error; None if a roll-out diverged."""
-    return None if None in (first["mean"], last["mean"]) else float(last["mean"] / first["mean"] - 1.0)
-
-
 def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
     gone = {name: float(step * at) for name, at in zip(names, left, strict=True) if at >= 0}
     return {"left": len(gone), "first_s": gone}
-
-
-def _sideways(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
-    """Estimated sideways displacement of bodies before their release [mm], by trial; empty if it is not estimated."""
-    if experiment.settings.release.sideways <= 0.0:
-        return {}
-    simulator = experiment.model_simulator("resphys")
-    sideways: dict[str, float] = {}
-    for batch in experiment.batches(names):
-        if experiment.begins(batch[0]) != "released":
-            continue
-        shift = experiment.start(experiment.replay(simulator, batch, "resphys")).shift
-        if shift is not None:
-            sideways |= dict(zip(batch, (1e3 * shift.norm(dim=2).mean(1)).tolist(), strict=True))
-    return sideways
 
 
 def time_models(context: StageContext) -> None:
@@ -352,41 +331,22 @@ def check_mesh(context: StageContext) -> None:
     groups = experiments[0].batches(settings.groups["1"])
     cells = [len(experiment.body.mesh.cells) for experiment in experiments]
     content: dict[str, Any] = {"cells": cells, "model": model}
-    errors: list[list[FloatArray]] = [[], []]
-    moved: list[FloatArray] = []
-    with Progress(context.name, 2 * sum(map(len, groups)), "trials") as progress:
+    errors: list[list[FloatArray]] = [[], [], []]  # of both meshes, and of one from the other
+    with Progress(context.name, 2 * sum(map(len, groups)), "trials") as progress, torch.no_grad():
         try:
             for names in groups:
                 shown = []
-                for experiment, mesh_errors in zip(experiments, errors, strict=True):
-                    markers, trials = _simulated(experiment, model, names)
-                    labels = experiment.dataset.labels
-                    markers, observed = as_markers(markers, labels), as_markers(trials.observed.cpu().numpy(), labels)
-                    seen = np.asarray(np.isfinite(observed).all(axis=-1))
-                    mesh_errors += _distances(markers, observed, seen)
-                    shown.append(markers)
+                for experiment in experiments:
+                    replay = experiment.replay(experiment.model_simulator(model), names, model)
+                    points = replay(experiment.start(replay, model), experiment.parameters(model))[0].cpu().numpy()
+                    shown.append(as_markers(points, experiment.dataset.labels))
                     progress.advance(len(names))
-                moved += _distances(shown[0], shown[1], seen)
+                observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.dataset.labels)
+                where = np.where(np.isfinite(observed), shown[1], np.nan)
+                for rows, x, y in zip(errors, (*shown, shown[0]), (observed, observed, where), strict=True):
+                    rows += _errors(x, y, [0] * len(names))
         except ConvergenceError as error:
             content["failed"] = str(error)
         else:
-            content["moved_mm"] = _mean(moved)
-            content["errors_mm"] = [_mean(mesh_errors) for mesh_errors in errors]
+            *content["errors_mm"], content["moved_mm"] = (float(np.mean([row.mean() for row in own])) for own in errors)
     write_json(context.run_dir / MESH_CHECK, content)
-
-
-def _mean(trials: Sequence[FloatArray]) -> float:
-    return float(np.mean([distances.mean() for distances in trials]))
-
-
-def _simulated(experiment: Experiment, model: str, names: Sequence[str]) -> tuple[FloatArray, Trials]:
-    """(R, T, M, 3) markers of trials that begin in the same way, by a model without a force [m], and the trials."""
-    replay = experiment.replay(experiment.model_simulator(model), names, model)
-    with torch.no_grad():
-        markers = replay(experiment.start(replay, model), experiment.parameters(model))[0]
-    return np.asarray(markers.cpu().numpy()), replay.trials
-
-
-def _distances(left: FloatArray, right: FloatArray, seen: NDArray[np.bool_]) -> list[FloatArray]:
-    """Distances of (R, T, M, 3) markers where they were seen [mm], by trial."""
-    return [1e3 * np.linalg.norm(a - b, axis=-1)[s] for a, b, s in zip(left, right, seen, strict=True)]

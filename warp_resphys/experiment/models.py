@@ -90,6 +90,7 @@ class ModelRollout:
 
     Attributes:
         replay: of the trials.
+        start: how they begin.
         steps: number of steps that covers all frames, rounded up to whole time steps of the experiment.
     """
 
@@ -104,7 +105,7 @@ class ModelRollout:
         self._experiment, self._model = experiment, model
         self._simulator = experiment.model_simulator(model) if simulator is None else simulator
         self.replay = experiment.replay(self._simulator, names, model)
-        self._start = experiment.start(self.replay, model) if start is None else start
+        self.start = experiment.start(self.replay, model) if start is None else start
         parameters = experiment.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.prepare(parameters)
         self._conditions = (
@@ -112,7 +113,7 @@ class ModelRollout:
         )
         self._first: State | None = None  # of motions, whatever the network
         substeps = round(experiment.settings.time_step / self._simulator.time_step)
-        self.steps = -(-self.replay.steps(self._start) // substeps) * substeps
+        self.steps = -(-self.replay.steps(self.start) // substeps) * substeps
         if self.replay.is_static:
             self.steps = POSE_STEPS if model == SIMFREE else 0
 
@@ -134,9 +135,9 @@ class ModelRollout:
         """
         force: Any = predictor if self.replay.is_static and self._model != SIMFREE else None
         if force is not None:
-            return self.replay.initial_state(self._start, self._constants, self._resting, force=force)
+            return self.replay.initial_state(self.start, self._constants, self._resting, force=force)
         if self._first is None:
-            self._first = self.replay.initial_state(self._start, self._constants, self._resting)
+            self._first = self.replay.initial_state(self.start, self._constants, self._resting)
         return self._first
 
     def roll(self, predictor: LearnedPredictor | None) -> Iterator[tuple[State, torch.Tensor]]:
@@ -164,7 +165,7 @@ class ModelRollout:
     def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
         """(R, T, M, 3) observed points at the frames of the trials [m], from those of all steps (R, M, 3)."""
         series = torch.stack([*points[-1:]] if self.replay.is_static else [*points], 1)
-        return np.asarray(self.replay.at_frames(series, self._start).cpu().numpy())
+        return np.asarray(self.replay.at_frames(series, self.start).cpu().numpy())
 
     def errors(self, learned: Learned) -> list[FloatArray]:
         """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged."""

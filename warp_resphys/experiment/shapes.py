@@ -5,7 +5,6 @@ and its integrator. It is held or inflated, released, and its state at the relea
 simulated trials of a run (`experiment.simulate`).
 """
 
-from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -32,8 +31,6 @@ from .experiment import LAW, Experiment
 from .files import LAW_FILE, SHAPES
 from .identify import Checkpoint
 from .simulate import held_alone, substeps_of, target_settings, vertices_in
-
-Force = Callable[[State], torch.Tensor]
 
 
 def try_shapes(context: StageContext) -> None:
@@ -84,66 +81,29 @@ def check_shape(shape: ShapeSettings) -> None:
             raise InputError("held.at selects fixed vertices only: hang the weight on vertices that can move.")
 
 
-class ShapeTrial:
-    """A shape that is held or inflated, and released, by its target.
-
-    Args:
-        experiment: whose identified material is put on the shape.
-        settings: of the stage.
-        shape: the shape.
-
-    Attributes:
-        body: of the models.
-        observed: (T + 1, N, 3) its vertices in the target's motion, from the release on [m].
-
-    Raises:
-        ConvergenceError: the target fails.
-    """
-
-    def __init__(self, experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> None:
-        self._experiment, self._settings, self._shape = experiment, settings, shape
-        self.body = build_body(BodySettings.of(shape))
-        target = _target(settings, shape)
-        seen = vertices_in(target.body.mesh, self.body.mesh).to(target.rest_positions)
-        with torch.no_grad():
-            start = _held(target, shape)
-            states = _rolled(target, start, settings.steps, substeps_of(settings.time_step, settings.target, "target"))
-            self.observed = torch.stack([seen(state.q)[0] for state in states]).cpu().numpy()
-            self._begin = State(seen(start.q), seen(start.v))
-
-    def simulator(self, model: str) -> tuple[Simulator, dict[str, torch.Tensor]]:
-        """Returns the simulator of a model on the shape, and the identified values of its material's constants."""
-        kind = self._experiment.sources(model)[0]
-        body = {key: getattr(self._shape, key) for key in BodySettings.model_fields}
-        made_of = self._experiment.settings_of(kind).model_copy(update=body)
-        simulator = build_simulator(made_of, self._experiment.material_of(kind), on_failure="count")
-        known = simulator.materials[""].quantities
-        return simulator, {name: x for name, x in self._experiment.parameters(model).items() if name in known}
-
-    def error(self, model: str, force: Force | None = None) -> float | None:
-        """Returns the mean error over vertices and time [mm], with an added force (1, N, 3); None if it diverges."""
-        simulator, values = self.simulator(model)
-        its_steps = round(self._settings.time_step / simulator.time_step)
-        with torch.no_grad():
-            rolled = _rolled(simulator, self._begin, self._settings.steps, its_steps, values, force)
-        points = torch.stack([state.q[0] for state in rolled]).cpu().numpy()
-        mean: float | None = summarise([marker_errors(points, self.observed)])["mean"]
-        return mean
-
-
 def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> dict[str, Any]:
-    """Returns the result of a shape."""
-    trial = ShapeTrial(experiment, settings, shape)
+    """Result of a shape, which its target holds or inflates, and releases."""
+    target, mesh = _target(settings, shape), build_body(BodySettings.of(shape)).mesh
+    seen = vertices_in(target.body.mesh, mesh).to(target.rest_positions)
     models = ("simulation", *(("sysid",) if settings.identified else ()), *((LAW,) if experiment.has_law else ()))
-    mesh = trial.body.mesh
-    moved = 1e3 * np.linalg.norm(trial.observed - mesh.vertices, axis=-1)
-    result: dict[str, Any] = {
-        "vertices": len(mesh.vertices),
-        "moved_mm": float(moved.max()),
-        "errors_mm": {model: trial.error(model) for model in models},
-    }
+    with torch.no_grad():
+        held, substeps = _held(target, shape), substeps_of(settings.time_step, settings.target, "target")
+        observed = seen(target.rollout(held, settings.steps * substeps).q[::substeps, 0]).cpu().numpy()
+        start, errors = State(seen(held.q), seen(held.v)), dict[str, float | None]()
+        for model in models:
+            kind = experiment.sources(model)[0]
+            body = {key: getattr(shape, key) for key in BodySettings.model_fields}
+            made_of = experiment.settings_of(kind).model_copy(update=body)
+            simulator = build_simulator(made_of, experiment.material_of(kind), on_failure="count")
+            known = simulator.materials[""].quantities
+            values = {name: x for name, x in experiment.parameters(model).items() if name in known}
+            substeps = round(settings.time_step / simulator.time_step)
+            q = simulator.rollout(start, settings.steps * substeps, None, values).q[::substeps, 0]
+            errors[model] = summarise([marker_errors(q.cpu().numpy(), observed)])["mean"]
+    moved = 1e3 * float(np.linalg.norm(observed - mesh.vertices, axis=-1).max())
+    result: dict[str, Any] = {"vertices": len(mesh.vertices), "moved_mm": moved, "errors_mm": errors}
     if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
-        result["outside"] = share_outside(principal_stretches(mesh, trial.observed), *law["stretches"])
+        result["outside"] = share_outside(principal_stretches(mesh, observed), *law["stretches"])
     return result
 
 
@@ -164,21 +124,3 @@ def _held(simulator: Simulator, shape: ShapeSettings) -> State:
     quantity = driving_quantity(shape)
     assert quantity is not None
     return simulator.static_equilibrium(Inputs(**{quantity.name: simulator.tensor([list(shape.inputs or ())])}))
-
-
-def _rolled(
-    simulator: Simulator,
-    state: State,
-    steps: int,
-    substeps: int,
-    values: Mapping[str, torch.Tensor] | None = None,
-    force: Force | None = None,
-) -> list[State]:
-    """Returns the states from the release on, at the time steps of the run."""
-    constants, states = simulator.prepare(values or {}), [state]
-    for _ in range(steps):
-        for _ in range(substeps):
-            added = None if force is None else force(state)
-            state, _ = simulator.step(state, Inputs(external_force=added), constants)
-        states.append(state)
-    return states

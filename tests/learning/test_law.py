@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from support.known_law import STIFF, beam, released
-from warp_resphys.learning.law import _constants, fit_classes
-from warp_resphys.learning.weak_form import WeakForm
+from warp_resphys.learning.law import WeakForm, _constants, fit_classes
 
 TERMS, TIMES = ("c20", "c01", "ogden_4"), np.geomspace(0.01, 0.2, 8).tolist()
 PULLS = [(0.4, 0.0, -0.15), (-0.2, 0.15, 0.05), (0.1, -0.1, 0.15)]  # N

@@ -10,7 +10,7 @@ import torch
 from support.known_law import STIFF, beam, pulled, released
 from warp_resphys import Inputs
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.weak_form import KnownMotion, NormalEquations, WeakForm
+from warp_resphys.learning.law import KnownMotion, NormalEquations, WeakForm
 
 UNIT = {
     "c10": 1e5,

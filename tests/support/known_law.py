@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, make_material, select_vertices
-from warp_resphys.learning.weak_form import KnownMotion
+from warp_resphys.learning.law import KnownMotion
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
 TIP = select_vertices(MESH, x=0.08)

@@ -23,11 +23,10 @@ from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext, package_versions
 from ..learning.identification import ParameterSearch
-from ..learning.law import VISCOSITIES, LawClass, fit_classes
+from ..learning.law import VISCOSITIES, KnownMotion, LawClass, WeakForm, fit_classes
 from ..learning.misfit import Misfit
 from ..learning.parameters import Bounds
 from ..learning.replay import Replay
-from ..learning.weak_form import KnownMotion, WeakForm
 from ..settings.stages import IdentifyLawStage
 from .experiment import LAW, Experiment
 from .files import LAW_FILE

@@ -102,14 +102,18 @@ class Intervals:
             trials = [quarter for quarter in trials[0].quarters() if quarter.seen.any()]
         parts = [_parts(np.linalg.norm(t.simulated - rest, axis=-1), t.since, t.spread) for t in trials]
         errors = [trial.errors for trial in trials]
-        variance = _variance(parts, errors)
-        left_out = []
-        for out in range(len(trials) if len(trials) > 1 else 0):
-            others = [number for number in range(len(trials)) if number != out]
-            own = _variance([parts[k] for k in others], [errors[k] for k in others])
-            scores = [error / np.sqrt(part @ own)[..., None] for part, error in zip(parts, errors, strict=True)]
+
+        def scaled(kept: Sequence[int]) -> tuple[FloatArray, list[FloatArray]]:
+            """Sizes of the parts of the variance from some trials, and the errors of all over that scale."""
+            sizes = _variance([parts[k] for k in kept], [errors[k] for k in kept])
+            return sizes, [error / np.sqrt(part @ sizes)[..., None] for part, error in zip(parts, errors, strict=True)]
+
+        every, left_out = [*range(len(trials))], []
+        for out in every if len(trials) > 1 else ():
+            others = [number for number in every if number != out]
+            _, scores = scaled(others)
             left_out.append((scores[out], [scores[k] for k in others]))
-        scores = [error / np.sqrt(part @ variance)[..., None] for part, error in zip(parts, errors, strict=True)]
+        variance, scores = scaled(every)
         factor = _quantiles(scores, _level(left_out, level))
         factor[~np.isfinite(factor)] = factor[np.isfinite(factor)].max()
         return cls(tuple(factor.tolist()), tuple(variance.tolist()))

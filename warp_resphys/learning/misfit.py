@@ -1,7 +1,7 @@
 """The misfit of a simulator to observed motions, as a function of the physical parameters to identify.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. Prior knowledge (`bounded_misfit`) is that of the parameters and of marker places (`nuisance`).
+all motions at once. Prior knowledge (`identification`) is that of the parameters and of marker places (`nuisance`).
 
 A parameter may have a value for each trial or session (`parameters.own_name`), held by its prior; all others have the
 mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
@@ -21,12 +21,12 @@ from ..data.markers import Markers
 from ..data.trials import Trials
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.state import State
-from .bounded_misfit import BoundedMisfit, FloatArray
+from .identification import BoundedMisfit
 from .nuisance import NuisanceFit, Nuisances
 from .parameters import Bounds, check_names, split_name
 from .placement import Accuracy, DisplacedMarkers
 from .replay import Replay, Start, exact
-from .uncertainty import LinearMisfit, LinearSystem, Uncertainty, left_out, uncertainty_of
+from .uncertainty import FloatArray, LinearMisfit, LinearSystem, Uncertainty, left_out, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range

@@ -31,7 +31,7 @@ from ..linalg.least_squares import minimise
 from ..linalg.threads import threads_for
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Step, StepProblem
+from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, StepProblem
 
 log = logging.getLogger(__name__)
 
@@ -133,11 +133,10 @@ class LeastSquares(Reconstructor):
         first_guess: torch.Tensor | None = None,
     ) -> Reconstruction:
         acting, constants = inputs or Inputs(), self._constants
-        observation, weight = self.observation, self.regularisation
-        step = Step(self.simulator, constants, state, acting, observed, weight, observation, self._basis)
+        step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation, self._basis)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
-                problem = kind(step)
+                problem = kind(*step)
                 result = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
                 if result.converged or number == len(self._problems):
                     break
@@ -150,7 +149,7 @@ class LeastSquares(Reconstructor):
                     x,
                     None,
                 )
-            return Reconstruction(step.linearise().finish(x), force, result.iterations)
+            return Reconstruction(problem.without_force().finish(x), force, result.iterations)
 
 
 class LBFGSB(Reconstructor):

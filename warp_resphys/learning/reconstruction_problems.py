@@ -18,20 +18,23 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 
 
-@dataclass(frozen=True)
-class Step:
-    """A step whose force is unknown."""
+@dataclass(eq=False)
+class StepProblem(Problem):
+    """A step whose force is unknown; the distance of two iterates is that of their stage positions [m]."""
+
+    method: ClassVar[str]
+    remedies: ClassVar[str] = "reconstruction.regularisation or reconstruction.max_iterations"
 
     simulator: Simulator
     constants: Constants  # of the simulator
-    state: State  # at its start
+    state: State  # at the start of the step
     inputs: Inputs  # during the step
     observed: torch.Tensor  # (B, M, D) measured points at its end, NaN where a point was not seen [unit]
     weight: float  # lambda [unit^2/N^2]
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     basis: torch.Tensor | None = None  # (3 N, modes) basis of the forces; None for any force on the free vertices
 
-    def linearise(self) -> Linearisation:
+    def without_force(self) -> Linearisation:
         """Returns the linearisation of the step without a residual force."""
         return self.simulator.linearise(self.state, self.inputs, self.constants)
 
@@ -43,16 +46,6 @@ class Step:
         """Returns C'^T, (B, 3 N, M D), zero for points that were not seen."""
         seen = torch.isfinite(self.observed).all(-1, keepdim=True).expand_as(self.observed)
         return torch.where(seen.flatten(1)[:, None], self.observation.transposed_jacobian(end), 0.0)
-
-
-class StepProblem(Problem):
-    """Problem of a step's force; the distance of two iterates is that of their stage positions [m]."""
-
-    method: ClassVar[str]
-    remedies: ClassVar[str] = "reconstruction.regularisation or reconstruction.max_iterations"
-
-    @abstractmethod
-    def __init__(self, step: Step) -> None: ...
 
     @abstractmethod
     def start(self, first_guess: torch.Tensor | None) -> Point:
@@ -84,16 +77,16 @@ class FullStateProblem(StepProblem):
     method = "Gauss-Newton"
     remedies = "reconstruction.max_iterations or reconstruction.tolerance"
 
-    @override
-    def __init__(self, step: Step) -> None:
-        if not bool(torch.isfinite(step.observed).all()):
+    def __post_init__(self) -> None:
+        """Checks that all vertices were seen."""
+        if not bool(torch.isfinite(self.observed).all()):
             raise InputError(
                 "Gauss-Newton needs the positions of all vertices, but some were not seen: observe those that were as "
                 "markers (MarkerMap.at_vertices), or take method=lbfgsb."
             )
-        self._step = step.linearise()
-        self._target = self._step.hold(step.simulator.method.solution_for(step.state, step.observed))
-        self._weight = step.weight * self._step.stage.end**2
+        self._step = self.without_force()
+        self._target = self._step.hold(self.simulator.method.solution_for(self.state, self.observed))
+        self._weight = self.weight * self._step.stage.end**2
 
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
@@ -148,9 +141,9 @@ class MarkerPositionProblem(StepProblem):
 
     method = "sparse Gauss-Newton"
 
-    @override
-    def __init__(self, step: Step) -> None:
-        self._task, self._step = step, step.linearise()
+    def __post_init__(self) -> None:
+        """Linearises the step."""
+        self._step = self.without_force()
 
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
@@ -166,11 +159,11 @@ class MarkerPositionProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        x, step, basis = point.x[:, 0], self._step, self._task.basis
+        x, step, basis = point.x[:, 0], self._step, self.basis
         end = step.finish(x).q
         residual = step.residual(x).reshape(len(x), -1, 1).to(x.dtype)
         step.factorise(x)
-        transposed = self._task.transposed_jacobian(end)
+        transposed = self.transposed_jacobian(end)
         columns = transposed
         if basis is not None and basis.shape[1] < transposed.shape[2]:
             columns = basis.expand(len(x), -1, -1)
@@ -178,8 +171,8 @@ class MarkerPositionProblem(StepProblem):
         jacobian = response.mT if columns is transposed else transposed.mT @ response
         if basis is not None and columns is transposed:
             jacobian = jacobian @ basis
-        right = step.stage.end * self._task.missing(end) + transposed.mT @ settling
-        force = ridge(jacobian, right, self._task.weight * step.stage.end**2)
+        right = step.stage.end * self.missing(end) + transposed.mT @ settling
+        force = ridge(jacobian, right, self.weight * step.stage.end**2)
         force = force if basis is None else basis @ force
         new = x + (step.solve(force) - settling).view_as(x)
         return lambda _: torch.stack([new, force.view_as(x)], 1)
@@ -196,47 +189,42 @@ class MarkerForceProblem(StepProblem):
     method = "sparse Levenberg-Marquardt"
 
     @override
-    def __init__(self, step: Step) -> None:
-        self._task = step
-
-    @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
         """Starts at zero force where the step fails with the first guess."""
-        if first_guess is not None and self._task.basis is not None:
-            basis = self._task.basis
+        if first_guess is not None and self.basis is not None:
+            basis = self.basis
             first_guess = (basis @ (basis.mT @ first_guess.flatten(1)[..., None])).view_as(first_guess)
         if first_guess is not None and bool(torch.isfinite((point := self.evaluate(first_guess)).value).all()):
             return point
-        return self.evaluate(torch.zeros_like(self._task.state.q))
+        return self.evaluate(torch.zeros_like(self.state.q))
 
     @override
     def solution(self, point: Point) -> tuple[torch.Tensor, torch.Tensor]:
-        return self._task.simulator.method.solution_for(self._task.state, point.kept[0]), point.x
+        return self.simulator.method.solution_for(self.state, point.kept[0]), point.x
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
-        task = self._task
         try:
-            end = task.simulator.step(task.state, task.inputs.plus(x), task.constants)[0].q
+            end = self.simulator.step(self.state, self.inputs.plus(x), self.constants)[0].q
         except ConvergenceError:
-            return Point(x, x.new_full((len(x),), torch.inf), (task.state.q,))
-        value = task.missing(end).square().sum((1, 2)) + task.weight * x.square().sum((1, 2))
+            return Point(x, x.new_full((len(x),), torch.inf), (self.state.q,))
+        value = self.missing(end).square().sum((1, 2)) + self.weight * x.square().sum((1, 2))
         return Point(x, value, (end,))
 
     @override
     def linearise(self, point: Point) -> Move:
-        force, (end,), basis = point.x.flatten(1)[..., None], point.kept, self._task.basis
-        step = self._task.linearise()
+        force, (end,), basis = point.x.flatten(1)[..., None], point.kept, self.basis
+        step = self.without_force()
         step.factorise(self.solution(point)[0])
         # q+ moves 1 / stage.end times as far as x.
-        jacobian = step.solve(self._task.transposed_jacobian(end)).mT / step.stage.end
-        missing = self._task.missing(end)
+        jacobian = step.solve(self.transposed_jacobian(end)).mT / step.stage.end
+        missing = self.missing(end)
         if basis is not None:
             force, jacobian = basis.mT @ force, jacobian @ basis
 
         def damped_step(damping: torch.Tensor) -> torch.Tensor:
             factor = (1.0 + damping)[:, None, None]
-            change = ridge(jacobian, missing + jacobian @ (force / factor), self._task.weight * factor)
+            change = ridge(jacobian, missing + jacobian @ (force / factor), self.weight * factor)
             new = force - force / factor + change
             return (new if basis is None else basis @ new).view_as(point.x)
 

@@ -24,9 +24,9 @@ from typing_extensions import override
 
 from ..data.camera import CORRECTIONS, PlacedCamera
 from ..io.errors import ConvergenceError, InputError
-from ..learning.bounded_misfit import BoundedMisfit, FloatArray
+from ..learning.identification import BoundedMisfit
 from ..learning.parameters import Bounds, split_name
-from ..learning.uncertainty import Linearised, LinearMisfit
+from ..learning.uncertainty import FloatArray, Linearised, LinearMisfit
 from .motion import RELEASE_DELAY, derivatives_at_own_times
 from .seen import Photo, SeenPose, Shape
 

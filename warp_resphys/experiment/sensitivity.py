@@ -240,9 +240,9 @@ def free_fits(
     values: dict[str, dict[str, float]] = {name: {} for name in errors}
     for name, error in errors.items():
         for quantity, word in (("scale", "factor"), ("zero", "zero")):  # all inputs move together
-            slopes = [linear[name].by_parameter[n] for n, other in words.items() if other == word]
-            if slopes and (own := _least([error], [np.sum(slopes, axis=0)[..., None]])) is not None:
-                left[name][quantity] = mean(error + np.sum(slopes, axis=0) * own[0])
+            columns = [linear[name].by_parameter[n] for n, other in words.items() if other == word]
+            if columns and (own := _least([error], [np.sum(columns, axis=0)[..., None]])) is not None:
+                left[name][quantity] = mean(error + np.sum(columns, axis=0) * own[0])
                 values[name][quantity] = float(own[0])
     for session in dict.fromkeys(map(experiment.dataset.session, errors)):
         members = [name for name in errors if experiment.dataset.session(name) == session]

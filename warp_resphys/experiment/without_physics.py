@@ -1,7 +1,6 @@
 """Predictions without physics of the trials of an experiment."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -99,20 +98,21 @@ def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> It
 
 def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str]) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
-    trials, others = (_observed(experiment, names) for names in (learned, asked))
-    trials.values[:, experiment.learned_steps(trials.values.shape[1] - 1) + 1 :] = np.nan
-    acting = [driving(experiment.dataset, names) for names in (learned, asked)]
-    known = [experiment.dataset.payload[experiment.dataset.rows(names)][:, None] for names in (learned, asked)]
-    if experiment.begins(asked[0]) in ("released", GIVEN):  # at rest where the training ends
-        ends = np.array([_end(own) for own in trials.values])
-        at_rest = np.array([_mean(column) for column in ends.T])
-        trials, others = (replace(own, origin=np.broadcast_to(at_rest, own.first.shape)) for own in (trials, others))
-    sizes = {name: _size(values) for name, values in acting[0].items()}
-    made = []
-    for motions, inputs, loads in zip((trials, others), acting, known, strict=True):
-        frames = [values / sizes[name] for name, values in inputs.items()]
-        empty = np.zeros((*motions.values.shape[:2], 0))
-        made.append(replace(motions, inputs=np.concatenate([empty, *frames], 2), known=loads / _size(known[0])))
+    dataset, made = experiment.dataset, list[PlainTrials]()
+    for names in (learned, asked):
+        rows = dataset.rows(names)
+        values, first = (
+            x[rows].reshape(len(rows), *x.shape[1:-2], -1).copy() for x in (dataset.observed, dataset.held)
+        )
+        acting, loads = driving(dataset, names), dataset.payload[rows][:, None]
+        if not made:
+            values[:, experiment.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
+            sizes, load = {name: _size(own) for name, own in acting.items()}, _size(loads)
+            at_rest = np.array([_mean(column) for column in np.array([_end(own) for own in values]).T])
+        settles = experiment.begins(asked[0]) in ("released", GIVEN)  # at rest where the training ends
+        frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
+        origin = np.broadcast_to(at_rest, first.shape) if settles else first
+        made.append(PlainTrials(values, origin, first, np.concatenate(frames, 2), loads / load))
     return made[0], made[1]
 
 
@@ -131,12 +131,3 @@ def _mean(values: FloatArray) -> float:
 def _size(values: FloatArray) -> float:
     """The root of the mean over trials and frames of the squared norm, or one if all are zero."""
     return float(np.sqrt(np.square(values).sum(-1).mean())) or 1.0
-
-
-def _observed(experiment: Experiment, names: Sequence[str]) -> PlainTrials:
-    dataset = experiment.dataset
-    rows = dataset.rows(names)
-    values, first = (
-        own[rows].reshape(len(rows), *own.shape[1:-2], -1).copy() for own in (dataset.observed, dataset.held)
-    )
-    return PlainTrials(values, first, first, np.zeros((*values.shape[:2], 0)), np.zeros((len(rows), 0)))

@@ -34,6 +34,10 @@ class StepProblem(Problem):
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     basis: torch.Tensor | None = None  # (3 N, modes) basis of the forces; None for any force on the free vertices
 
+    def __post_init__(self) -> None:
+        """Linearises the step."""
+        self._step = self.without_force()
+
     def without_force(self) -> Linearisation:
         """Returns the linearisation of the step without a residual force."""
         return self.simulator.linearise(self.state, self.inputs, self.constants)
@@ -77,14 +81,14 @@ class FullStateProblem(StepProblem):
     method = "Gauss-Newton"
     remedies = "reconstruction.max_iterations or reconstruction.tolerance"
 
+    @override
     def __post_init__(self) -> None:
-        """Checks that all vertices were seen."""
         if not bool(torch.isfinite(self.observed).all()):
             raise InputError(
                 "Gauss-Newton needs the positions of all vertices, but some were not seen: observe those that were as "
                 "markers (MarkerMap.at_vertices), or take method=lbfgsb."
             )
-        self._step = self.without_force()
+        super().__post_init__()
         self._target = self._step.hold(self.simulator.method.solution_for(self.state, self.observed))
         self._weight = self.weight * self._step.stage.end**2
 
@@ -141,10 +145,6 @@ class MarkerPositionProblem(StepProblem):
 
     method = "sparse Gauss-Newton"
 
-    def __post_init__(self) -> None:
-        """Linearises the step."""
-        self._step = self.without_force()
-
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
         return self.evaluate(torch.stack([self._step.start, torch.zeros_like(self._step.start)], 1))
@@ -187,6 +187,10 @@ class MarkerForceProblem(StepProblem):
     """
 
     method = "sparse Levenberg-Marquardt"
+
+    @override
+    def __post_init__(self) -> None:
+        """Nothing is linearised before a whole step is made."""
 
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:

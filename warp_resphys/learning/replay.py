@@ -269,7 +269,7 @@ class Replay:
         """K + 1 states of R trials at the steps, from the release on, with one set of parameters.
 
         Args:
-            start: of the R trials.
+            start: of the R trials, or of these for several sets of parameters, of which the first are taken.
             parameters: (1,) values, by any of `parameter_names`.
             near: predicts the positions (R, N, 3) of a state by its number [m], see `Simulator.step`.
 
@@ -277,7 +277,8 @@ class Replay:
             ConvergenceError: see `Simulator.step`.
         """
         constants, inputs, resting = self.prepare(parameters)
-        states = [self.initial_state(start, constants, resting)]
+        first = replace(start, state=start.state.map(lambda t: t[: len(self.trials.names)]))
+        states = [self.initial_state(first, constants, resting)]
         for k in range(self.steps(start)):
             states.append(self._step(states[-1], inputs.at(k), constants, None if near is None else near(k + 1)))
         return states
@@ -328,7 +329,7 @@ class Replay:
         there: differences to the first set are exact to first order, for one factor and one residual each.
 
         Args:
-            start: of the R trials.
+            start: of the R trials, or of these for each set of parameters.
             parameters: (E,) values, by any of `parameter_names`; E is two or more.
             states: `states` of the first set; simulated if omitted.
             record: called for each state with the positions (R, N, 3) of the first set and those of the others [m].

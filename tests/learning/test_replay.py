@@ -231,13 +231,13 @@ def test_the_delay_of_a_release_is_recovered_in_any_basis(monkeypatch):
     q = hold(replay, 6)
     seen = replay(Start(State(q, torch.zeros_like(q)), delay))[0]
     settings = ReleaseSettings(delay=0.01, window=0.1, noise=1e-5)
-    result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    result = estimate_release(Replay(sim, MARKERS, replace(motions, observed=seen)), settings)
     torch.testing.assert_close(result.delay, delay, rtol=0.0, atol=5e-4)
     torch.testing.assert_close(result.state.q, q)
     again = replay(result)[0]
     assert float((again - seen).norm(dim=-1).mean()) < 2e-5
     assert result.shift is None
-    kept = estimate_release(sim, MARKERS, motions, ReleaseSettings(delay=0.0))
+    kept = estimate_release(Replay(sim, MARKERS, motions), ReleaseSettings(delay=0.0))
     assert float(kept.delay.abs().max() + kept.state.v.abs().max()) == 0.0
 
 
@@ -250,7 +250,7 @@ def test_releases_within_twice_what_is_expected_are_recovered():
     release = Start(State(q, torch.zeros_like(q)), 0.01 * values)
     seen = Replay(sim, MARKERS, motions)(release)[0]
     settings = ReleaseSettings(hold_modes=6, delay=0.01, window=0.1, noise=1e-5)
-    result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    result = estimate_release(Replay(sim, MARKERS, replace(motions, observed=seen)), settings)
     torch.testing.assert_close(result.delay, release.delay, rtol=0.0, atol=5e-4)
 
 
@@ -281,12 +281,13 @@ def test_a_sideways_held_body_is_identified_from_its_initial_motion():
     seen = replay(truth)[0]
     torch.testing.assert_close(seen[:, 0], MARKERS(q), rtol=0.0, atol=1e-12)
     settings = ReleaseSettings(delay=0.0, sideways=0.002, window=0.1, noise=1e-5)
-    result = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings)
+    result = estimate_release(Replay(sim, MARKERS, replace(motions, observed=seen)), settings)
     torch.testing.assert_close(result.state.q, bent, rtol=0.0, atol=2e-5)
     torch.testing.assert_close(replay(result)[0], seen, rtol=0.0, atol=1e-5)
     torch.testing.assert_close(result.select([1]).shift, result.shift[1:])
     torch.testing.assert_close(result.bound(result.shifted(seen)), seen)
-    straight = estimate_release(sim, MARKERS, replace(motions, observed=seen), settings.changed(sideways=0.0))
+    bowed = Replay(sim, MARKERS, replace(motions, observed=seen))
+    straight = estimate_release(bowed, settings.changed(sideways=0.0))
     assert straight.shift is None
     assert float((replay(straight)[0] - seen).norm(dim=-1).mean()) > 1e-3
 

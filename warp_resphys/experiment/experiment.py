@@ -224,7 +224,7 @@ class Experiment:
         known = self.parameters(model) if parameters is None else _tensors(parameters, simulator)
         values = {name: value for name, value in known.items() if split_name(name)[0] in replay.parameter_names} or None
         if begins == "released":
-            return estimate_release(simulator, replay.observe, trials, self.settings.release, values)
+            return estimate_release(replay, self.settings.release, values)
         guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
         if begins in (STATIC, UNDER_INPUTS):  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():

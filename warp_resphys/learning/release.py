@@ -13,8 +13,6 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..data.observation import Observation
-from ..data.trials import Trials
 from ..dynamics.modes import align_degenerate_modes, fix_signs, vibration_modes
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError
@@ -34,28 +32,30 @@ _ITERATIONS = 4  # of Levenberg-Marquardt, at most
 _RELEASE_TOLERANCE, _DIFFERENCE, _LONGEST_STEP = 1e-4, 0.05, 3.0  # in expected deviations
 
 
-def estimate_release(
-    simulator: Simulator,
-    markers: Observation,
-    motions: Trials,
-    settings: ReleaseSettings,
-    parameters: Parameters | None = None,
-) -> Start:
-    """Returns the start of every motion, estimated with a simulator.
+def estimate_release(replay: Replay, settings: ReleaseSettings, parameters: Parameters | None = None) -> Start:
+    """Returns the start of every motion that begins by a release.
+
+    The body is at rest in frames before the release and moves in those after it, so that the error of the first frames
+    has a kink where the delay equals the time of a frame, and minima in between: the search starts at several delays.
 
     Args:
-        simulator: of the body.
-        markers: maps positions of the vertices (B, N, 3) to markers (B, M, 3) [m].
-        motions: observed trials.
+        replay: of the trials.
         settings: see the class.
         parameters: (1,) values that replace the simulator's, by name.
 
     Raises:
         ConvergenceError: the body cannot be held, or a step of the simulation fails.
     """
-    q = hold(Replay(simulator, markers, motions), settings.hold_modes, parameters)
-    release = Start(State(q, torch.zeros_like(q)), torch.zeros_like(motions.times[:, 0]))
-    return _initial_motion(simulator, markers, motions.first(settings.window), release, settings, parameters)
+    problem = _FirstFrames(replay, hold(replay, settings.hold_modes, parameters), settings, parameters)
+    count, unknowns = len(replay.trials.names), len(problem.deviation)
+    start = problem.deviation.new_zeros(count, unknowns)
+    if not unknowns:
+        return problem.release(start)
+    delays = start.new_tensor(_DELAYS if settings.delay > 0.0 else (0.0,))
+    start = delays.repeat_interleave(count)[:, None] * torch.eye(unknowns).to(delays)[0]
+    solution = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, _ITERATIONS).point
+    best = solution.value.view(-1, count).argmin(0)
+    return problem.release(solution.x.view(-1, count, unknowns)[best, torch.arange(count, device=best.device)])
 
 
 def begin_inputs(
@@ -172,56 +172,49 @@ class _HoldProblem(Problem):
         return (new.kept[0] - old.kept[0]).abs().amax((1, 2))
 
 
-def _initial_motion(
-    simulator: Simulator,
-    markers: Observation,
-    motions: Trials,
-    held: Start,
-    settings: ReleaseSettings,
-    parameters: Parameters | None,
-) -> Start:
-    """Returns the starts with the smallest error in the first frames (`_ReleaseModel`).
-
-    The body is at rest in frames before the release and moves in those after it, so that the objective has a kink where
-    the delay equals the time of a frame, and minima in between: the search starts at several delays.
-    """
-    model = _ReleaseModel(simulator, markers, held, settings)
-    count, unknowns = len(motions.names), len(model.deviation)
-    if not unknowns:
-        return held
-    delays = simulator.tensor(_DELAYS if settings.delay > 0.0 else (0.0,))
-    start = delays.repeat_interleave(count)[:, None] * torch.eye(unknowns).to(delays)[0]
-    copies = motions.select(list(range(count)) * len(delays) * (1 + unknowns))
-    problem = _FirstFrames(Replay(simulator, markers, copies), model, settings.noise, parameters)
-    solution = minimise(problem, problem.evaluate(start), _RELEASE_TOLERANCE, _ITERATIONS).point
-    best = solution.value.view(-1, count).argmin(0)
-    return model(solution.x.view(-1, count, unknowns)[best, torch.arange(count, device=best.device)])
-
-
 class _FirstFrames(Problem):
     """Squared error of the first frames over their noise, as a function of releases in expected deviations.
 
-    A point keeps J^T J + 1 and the gradient, with J from finite differences in one batch.
+    The unknowns are the delay, if one is expected, and the sideways displacements. A point keeps J^T J + 1 and the
+    gradient, with J from finite differences in one batch.
 
     Args:
-        replay: of 1 + P copies of the trials, for P unknowns.
-        model: maps unknowns to releases.
-        noise: see `ReleaseSettings` [m].
+        replay: of the R trials.
+        held: (R, N, 3) positions in which the body is held, if it is straight [m].
+        settings: which unknowns there are, their expected deviations, and the noise.
         parameters: (1,) values that replace the simulator's.
     """
 
     def __init__(
-        self, replay: Replay, model: "_ReleaseModel", noise: float, parameters: Parameters | None = None
+        self, replay: Replay, held: torch.Tensor, settings: ReleaseSettings, parameters: Parameters | None
     ) -> None:
-        self._replay, self._model, self._noise, self._parameters = replay, model, noise, parameters
+        self._simulator, self._observe, self._trials = replay.simulator, replay.observe, replay.trials
+        self._held, self._settings, self._parameters = held, settings, parameters
+        none = held.new_zeros(0, *held[0].shape)
+        self._shapes = sideways_shapes(replay.simulator) if settings.sideways > 0.0 else none
+        self._sizes = (int(settings.delay > 0.0), len(self._shapes))
+        deviations, self._copies = (settings.delay, settings.sideways), dict[int, Replay]()
+        self.deviation = held.new_tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
+
+    def release(self, values: torch.Tensor) -> Start:
+        """Returns the releases for values (k R, unknowns); the R motions run fastest."""
+        delay, bends = (values * self.deviation).split(self._sizes, 1)
+        held = self._held.repeat(len(values) // len(self._held), 1, 1)
+        bend = torch.einsum("bk,knc->bnc", bends, self._shapes)
+        shift = self._observe(held) - self._observe(held + bend) if len(self._shapes) else None
+        return Start(State(held + bend, torch.zeros_like(held)), delay.sum(1), shift)
 
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
-        runs, unknowns = x.shape
+        (runs, unknowns), count = x.shape, len(self._held)
+        if runs not in self._copies:
+            first = self._trials.first(self._settings.window).select([*range(count)] * (runs // count * (1 + unknowns)))
+            self._copies[runs] = Replay(self._simulator, self._observe, first)
         identity = torch.eye(unknowns, dtype=x.dtype, device=x.device)
         offsets = torch.cat([torch.zeros_like(identity[:1]), _DIFFERENCE * identity]).repeat_interleave(runs, 0)
-        simulated = self._replay(self._model(x.repeat(1 + unknowns, 1) + offsets), self._parameters)
-        residual = self._replay.errors(simulated)[0].flatten(1).unflatten(0, (-1, runs)) / self._noise
+        replay = self._copies[runs]
+        simulated = replay(self.release(x.repeat(1 + unknowns, 1) + offsets), self._parameters)
+        residual = replay.errors(simulated)[0].flatten(1).unflatten(0, (-1, runs)) / self._settings.noise
         slope = ((residual[1:] - residual[0]) / _DIFFERENCE).permute(1, 2, 0)
         gradient = (slope.mT @ residual[0][..., None])[..., 0] + x
         return Point(x, residual[0].square().sum(1) + x.square().sum(1), (slope.mT @ slope + identity, gradient))
@@ -239,34 +232,6 @@ class _FirstFrames(Problem):
     @override
     def distance(self, old: Point, new: Point) -> torch.Tensor:
         return (new.x - old.x).abs().amax(1)
-
-
-class _ReleaseModel:
-    """Maps delays and sideways displacements, in expected deviations, to releases.
-
-    Args:
-        simulator: of the body.
-        markers: maps positions of the vertices to markers.
-        held: release without delay, from rest in the held positions.
-        settings: which unknowns there are, and their expected deviations.
-    """
-
-    def __init__(self, simulator: Simulator, markers: Observation, held: Start, settings: ReleaseSettings) -> None:
-        self._markers, self._held = markers, held
-        none = simulator.rest_positions.new_zeros(0, *simulator.rest_positions.shape)
-        self._shapes = sideways_shapes(simulator) if settings.sideways > 0.0 else none
-        self._sizes = (int(settings.delay > 0.0), len(self._shapes))
-        deviations = (settings.delay, settings.sideways)
-        self.deviation = simulator.tensor([d for d, n in zip(deviations, self._sizes, strict=True) for _ in range(n)])
-
-    def __call__(self, values: torch.Tensor) -> Start:
-        """Returns the releases for values (k R, unknowns); the R motions run fastest."""
-        delay, bends = (values * self.deviation).split(self._sizes, 1)
-        repeats = len(values) // len(self._held.delay)
-        held = self._held.state.q.repeat(repeats, 1, 1)
-        bend = torch.einsum("bk,knc->bnc", bends, self._shapes)
-        shift = self._markers(held) - self._markers(held + bend) if len(self._shapes) else None
-        return Start(State(held + bend, torch.zeros_like(held)), delay.sum(1), shift)
 
 
 def sideways_shapes(simulator: Simulator) -> torch.Tensor:

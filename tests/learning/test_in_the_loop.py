@@ -135,7 +135,7 @@ class TestInTheLoop:
         rest = simulator().rest_state(2)
         assert not model(rest.q, rest.v + 1.0, LOADS).any()
         trainer.run_epoch()
-        first, second = trainer.state.history
+        first, second = trainer.history
         assert first["rollout_error_mm"] == pytest.approx(loss.error_mm(None), rel=1e-9)
         if not changes:
             assert first["train_loss"] == pytest.approx(float(loss(None)), rel=1e-9)
@@ -163,10 +163,10 @@ class TestInTheLoop:
 
     def test_it_descends_and_keeps_the_best_weights(self, loss):
         trainer = finish(InTheLoop(network(), loss, loss, CONFIG.changed(epochs=12)))
-        losses = [record["train_loss"] for record in trainer.state.history]
+        losses = [record["train_loss"] for record in trainer.history]
         assert losses == sorted(losses, reverse=True)
         assert losses[-1] < 0.5 * losses[0]  # the way there hangs on rounding, from four epochs (0.53) to eight (0.42)
-        errors = [record["rollout_error_mm"] for record in trainer.state.history]
+        errors = [record["rollout_error_mm"] for record in trainer.history]
         assert loss.error_mm(trainer.use_best()) == pytest.approx(min(errors), rel=1e-9)
 
     def test_it_goes_on_bit_for_bit(self, loss, tmp_path):
@@ -178,7 +178,7 @@ class TestInTheLoop:
         again = InTheLoop(network(seed=1), loss, loss, CONFIG)
         again.resume(*read_checkpoint(tmp_path / "part.safetensors", "training"))
         finish(again)
-        assert again.state.history == whole.state.history
+        assert again.history == whole.history
         one, other = (trainer.use_best().state_dict() for trainer in (whole, again))
         assert all(torch.equal(one[key], other[key]) for key in one)
 
@@ -208,7 +208,7 @@ class TestInTheLoop:
         histories = []
         for held_out in (loss, other):
             alone = finish(InTheLoop(network(), loss, held_out, config))
-            histories.append([record["rollout_error_mm"] for record in alone.state.history])
+            histories.append([record["rollout_error_mm"] for record in alone.history])
         parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
         mean = np.average(histories, axis=0, weights=[2, 1])
         assert 0 < np.argmin(mean) == cross_validated_epochs(network, parts, config, lambda: None)
@@ -224,7 +224,7 @@ class TestInTheLoop:
         model = finish(trained).use_best()
         before = loss.error_mm(model)
         whole = finish(InTheLoop(copy.deepcopy(model), loss, loss, config, after=12))
-        history = whole.state.history
+        history = whole.history
         assert [record["epoch"] for record in history] == [12, 13, 14, 15]
         assert history[0]["rollout_error_mm"] == pytest.approx(before, rel=1e-12)
         losses = [record["train_loss"] for record in history]
@@ -237,7 +237,7 @@ class TestInTheLoop:
         write_checkpoint(tmp_path / "part.safetensors", "training", *part.snapshot())
         again = InTheLoop(copy.deepcopy(model), loss, loss, config, after=12)
         again.resume(*read_checkpoint(tmp_path / "part.safetensors", "training"))
-        assert finish(again).state.history == history
+        assert finish(again).history == history
 
 
 class TestWindows:

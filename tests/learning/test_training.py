@@ -76,10 +76,10 @@ class TestResume:
         finish(second)
         assert same(second.model.state_dict(), whole.model.state_dict())
         assert same(second.use_best().state_dict(), whole.use_best().state_dict())
-        assert second.state.history == whole.state.history
-        assert (second.state.best_score, second.state.best_epoch) == (whole.state.best_score, whole.state.best_epoch)
+        assert second.history == whole.history
+        assert (second.best_score, second.best_epoch) == (whole.best_score, whole.best_epoch)
         assert second.best_error == whole.best_error
-        assert same(second.state.best, whole.state.best)
+        assert same(second.best, whole.best)
 
 
 class TestSelection:
@@ -95,9 +95,9 @@ class TestSelection:
             return queue.pop(0)
 
         run = finish(trainer(error=error))
-        losses = [record["validation_loss"] for record in run.state.history]
+        losses = [record["validation_loss"] for record in run.history]
         assert losses == sorted(losses, reverse=True)  # the last epoch has the best loss
-        assert (run.best_error, run.state.best_epoch) == (errors[best], 2 * (best + 1))
+        assert (run.best_error, run.best_epoch) == (errors[best], 2 * (best + 1))
         assert not same(weights[0], weights[2])
         assert same(dict(run.use_best().network.state_dict()), weights[best])
         assert not run.model.training
@@ -113,13 +113,13 @@ class TestSelection:
 
         monkeypatch.setattr(run, "_validate", validate)
         finish(run)
-        assert run.state.best_epoch == 3
+        assert run.best_epoch == 3
         assert not same(weights[2], weights[-1])
         assert len(asked) == 3  # after epochs 2, 4 and 6
         assert math.isnan(run.best_error)  # of epoch 3, nothing is known yet
         assert same(dict(run.use_best().network.state_dict()), weights[2])
         assert (run.best_error, len(asked)) == (measured, 4)
-        assert run.state.history[2]["rollout_error_mm"] == measured
+        assert run.history[2]["rollout_error_mm"] == measured
         run.use_best()
         assert len(asked) == 4
         assert not run.model.training
@@ -128,7 +128,7 @@ class TestSelection:
 class TestRepeatability:
     def test_the_seed_decides(self):
         a, b, other = finish(trainer()), finish(trainer()), finish(trainer(seed=1))
-        assert a.state.history == b.state.history
+        assert a.history == b.history
         assert same(a.model.state_dict(), b.model.state_dict())
         assert not same(a.model.state_dict(), other.model.state_dict())
 
@@ -138,7 +138,7 @@ class TestLearning:
         run = finish(trainer(epochs=100, batch_size=8, noise=0.0))
         linear = float(run.model.remainder) ** 2
         assert 0.1 < linear < 1.0
-        assert run.state.history[-1]["train_loss"] < 0.5 * linear
+        assert run.history[-1]["train_loss"] < 0.5 * linear
 
     def test_losses_are_mean_squared_errors_of_the_standardised_force(self):
         run = finish(trainer(epochs=1))
@@ -146,16 +146,16 @@ class TestLearning:
             wanted = run.model.coders[0].encode(VALIDATION.outputs[0])
             result = run.model.coders[0].encode(run.model(VALIDATION.q, VALIDATION.v))
         expected = float((result - wanted).square().mean())
-        assert run.state.history[0]["validation_loss"] == pytest.approx(expected, rel=1e-5)
+        assert run.history[0]["validation_loss"] == pytest.approx(expected, rel=1e-5)
 
     def test_cosine_schedule(self):
-        rates = [r["learning_rate"] for r in finish(trainer(epochs=5)).state.history]
+        rates = [r["learning_rate"] for r in finish(trainer(epochs=5)).history]
         assert (rates[0], rates[-1]) == (5e-3, pytest.approx(1e-4))
         assert rates[2] == pytest.approx((5e-3 + 1e-4) / 2)
         assert rates == sorted(rates, reverse=True)
 
     def test_step_schedule(self):
-        rates = [r["learning_rate"] for r in finish(trainer(schedule="step")).state.history]
+        rates = [r["learning_rate"] for r in finish(trainer(schedule="step")).history]
         assert rates == [5e-3, 5e-3, 2.5e-3, 2.5e-3, 1.25e-3, 1.25e-3]
 
 

@@ -211,7 +211,7 @@ def _in_the_loop(
     if loop.start == "steps":
         first, _ = _supervised(experiment, model, samples, settings)
         run_epochs(f"{model}: steps", first, lambda _: None)
-        network, after = first.use_best().double().train(), first.state.best_epoch
+        network, after = first.use_best().double().train(), first.best_epoch
     elif loop.hold_out and not validation and len(train) > 1:
         parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
@@ -245,12 +245,12 @@ def train(context: StageContext) -> None:
     best = trainer.use_best()
     kept = {
         "selection": trainer.selection,
-        "epoch": trainer.state.best_epoch,
+        "epoch": trainer.best_epoch,
         "validation_rollout_error_mm": trainer.best_error if math.isfinite(trainer.best_error) else None,
     }
     if kept["validation_rollout_error_mm"] is None:
         log.warning("%s: the selected weights diverge on the validation split", context.name)
-    write_json(context.run_dir / training_file(model), {"kept": kept, "epochs": trainer.state.history})
+    write_json(context.run_dir / training_file(model), {"kept": kept, "epochs": trainer.history})
     write_checkpoint(
         context.run_dir / weights_file(model),
         kind_of(model)[1],
@@ -276,7 +276,7 @@ def run_epochs(
     """
     saved = time.monotonic()
     kept = _copy(trainer.snapshot())
-    with Progress(name, trainer.settings.epochs, "epochs", trainer.state.epoch) as progress:
+    with Progress(name, trainer.settings.epochs, "epochs", trainer.epoch) as progress:
         try:
             while not trainer.finished:
                 record = trainer.run_epoch()

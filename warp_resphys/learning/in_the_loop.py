@@ -137,16 +137,16 @@ class InTheLoop(EpochTrainer[ResidualForce]):
         )
         last = after + (settings.epochs if epochs is None else epochs)
         super().__init__(model, self._lbfgs, judge.error_mm, settings.model_copy(update={"epochs": last}))
-        self.state.epoch = after
+        self.epoch = after
         self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     def begin(self) -> None:
         """Records the start as the first candidate, unless training has begun."""
-        if not self.state.history:
+        if not self.history:
             error = self.rollout_error(self.model)
             with torch.no_grad():
                 loss = float(self._loss())
-            self._keep({"epoch": float(self.state.epoch), "train_loss": loss, "rollout_error_mm": error})
+            self._keep({"epoch": float(self.epoch), "train_loss": loss, "rollout_error_mm": error})
 
     @override
     def _run_epoch(self) -> dict[str, float]:
@@ -158,7 +158,7 @@ class InTheLoop(EpochTrainer[ResidualForce]):
     @property
     def _unit(self) -> float:
         """Loss by which that of the optimiser is divided."""
-        return 1.0 if self.settings.start == "zero" else max(self.state.history[0]["train_loss"], _LEAST)
+        return 1.0 if self.settings.start == "zero" else max(self.history[0]["train_loss"], _LEAST)
 
     def _loss(self) -> torch.Tensor:
         squares = [w.square().sum() for w in self.model.network.parameters()]
@@ -209,7 +209,7 @@ def cross_validated_epochs(
     for trainer in trainers:
         trainer.begin()
     while True:
-        means = np.mean([[record["rollout_error_mm"] for record in t.state.history] for t in trainers], axis=0)
+        means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
         if trainers[0].finished or len(means) - 1 - best >= settings.patience:
             return best

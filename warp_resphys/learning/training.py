@@ -4,7 +4,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Generic
 
 import torch
@@ -26,20 +26,6 @@ class Samples:
     lengths: tuple[int, ...] = ()  # of the time series that the samples consist of, one after the other
 
 
-@dataclass
-class TrainingState:
-    """Progress of a training."""
-
-    epoch: int = 0  # epochs done
-    # one record for each epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and where measured
-    # ``rollout_error_mm``, infinite where a roll-out diverged
-    history: list[dict[str, float]] = field(default_factory=list)
-    # smallest value so far of the selection criterion, a roll-out error [mm] or a validation loss
-    best_score: float = math.inf
-    best_epoch: int = 0  # epoch of the best score
-    best: dict[str, torch.Tensor] = field(default_factory=dict)  # weights of the best score
-
-
 class EpochTrainer(ABC, Generic[Model]):
     """Trains epoch by epoch, and keeps the weights with the smallest roll-out error.
 
@@ -48,6 +34,14 @@ class EpochTrainer(ABC, Generic[Model]):
         optimiser: of the network's weights.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
         settings: number of epochs, and how often the roll-out error is measured.
+
+    Attributes:
+        epoch: epochs done.
+        history: a record for each epoch: ``epoch``, ``train_loss``, ``validation_loss``, ``learning_rate``, and where
+            measured ``rollout_error_mm``, infinite where a roll-out diverged.
+        best_score: smallest value so far of the selection criterion, a roll-out error [mm] or a validation loss.
+        best_epoch: its epoch.
+        best: its weights.
     """
 
     selection: str = "rollout"
@@ -60,7 +54,8 @@ class EpochTrainer(ABC, Generic[Model]):
         settings: EpochSettings,
     ) -> None:
         self.model, self.settings, self.rollout_error = model, settings, rollout_error
-        self._optimiser, self.state = optimiser, TrainingState()
+        self._optimiser, self.epoch, self.history = optimiser, 0, list[dict[str, float]]()
+        self.best_score, self.best_epoch, self.best = math.inf, 0, dict[str, torch.Tensor]()
 
     @abstractmethod
     def _run_epoch(self) -> dict[str, float]:
@@ -69,38 +64,38 @@ class EpochTrainer(ABC, Generic[Model]):
     @property
     def finished(self) -> bool:
         """Whether all epochs are done."""
-        return self.state.epoch >= self.settings.epochs
+        return self.epoch >= self.settings.epochs
 
     def run_epoch(self) -> dict[str, float]:
         """Trains for one epoch and returns its record."""
         losses = self._run_epoch()
-        self.state.epoch += 1
-        record = {"epoch": float(self.state.epoch), **losses}
-        if self.state.epoch % self.settings.rollout_every == 0 or self.finished:
+        self.epoch += 1
+        record = {"epoch": float(self.epoch), **losses}
+        if self.epoch % self.settings.rollout_every == 0 or self.finished:
             record["rollout_error_mm"] = self.rollout_error(self.model)
         self._keep(record)
         return record
 
     def _keep(self, record: dict[str, float]) -> None:
         """Adds a record to the history, and keeps the weights if their score is the first or the best so far."""
-        self.state.history.append(record)
+        self.history.append(record)
         score = record.get("rollout_error_mm" if self.selection == "rollout" else self.selection)
-        if score is not None and (score < self.state.best_score or not self.state.best):
-            self.state.best_score, self.state.best_epoch = score, self.state.epoch
-            self.state.best = {k: t.detach().clone() for k, t in self.model.network.state_dict().items()}
+        if score is not None and (score < self.best_score or not self.best):
+            self.best_score, self.best_epoch = score, self.epoch
+            self.best = {k: t.detach().clone() for k, t in self.model.network.state_dict().items()}
 
     def _kept_record(self) -> dict[str, float]:
         """Record of the epoch whose weights are kept."""
-        return next(record for record in self.state.history if record["epoch"] == self.state.best_epoch)
+        return next(record for record in self.history if record["epoch"] == self.best_epoch)
 
     @property
     def best_error(self) -> float:
         """Roll-out error of the kept weights [mm]; infinite if one diverged, NaN before the first measurement."""
-        return self._kept_record().get("rollout_error_mm", math.nan) if self.state.best else math.nan
+        return self._kept_record().get("rollout_error_mm", math.nan) if self.best else math.nan
 
     def use_best(self) -> Model:
         """Returns the model with the kept weights; adds their roll-out error to the history if missing."""
-        self.model.network.load_state_dict(self.state.best)
+        self.model.network.load_state_dict(self.best)
         self.model.eval()
         record = self._kept_record()
         if "rollout_error_mm" not in record:
@@ -110,7 +105,7 @@ class EpochTrainer(ABC, Generic[Model]):
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Returns tensors and metadata for `resume`."""
         tensors = {f"model.{k}": t for k, t in self.model.state_dict().items()}
-        tensors |= {f"best.{k}": t for k, t in self.state.best.items()}
+        tensors |= {f"best.{k}": t for k, t in self.best.items()}
         numbers: dict[str, Any] = {}
         for i, slot in self._optimiser.state_dict()["state"].items():
             for key, value in slot.items():
@@ -123,18 +118,19 @@ class EpochTrainer(ABC, Generic[Model]):
                     numbers[name] = []
                     tensors |= {f"optimiser.{name}.{k:04d}": t for k, t in enumerate(value)}
         return tensors, {
-            "epoch": self.state.epoch,
-            "best_score": self.state.best_score,
-            "best_epoch": self.state.best_epoch,
-            "history": self.state.history,
+            "epoch": self.epoch,
+            "best_score": self.best_score,
+            "best_epoch": self.best_epoch,
+            "history": self.history,
             "optimiser": numbers,
         }
 
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         """Continues exactly from a `snapshot`."""
         self.model.load_state_dict(with_prefix(tensors, "model."))
-        done = {key: metadata[key] for key in ("epoch", "history", "best_score", "best_epoch")}
-        self.state = TrainingState(**copy.deepcopy(done), best=with_prefix(tensors, "best."))
+        self.epoch, self.history = metadata["epoch"], copy.deepcopy(metadata["history"])
+        self.best_score, self.best_epoch = metadata["best_score"], metadata["best_epoch"]
+        self.best = with_prefix(tensors, "best.")
         slots: dict[int, dict[str, Any]] = {}
         for name, value in metadata["optimiser"].items():
             index, key = name.split(".")
@@ -203,7 +199,7 @@ class Trainer(EpochTrainer[Model]):
 
     @override
     def _run_epoch(self) -> dict[str, float]:
-        rate = self.learning_rate(self.state.epoch)
+        rate = self.learning_rate(self.epoch)
         self._adam.param_groups[0]["lr"] = rate
         self.model.train()
         total, count = torch.zeros((), device=self.model.rest.device), 0.0

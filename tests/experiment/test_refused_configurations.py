@@ -143,7 +143,7 @@ CASES = {
     ],
     LIMBS: [
         ("markers.plane is .* twice", "markers.plane=[x,x]"),
-        ("'slow'", "data.trials.fast.labels=[N1,N2,N3,N4,M3]"),
+        ("two trials have some markers in common", "data.trials.fast.labels=[N1,N2,N3,N4,M3]"),
         ("markers.tracked", "data.trials.fast.labels=[N1,N2,N4]"),
         ("markers.plane", "data.axes=null"),
         ("markers.frame", "data.base_motion=recorded"),

@@ -4,7 +4,7 @@ import benchmark
 import numpy as np
 import pytest
 import torch
-from benchmarks import gripper, measuring, peers, steps
+from benchmarks import measuring, peers, steps
 
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.files import read_json
@@ -128,11 +128,6 @@ class TestGripper:
         (row,) = result["a step of 10 ms of all grippers"]
         assert (row["grippers"], row["held"], row["crossings"]) == (2, 2, 0)
         assert row["speed_of_that_without"] == pytest.approx(row["without_contact_ms"] / row["grasp_ms"])
-
-    @pytest.mark.slow
-    def test_a_loose_one_drops_it(self):
-        words = arguments("gripper", "--tensions", "0.3", "0.3")
-        assert gripper.Grasp.of(words, 1, torch.device("cpu"), contact=True).measure()["held"] == 0
 
 
 class TestPeers:

@@ -159,15 +159,6 @@ print(json.dumps(helps))
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_a_command_runs_from_an_empty_folder(installed, tmp_path):
-    arguments = ["mesh=arm_generated", "mesh.layers=0.03", "save=arm.msh", "picture=false"]
-    out = call(installed / "warp-resphys", "inspect", *arguments, folder=tmp_path)
-    assert "chamber_6" in out
-    out = call(installed / "warp-resphys", "inspect", "outputs/inspect/arm.msh", "picture=false", folder=tmp_path)
-    assert "chamber_6 (" in out
-
-
 def test_importing_the_package_imports_nothing_heavy(installed, tmp_path):
     program = "import sys, warp_resphys; print(sorted({'torch', 'warp', 'numpy', 'hydra'} & set(sys.modules)))"
     assert call(installed / "python", "-c", program, folder=tmp_path) == "[]\n"

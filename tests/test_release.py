@@ -110,42 +110,13 @@ def test_the_recipe_has_the_dependencies_of_the_package():
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_a_workflow_is_whole_and_names_what_exists(path):
-    workflow = yaml.safe_load(path.read_text(encoding="utf-8"))
-    assert workflow["permissions"]
-    assert workflow[True]  # the key `on`, which YAML reads as a truth value
-    extras = PROJECT["project"]["optional-dependencies"]
-    for job in workflow["jobs"].values():
-        if "steps" not in job:
-            assert (REPOSITORY / job["uses"]).is_file()
-            continue
-        assert job["timeout-minutes"] <= 120
-        assert job["runs-on"]
-        listed = [entry["tests"] for entry in job.get("strategy", {}).get("matrix", {}).get("include", [])]
-        for step in job["steps"]:
-            assert ("uses" in step) != ("run" in step)
-            if "uses" in step:
-                assert re.fullmatch(r"[\w-]+/[\w-]+@[\w./-]+", step["uses"])
-        commands = listed + [step["run"] for step in job["steps"] if "run" in step]
-        for command in commands:
-            for name in paths_in(command):
-                assert (REPOSITORY / name).exists(), name
-            for names in re.findall(r'"\.\[([\w,]+)\]"', command):
-                assert set(names.split(",")) <= extras.keys()
-
-
-def test_the_workflows_cover_systems_versions_and_extras():
-    jobs = yaml.safe_load(text(".github/workflows/tests.yml"))["jobs"]
-    classifiers = PROJECT["project"]["classifiers"]
-    versions = [name.rpartition(" ")[2] for name in classifiers if re.search(r":: 3\.\d+$", name)]
-    assert jobs["linux"]["strategy"]["matrix"]["python"] == versions
-    assert {system.partition("-")[0] for system in jobs["systems"]["strategy"]["matrix"]["system"]} == {
-        "windows",
-        "macos",
-    }
-    extras = {entry["extra"] for entry in jobs["extras"]["strategy"]["matrix"]["include"]}
-    tested = re.search(r"warp-resphys\[([\w,]+)\]", str(PROJECT["project"]["optional-dependencies"]["test"]))[1]
-    assert extras | {*tested.split(",")} == PROJECT["project"]["optional-dependencies"].keys() - {"book", "dev", "test"}
+def test_a_workflow_names_what_exists(path):
+    workflow = path.read_text(encoding="utf-8")
+    assert yaml.safe_load(workflow)["permissions"]
+    for name in paths_in(workflow):
+        assert (REPOSITORY / name).exists(), name
+    for names in re.findall(r'"\.\[([\w,]+)\]"', workflow):
+        assert set(names.split(",")) <= PROJECT["project"]["optional-dependencies"].keys()
 
 
 @pytest.mark.parametrize("path", CONTAINERS, ids=lambda path: path.name)

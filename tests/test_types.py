@@ -31,6 +31,7 @@ def test_completion_lists_the_public_names_alone():
     assert sorted(dir(warp_resphys)) == sorted([*warp_resphys.__all__, "__version__"])
 
 
+@pytest.mark.slow
 def test_a_type_checker_knows_the_public_names(tmp_path):
     api = pytest.importorskip("mypy.api")
     script = tmp_path / "script.py"

@@ -39,7 +39,7 @@ def done(function, tasks, workers, folder):
     return fan_out(function, tasks, workers, folder, numbers.append), numbers
 
 
-@pytest.fixture(params=["local", "dask"])
+@pytest.fixture(params=["local", pytest.param("dask", marks=pytest.mark.slow)])
 def workers(request, monkeypatch):
     if request.param == "local":
         yield Workers(2)
@@ -71,7 +71,7 @@ def fails(task):
     ("task", "error", "message"),
     [
         ("bad input", WorkerError, "^this is refused.$"),
-        ("fault", WorkerFaultError, "ZeroDivisionError"),
+        pytest.param("fault", WorkerFaultError, "ZeroDivisionError", marks=pytest.mark.slow),
     ],
 )
 def test_an_error_ends_the_work(task, error, message, workers, tmp_path):
@@ -127,6 +127,7 @@ def interrupts_itself(task):
     return "continues"
 
 
+@pytest.mark.slow
 def test_workers_leave_ctrl_c_to_their_parent(tmp_path):
     assert done(interrupts_itself, [0, 1, 2], Workers(2), tmp_path)[0] == ["continues"] * 3
 

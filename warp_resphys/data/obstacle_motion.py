@@ -19,15 +19,11 @@ from .recordings.recording import Recording
 from .rigid import FloatArray
 
 
-def configured(common: Mapping[str, Any], own: Mapping[str, MotionSettings]) -> dict[str, MotionSettings]:
-    """Returns the given motions of a trial by obstacle: its own, or the common ones that are not recorded."""
-    return {name: motion for name, motion in {**common, **own}.items() if isinstance(motion, MotionSettings)}
-
-
 def prescribed_all(
-    motions: Mapping[str, MotionSettings], times: NDArray[Any], folder: str = "."
+    common: Mapping[str, Any], own: Mapping[str, MotionSettings], times: NDArray[Any], folder: str = "."
 ) -> dict[str, FloatArray]:
-    """Poses (T, 6) by obstacle at times (T,) [s] of configured motions, as `base_motion.prescribed`."""
+    """Poses (T, 6) by obstacle at times (T,) [s] of a trial's given motions: its own, or common ones, none recorded."""
+    motions = {name: motion for name, motion in {**common, **own}.items() if isinstance(motion, MotionSettings)}
     return {name: prescribed(motion, times, folder) for name, motion in motions.items()}
 
 

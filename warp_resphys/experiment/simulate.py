@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..data.base_motion import check_steps, prescribed, rigid
 from ..data.markers import MarkerMap
 from ..data.observation import WHOLE_STATE, Observation
-from ..data.obstacle_motion import configured, contact_inputs, prescribed_all
+from ..data.obstacle_motion import contact_inputs, prescribed_all
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError, MeshError
 from ..io.fan_out import ALONE
@@ -185,7 +185,7 @@ def obstacles_of(common: Mapping[str, Any], trials: Sequence[Trial], times: NDAr
         trials: the trials.
         times: (T,) times [s].
     """
-    motions = [prescribed_all(configured(common, trial.obstacle_motion), times) for trial in trials]
+    motions = [prescribed_all(common, trial.obstacle_motion, times) for trial in trials]
     still = np.zeros((len(times), 6))
     return {name: np.stack([own.get(name, still) for own in motions]) for own in motions for name in own}
 

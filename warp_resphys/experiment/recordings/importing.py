@@ -17,15 +17,12 @@ from ...data.actuation import NO_INPUT
 from ...data.base_motion import at_times, check_steps
 from ...data.recordings.processing import smooth
 from ...data.recordings.quality import quality
-from ...data.registration import Registration
 from ...data.rigid import root_mean_square
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
 from ...io.errors import DataFileError, InputError, number_of
 from ...io.files import write_json
 from ...io.stages import StageContext
 from ...settings.stages import ImportStage
-from ...settings.trials import ReadingSettings, Trial
-from ..actuators import Drive
 from ..build import bound_markers
 from ..files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
 from ..trials import evenly
@@ -48,23 +45,20 @@ def import_recordings(context: StageContext) -> None:
         DataFileError: a recording cannot be read or used; the message names the file and the marker.
         InputError: a configured value is invalid.
     """
-    observer = Observer(context)
-    settings, tracked = observer.settings, observer.tracked
+    observer, settings = Observer(context), context.settings
     observed = observer.observe(settings.trials)
-    if observer.drive is not None:
-        _check_unit([x.driven for x in observed if x.driven is not None], settings.data, observer.drive)
+    _check_unit(observer, [x.driven for x in observed if x.driven is not None])
     if text := sessions_text({x.settings.name: x.raw.rate for x in observed}, [x.settings.session for x in observed]):
         log.warning("import: %s", text)
     training = [x.settings.name for x in observed] if settings.learned is None else settings.learned
-    offsets = np.stack([_offset(observer, x) for x in observed])  # (R, M, 3) [m]
-    bound = _mounted(observer, observed, observer.nominal + _mean_offset(offsets, observed, training))
-    bound_markers(settings.markers, observer.simulator.body.mesh, bound, tracked)  # Refuses a marker that is far off.
-    shifts = _shifts(observer, observed, bound, offsets)
+    offsets = _offsets(observer, observed)
+    bound = _bound(observer, observed, offsets, training)
+    bound_markers(settings.markers, observer.simulator.body.mesh, bound, observer.tracked)  # Refuses a far marker.
     mountings = _mountings(observer, observed, bound, offsets, training)
-    verticals = _verticals(observed, settings)
-    gravity = _gravity(verticals, settings)
+    verticals, gravity = _verticals(observed, settings)
+    shifts = _shifts(observer, observed, bound, offsets)
     _dataset(observer, observed, bound, shifts, gravity).write(context.run_dir / DATASET)
-    _write_quality(context, observed, tracked, shifts, verticals, gravity, mountings)
+    _write_quality(context, observer, observed, shifts, verticals, gravity, mountings)
 
 
 def import_scaled(context: StageContext) -> None:
@@ -73,12 +67,10 @@ def import_scaled(context: StageContext) -> None:
     Raises:
         DataFileError: a recording cannot be read or used.
     """
-    observer = Observer(context)
-    dataset = read_dataset(context.run_dir / DATASET)
+    observer, dataset = Observer(context), read_dataset(context.run_dir / DATASET)
     assert dataset.bound is not None
-    observed = observer.observe(observer.settings.trials)
-    offsets = np.stack([_offset(observer, x) for x in observed])
-    shifts = _shifts(observer, observed, dataset.bound, offsets)
+    observed = observer.observe(context.settings.trials)
+    shifts = _shifts(observer, observed, dataset.bound, _offsets(observer, observed))
     _dataset(observer, observed, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
 
 
@@ -101,36 +93,48 @@ def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) ->
     )
 
 
-def _offset(observer: Observer, trial: Observed) -> FloatArray:
-    """(M, 3) observed minus expected places of tracked markers in the frame of the body [m], NaN if not seen.
+def _check_unit(observer: Observer, driven: Sequence[FloatArray]) -> None:
+    """Refuses recordings with negligible inputs, which indicate a wrong unit."""
+    drive, limit = observer.drive, observer.data.input_limit
+    if drive is None or limit is None or all(len(inputs) == 1 for inputs in driven):
+        return
+    highest = max(float(np.abs(inputs).max()) for inputs in driven)
+    if highest < NO_INPUT * limit:
+        raise DataFileError(
+            f"the {drive.quantity.plural} of all {len(driven)} recordings stay below {highest:.3g} "
+            f"{drive.quantity.unit}, and data.input_limit is {limit:.3g} {drive.quantity.unit}: give their unit in the "
+            "files (actuation_units, or the header of the column), or set the limit to the robot's maximum."
+        )
+
+
+def _offsets(observer: Observer, observed: Sequence[Observed]) -> FloatArray:
+    """(R, M, 3) observed minus expected places of tracked markers in the frame of the body [m], NaN if not seen.
 
     Those of rigid bodies are turned back with their part, so that they are places on the undeformed body.
     """
-    offset = np.full_like(observer.nominal, np.nan)
-    offset[trial.columns] = trial.places - observer.reader.expected(trial.settings)[: len(trial.columns)]
-    return np.einsum("mij,mi->mj", observer.reader.turned(trial.settings), offset)
+    offsets = np.full((len(observed), *observer.nominal.shape), np.nan)
+    for offset, trial in zip(offsets, observed, strict=True):
+        offset[trial.columns] = trial.places - observer.expected(trial.settings)[: len(trial.columns)]
+        offset[:] = np.einsum("mij,mi->mj", observer.turned(trial.settings), offset)
+    return offsets
 
 
-def _mean_offset(offsets: FloatArray, observed: Sequence[Observed], training: Container[str]) -> FloatArray:
-    """(M, 3) mean of offsets (R, M, 3) of markers from their nominal places [m]; zero for markers that no trial shows.
+def _bound(
+    observer: Observer, observed: Sequence[Observed], offsets: FloatArray, training: Container[str]
+) -> FloatArray:
+    """(M, 3) places of markers: nominal ones with their mean offsets; of rigid bodies, as their poses at rest [m].
 
     Test trials are used only for markers that no training trial has.
-    """
-    mean = np.zeros(offsets.shape[1:])
-    shows_places = np.array([x.shows_places for x in observed])
-    learned = np.array([x.settings.name in training for x in observed])
-    for marker, seen in enumerate(np.isfinite(offsets).all(axis=2).T & shows_places):
-        if seen.any():
-            mean[marker] = offsets[seen & learned if (seen & learned).any() else seen, marker].mean(axis=0)
-    return mean
-
-
-def _mounted(observer: Observer, observed: Sequence[Observed], bound: FloatArray) -> FloatArray:
-    """(M, 3) places of observed points (M, 3), those of a rigid body as its pose at rest has them [m].
 
     Raises:
         InputError: no trial shows a rigid body at rest.
     """
+    bound = observer.nominal.copy()
+    shows_places = np.array([x.shows_places for x in observed])
+    learned = np.array([x.settings.name in training for x in observed])
+    for marker, seen in enumerate(np.isfinite(offsets).all(axis=2).T & shows_places):
+        if seen.any():
+            bound[marker] += offsets[seen & learned if (seen & learned).any() else seen, marker].mean(axis=0)
     for name, own in corners_of(observer.tracked).items():
         if not any(x.shows_places and x.settings.has(name) for x in observed):
             raise InputError(
@@ -183,27 +187,42 @@ def _mountings(
 
 def _shifts(observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray) -> FloatArray:
     """(R, M, 3) shifts that move the markers of each trial to their places [m]; zero if alignment is shared."""
-    if observer.settings.data.alignment == "shared":
+    if observer.data.alignment == "shared":
         return np.zeros_like(offsets)
     shows_places = np.array([x.shows_places for x in observed])
-    turned = np.stack([observer.reader.turned(x.settings) for x in observed])
+    turned = np.stack([observer.turned(x.settings) for x in observed])
     shifts = np.einsum("rmij,rmj->rmi", turned, bound - observer.nominal - offsets)
     return np.where(shows_places[:, None, None], shifts, 0.0)
 
 
-def _check_unit(driven: Sequence[FloatArray], data: ReadingSettings, drive: Drive) -> None:
-    """Refuses recordings with negligible inputs, which indicate a wrong unit."""
-    if not driven or all(len(inputs) == 1 for inputs in driven):
-        return
-    assert data.input_limit is not None
-    highest, limit = max(float(np.abs(inputs).max()) for inputs in driven), data.input_limit
-    words, unit = drive.quantity.plural, drive.quantity.unit
-    if highest < NO_INPUT * limit:
-        raise DataFileError(
-            f"the {words} of all {len(driven)} recordings stay below {highest:.3g} {unit}, and data.input_limit is "
-            f"{limit:.3g} {unit}: give their unit in the files (actuation_units, or the header of the column), or "
-            "set the limit to the robot's maximum."
-        )
+def _verticals(observed: Sequence[Observed], settings: ImportStage) -> tuple[FloatArray | None, FloatArray]:
+    """Returns the (R, 3) vertical of each recording in the frame of the body, and (3,) gravity there [m/s^2].
+
+    Gravity has the mean of their directions, and the configured strength. Where the vertical is unknown, gravity is the
+    configured one.
+
+    Raises:
+        InputError: a vertical is far from that of the configured gravity.
+    """
+    up, configured = vertical(settings.data.up), np.asarray(settings.gravity, dtype=np.float64)
+    if up is None:
+        return None, configured
+    verticals = np.stack([x.registration.transform.rotation @ up for x in observed])
+    for trial, measured in zip(observed, verticals, strict=True):
+        if configured.any() and _angle(measured, -configured) > _LARGEST_LEAN:
+            down = ", ".join(f"{-x:.2f}" for x in measured)
+            raise InputError(
+                f"{trial.raw.source}: with data.up {settings.data.up}, gravity points along ({down}) in the "
+                f"frame of the body, {_angle(measured, -configured):.0f} degrees from the configured one: set data.up "
+                "to the vertical of the recordings, or gravity to its direction in the frame of markers and mesh."
+            )
+    mean = verticals.mean(axis=0)
+    return verticals, -np.linalg.norm(configured) * mean / np.linalg.norm(mean)
+
+
+def _angle(a: FloatArray, b: FloatArray) -> float:
+    """Angle between two vectors [degrees]."""
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def _dataset(
@@ -211,19 +230,17 @@ def _dataset(
 ) -> Dataset:
     """Makes the dataset in the frame of the body; trials that end early are padded."""
     settings, drive = observer.settings, observer.drive
-    cutoff, steps = settings.data.cutoff, settings.data.steps
+    cutoff, steps, step = settings.data.cutoff, settings.data.steps, settings.time_step
     frames = max(len(x.moving.positions) if x.settings.is_released else 1 for x in observed)
-    if any(x.settings.begins in RESTING for x in observed):
+    begins = ["released" if x.settings.is_released else x.settings.begins for x in observed]
+    begins = [UNDER_INPUTS if word == SLACK else word for word in begins]
+    if {*begins} & {*RESTING}:
         assert steps is not None
         frames = max(frames, steps + 1)
     shape = (len(observed), frames, len(observer.tracked), 3)
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
     times, held = np.zeros(shape[:2]), np.full((shape[0], *shape[2:]), np.nan)
-    inputs, resting = {}, dict[str, FloatArray]()
-    if drive is not None:
-        inputs[drive.quantity.name] = np.zeros((len(observed), steps if steps else 1, len(drive.parts)))
-        if any(_begins(x.settings) == UNDER_INPUTS for x in observed):
-            resting[drive.quantity.name] = np.array([x.driven[0] for x in observed if x.driven is not None])
+    inputs = np.zeros((len(observed), steps or 1, 0 if drive is None else len(drive.parts)))
     for row, trial in enumerate(observed):
         limit = frames if trial.settings.is_released or steps is None else steps + 1
         seen = trial.moving.positions[:limit]
@@ -235,130 +252,73 @@ def _dataset(
         if trial.settings.is_released:
             times[row] = np.pad(trial.moving.time, (0, frames - len(seen)), mode="edge")
         elif trial.settings.begins in RESTING:
-            times[row] = np.minimum(np.arange(frames), steps or 0) * settings.time_step
+            times[row] = np.minimum(np.arange(frames), steps or 0) * step
             held[row] = np.where(np.isfinite(markers[row, 0]), markers[row, 0], held[row])
         else:
             held[row, has] = bound[has]  # The displacement of a static pose counts from the undeformed body.
-        if trial.driven is not None:
-            for series in inputs.values():
-                _fill_inputs(series[row], trial.driven, trial)
-    sessions = tuple(x.settings.session or "" for x in observed)
-    points = observer.simulator.body.mesh.vertices
-    base = _at_steps(observed, [x.base for x in observed], times, settings.time_step, points)
-    moved = dict.fromkeys(name for x in observed for name in x.obstacles)
+        if trial.driven is not None:  # The last inputs are repeated after the end of a trial.
+            series = trial.driven if len(trial.driven) == 1 else trial.driven[1 : inputs.shape[1] + 1]
+            inputs[row, : len(series)], inputs[row, len(series) :] = series, trial.driven[-1]
+            if 1 < len(series) < inputs.shape[1]:
+                log.warning(
+                    "import: %s ends after %d of the %d steps of data.steps; later frames count as not seen.",
+                    *(trial.raw.source.name, len(series), inputs.shape[1]),
+                )
+    driven: dict[str, Any] = {}
+    if drive is not None:
+        name = drive.quantity.name
+        driven = {"inputs": {name: inputs}, "channels": {name: drive.parts}, "units": {name: drive.quantity.unit}}
+        if UNDER_INPUTS in begins:
+            driven["resting"] = {name: np.array([x.driven[0] for x in observed if x.driven is not None])}
+    at_steps = step * np.arange(round(np.ceil(times.max() / step - 1e-6)) + 1)
+
+    def motion_of(what: str, poses: Sequence[FloatArray | None]) -> FloatArray:
+        """Returns the motion (R, K + 1, 6) of the base or of an obstacle at the steps of the longest trial."""
+        motion, points = np.zeros((len(observed), len(at_steps), 6)), observer.simulator.body.mesh.vertices
+        for row, (trial, own) in enumerate(zip(observed, poses, strict=True)):
+            if own is not None:
+                motion[row] = at_times(own, trial.moving.time, at_steps)
+                check_steps(motion[row], points, trial.raw.source, what)
+        return motion
+
     obstacles = {
-        name: _at_steps(
-            observed,
-            [x.obstacles.get(name) for x in observed],
-            times,
-            settings.time_step,
-            points,
-            f"the obstacle {name!r}",
-        )
-        for name in moved
+        name: motion_of(f"the obstacle {name!r}", [x.obstacles.get(name) for x in observed])
+        for name in dict.fromkeys(name for x in observed for name in x.obstacles)
     }
+    sessions = tuple(x.settings.session or "" for x in observed)
     return Dataset(
         names=tuple(x.settings.name for x in observed),
         labels=tuple(observer.tracked),
-        begins=tuple(_begins(x.settings) for x in observed),
+        begins=tuple(begins),
         times=times,
         observed=markers,
         held=held,
         payload=np.array([x.settings.payload for x in observed]),
         gravity=gravity,
-        time_step=settings.time_step,
+        time_step=step,
         bound=bound,
-        smoothed=smoothed if cutoff is not None or all(x.settings.begins in RESTING for x in observed) else None,
-        inputs=inputs,
-        channels={} if drive is None else {drive.quantity.name: drive.parts},
-        units={} if drive is None else {drive.quantity.name: drive.quantity.unit},
-        resting=resting,
-        base=base,
-        obstacles={name: motion for name, motion in obstacles.items() if motion is not None},
+        smoothed=smoothed if cutoff is not None or {*begins} <= {*RESTING} else None,
+        base=motion_of("the base", [x.base for x in observed]) if any(x.base is not None for x in observed) else None,
+        obstacles=obstacles,
         sessions=sessions if any(sessions) else (),
+        **driven,
     )
-
-
-def _begins(trial: Trial) -> str:
-    """How a trial begins in a dataset."""
-    return "released" if trial.is_released else UNDER_INPUTS if trial.begins == SLACK else trial.begins
-
-
-def _at_steps(
-    observed: Sequence[Observed],
-    motions: Sequence[FloatArray | None],
-    times: FloatArray,
-    time_step: float,
-    points: FloatArray,
-    what: str = "the base",
-) -> FloatArray | None:
-    """(R, K + 1, 6) motion of the base or of an obstacle at the steps of the longest trial; None if it stands still."""
-    if all(poses is None for poses in motions):
-        return None
-    steps = time_step * np.arange(round(np.ceil(times.max() / time_step - 1e-6)) + 1)
-    motion = np.zeros((len(observed), len(steps), 6))
-    for row, (trial, poses) in enumerate(zip(observed, motions, strict=True)):
-        if poses is not None:
-            motion[row] = at_times(poses, trial.moving.time, steps)
-            check_steps(motion[row], points, trial.raw.source, what)
-    return motion
-
-
-def _fill_inputs(row: FloatArray, driven: FloatArray, trial: Observed) -> None:
-    """Fills in the inputs (K, C) during the steps of a trial; the last inputs are repeated after its end."""
-    series = driven if len(driven) == 1 else driven[1 : len(row) + 1]
-    row[: len(series)] = series
-    row[len(series) :] = driven[-1]
-    if 1 < len(series) < len(row):
-        log.warning(
-            "import: %s ends after %d of the %d steps of data.steps; later frames count as not seen.",
-            *(trial.raw.source.name, len(series), len(row)),
-        )
-
-
-def _verticals(observed: Sequence[Observed], settings: ImportStage) -> FloatArray | None:
-    """(R, 3) vertical of each recording in the frame of the body; None if unknown, refused if far from gravity."""
-    up = vertical(settings.data.up)
-    if up is None:
-        return None
-    verticals = np.stack([x.registration.transform.rotation @ up for x in observed])
-    configured = np.asarray(settings.gravity, dtype=np.float64)
-    for trial, measured in zip(observed, verticals, strict=True):
-        if configured.any() and _angle(measured, -configured) > _LARGEST_LEAN:
-            down = ", ".join(f"{-x:.2f}" for x in measured)
-            raise InputError(
-                f"{trial.raw.source}: with data.up {settings.data.up}, gravity points along ({down}) in the "
-                f"frame of the body, {_angle(measured, -configured):.0f} degrees from the configured one: set data.up "
-                "to the vertical of the recordings, or gravity to its direction in the frame of markers and mesh."
-            )
-    return verticals
-
-
-def _gravity(verticals: FloatArray | None, settings: ImportStage) -> FloatArray:
-    """(3,) measured direction of gravity in the frame of the body, with the configured strength [m/s^2]."""
-    configured = np.asarray(settings.gravity, dtype=np.float64)
-    if verticals is None:
-        return configured
-    mean = verticals.mean(axis=0)
-    return np.asarray(-np.linalg.norm(configured) * mean / np.linalg.norm(mean))
-
-
-def _angle(a: FloatArray, b: FloatArray) -> float:
-    """Angle between two vectors [degrees]."""
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def _write_quality(
     context: StageContext,
+    observer: Observer,
     observed: Sequence[Observed],
-    tracked: Sequence[str],
     shifts: FloatArray,
     verticals: FloatArray | None,
     gravity: FloatArray,
     mountings: Mapping[str, Any],
 ) -> None:
-    """Writes quality.json and registration.json for all released trials and a few driven trials."""
-    settings: ImportStage = context.settings
+    """Writes quality.json and registration.json for all released trials and a few driven trials.
+
+    Lengths are in millimetres, except positions in the frame of the body in metres.
+    """
+    settings, tracked = observer.settings, observer.tracked
     reference, gap = list(settings.markers.reference), settings.data.longest_gap
     driven = [row for row, x in enumerate(observed) if not x.settings.is_released]
     shown = evenly(driven, _SHOWN) if driven else []
@@ -366,8 +326,7 @@ def _write_quality(
     for row, trial in enumerate(observed):
         if row in driven and row not in shown:
             continue
-        name = trial.settings.name
-        labels = trial.raw.labels
+        name, labels, fit = trial.settings.name, trial.raw.labels, trial.registration
         raw = replace(trial.raw, labels=owners(labels), positions=as_markers(trial.raw.positions, labels))
         measured = quality(raw, reference if trial.base is None else [], trial.release, longest_gap=gap)
         qualities[name] = asdict(measured)
@@ -377,29 +336,19 @@ def _write_quality(
         elif measured.warnings:
             remarks = number_of(len(measured.warnings), "remark")
             log.info("import: %s: %s on its quality in the report", measured.source.name, remarks)
-        # Residuals of the tracked markers of a loaded body do not concern the registration.
-        fitted = [*settings.markers.tracked, *reference] if trial.shows_places else reference
-        moved = {tracked[n]: -shifts[row, n] for n in trial.columns if tracked[n] in settings.markers.tracked}
-        registrations[name] = _summary(trial.registration, moved, fitted)
-        if mountings[name]:
-            registrations[name]["mounting"] = mountings[name]
-        if verticals is not None:
-            registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
+        # Places of the tracked markers of a loaded body are not known, and do not concern the registration.
+        known = [*settings.markers.tracked, *reference] if trial.shows_places else reference
+        rows = [row for row, label in enumerate(fit.names) if label in known]
+        names = [fit.names[row] for row in rows]
+        moved = {tracked[n]: -_MILLI * shifts[row, n] for n in trial.columns if tracked[n] in settings.markers.tracked}
+        registrations[name] = {
+            "positions": dict(zip(names, fit.positions[rows].tolist(), strict=True)),
+            "rms_mm": _MILLI * fit.rms,
+            "residual_mm": dict(zip(names, _MILLI * fit.residual[rows], strict=True)),
+            "outliers": list(fit.outliers),
+            "shift_mm": {label: shift.tolist() for label, shift in moved.items()},
+            **({"mounting": mountings[name]} if mountings[name] else {}),
+            **({} if verticals is None else {"vertical_deg": _angle(verticals[row], -gravity)}),
+        }
     write_json(context.run_dir / QUALITY, qualities)
     write_json(context.run_dir / REGISTRATION, registrations)
-
-
-def _summary(registration: Registration, shifts: Mapping[str, FloatArray], only: Sequence[str]) -> dict[str, Any]:
-    """Entry of registration.json; lengths are in millimetres, except positions in the frame of the body in metres.
-
-    Positions and residuals are those of ``only`` some markers, whose places are known.
-    """
-    rows = [row for row, name in enumerate(registration.names) if name in only]
-    names = [registration.names[row] for row in rows]
-    return {
-        "positions": dict(zip(names, registration.positions[rows].tolist(), strict=True)),
-        "rms_mm": _MILLI * registration.rms,
-        "residual_mm": dict(zip(names, _MILLI * registration.residual[rows], strict=True)),
-        "outliers": list(registration.outliers),
-        "shift_mm": {label: (_MILLI * shift).tolist() for label, shift in shifts.items()},
-    }

@@ -11,21 +11,16 @@ from numpy.typing import NDArray
 from ...data.actuation import NO_INPUT, check_inputs
 from ...data.base_motion import followed, in_frame, prescribed, rigid
 from ...data.marker_view import MarkerView
-from ...data.obstacle_motion import configured, prescribed_all
+from ...data.obstacle_motion import prescribed_all
 from ...data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
 from ...data.recordings.quality import check_base, check_motion
 from ...data.recordings.recording import Recording
 from ...data.recordings.release import Release, valve_opening
 from ...data.registration import Registration, register_markers
-from ...data.rigid import RigidTransform
 from ...data.rigid_bodies import corners_of, owners
-from ...dynamics.simulator import Simulator
 from ...io.errors import DataFileError, listed
-from ...io.stages import StageContext
-from ...settings.stages import ImportStage
-from ...settings.trials import BaseMotion, MotionSettings, Trial
-from ..actuators import Drive, drive_of
-from ..build import build_simulator
+from ...settings.trials import MotionSettings, Trial
+from ..actuators import Drive
 from ..files import SLACK, STATIC, UNDER_INPUTS
 from .reading import POSE_SECONDS, Reader, central_places
 
@@ -81,70 +76,42 @@ class Observed:
         return self.view.of_arrays(self.registration.positions[: len(self.columns)])
 
 
-class Observer:
-    """Reads and registers trials.
-
-    Args:
-        context: context of the stage.
-    """
-
-    def __init__(self, context: StageContext) -> None:
-        settings: ImportStage = context.settings
-        self.context, self.settings = context, settings
-        self.data, self.markers = settings.data, settings.markers
-        self.simulator: Simulator = build_simulator(settings, settings.simulation, payload_at=settings.payload_at)
-        self._limit = settings.data.input_limit or np.inf
-        self.drive = drive_of(self.settings, self.simulator.body)
-        self.reader = Reader(self.settings, context.run_dir, self.simulator, self.drive)
-        self.tracked, self.nominal = self.reader.tracked, self.reader.nominal
+class Observer(Reader):
+    """Reads and registers trials."""
 
     def observe(self, trials: Sequence[Trial]) -> list[Observed]:
         """Reads every trial, finds time zero and registers it.
 
+        In loaded trials only the reference markers are at known places. Their nominal places may be wrong by a third of
+        a millimetre, which would rotate a body by a millimetre at its tip compared with the other trials, which are
+        registered by all markers. So trials that are loaded from their first frame on are registered by the reference
+        markers of the other trials.
+
         Raises:
             DataFileError: a recording cannot be read or used; the message names the file and the marker.
         """
-        ready = [*map(self._timed, trials, self.reader.read(trials))]
+        ready = [*map(self._timed, trials, self.read(trials))]
         self._check_reference(trials, ready)
-        return self._with_common_reference(
-            [
-                self._driven(trial, recording) if release is None else self._released(trial, recording, release)
-                for trial, (recording, release) in zip(trials, ready, strict=True)
-            ]
-        )
-
-    def _with_common_reference(self, observed: list[Observed]) -> list[Observed]:
-        """Registers trials that are loaded from their first frame on by the reference markers of the other trials.
-
-        In loaded trials only the reference markers are at known places. Their nominal places may be wrong by a third of
-        a millimetre, which would rotate a body by a millimetre at its tip compared with the other trials, which are
-        registered by all markers.
-        """
+        observed = [
+            self._driven(trial, recording) if release is None else self._released(trial, recording, release)
+            for trial, (recording, release) in zip(trials, ready, strict=True)
+        ]
         positions = [x.registration.positions[len(x.columns) :] for x in observed if x.shows_places]
-        if not positions or len(positions) == len(observed) or len(self.markers.reference) < self.reader.enough:
-            return observed
-        seen = np.isfinite(np.stack(positions)).all(-1).any(0)
-        mean = np.nanmean(np.stack(positions)[:, seen], axis=0)
-
-        def registered(loaded: Observed) -> Observed:
-            expected = self.reader.expected(loaded.settings)
-            expected[len(loaded.columns) :][seen] = mean
-            registration = self._register(loaded.settings, loaded.still, loaded.raw, expected, only_reference=True)
-            return replace(loaded, registration=registration)
-
-        return [x if x.shows_places else registered(x) for x in observed]
+        if positions and len(positions) < len(observed) and len(self.markers.reference) >= self.enough:
+            seen = np.isfinite(np.stack(positions)).all(-1).any(0)
+            mean = np.nanmean(np.stack(positions)[:, seen], axis=0)
+            for row, loaded in enumerate(observed):
+                if not loaded.shows_places:
+                    expected = self.expected(loaded.settings)
+                    expected[len(loaded.columns) :][seen] = mean
+                    again = self._register(loaded.settings, loaded.still, loaded.raw, expected, only_reference=True)
+                    observed[row] = replace(loaded, registration=again)
+        return observed
 
     def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
         """Resamples the recording of a driven body to the steps of the simulation; finds the release of a held body."""
         if not trial.is_released:
             return resample(recording, 1.0 / self.settings.time_step), None
-        self._check_rate(recording)
-        if trial.begins == "released":
-            return recording, _START
-        return recording, release_of(recording, self.reader.tracked_in(trial), self.data.longest_gap)
-
-    def _check_rate(self, recording: Recording) -> None:
-        """Refuses a frame rate that is too low, and logs whether frames fall between the steps of the simulation."""
         if recording.rate < _LEAST_RATE:
             raise DataFileError(
                 f"{recording.source} has {recording.rate:g} frames per second, too few to estimate the release of "
@@ -157,16 +124,18 @@ class Observer:
                 "at the frames",
                 *(recording.source.name, recording.rate, 1.0 / self.settings.time_step),
             )
+        if trial.begins == "released":
+            return recording, _START
+        return recording, release_of(recording, self.tracked_in(trial), self.data.longest_gap)
 
     def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
         """Refuses recordings if reference markers moved relative to each other between trials."""
         reference, still = list(self.markers.reference), []
         for trial, (recording, release) in zip(trials, ready, strict=True):
+            first, last = 0, None if self._base_motion(trial) is None else self._rest_frames(recording)
             if release is not None:
-                still.append(_frames(recording, *release.rest))
-            else:
-                stands = self._base_motion(trial) is None
-                still.append(recording if stands else _frames(recording, 0, self._rest_frames(recording)))
+                first, last = release.rest
+            still.append(_frames(recording, first, last))
         if len(reference) > 1:
             limits = {"largest_distortion": self.markers.largest_distortion}
             check_base(still, reference, **limits, largest_shift=self.markers.largest_shift)
@@ -174,64 +143,42 @@ class Observer:
     def _rest_frames(self, recording: Recording) -> int:
         return max(round(self.data.rest_seconds * recording.rate), 1)
 
-    def _base_motion(self, trial: Trial) -> BaseMotion:
+    def _base_motion(self, trial: Trial) -> Any:
         """Configured motion of the base of a trial; in a laboratory the base may be measured instead."""
         common = self.data.base_motion
         return common if trial.base_motion is None or isinstance(common, str) else trial.base_motion
 
-    def _base(
-        self, trial: Trial, whole: Recording, moving: Recording, still: FloatArray, transform: RigidTransform
-    ) -> FloatArray | None:
-        """(T, 6) motion of the base at the frames, in the frame of the body; ``whole`` has all markers."""
-        motion = self._base_motion(trial)
-        if motion is None:
-            return None
-        if isinstance(motion, MotionSettings):
-            poses = prescribed(motion, moving.time, self.data.folder or ".")
-        elif motion == "reference":
-            count = len(self.reader.tracked_in(trial))
-            poses = in_frame(followed(whole.positions[:, count:], still[count:], whole.source), transform)
-        elif moving.base is not None:
-            poses = in_frame(moving.base, transform)
-        else:
-            raise DataFileError(
-                f"{whole.source} has no array 'base' with the motion of the base: add it "
-                "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
-            )
-        self._check_early(trial, whole, poses, "the base moves the body")
-        return poses
+    def _with_motions(self, observed: Observed, whole: Recording) -> Observed:
+        """Adds the motions of base and obstacles in the frame of the body; ``whole`` has all markers at the frames.
 
-    def _check_early(self, trial: Trial, whole: Recording, poses: FloatArray, what: str) -> None:
-        """Refuses a motion (T, 6) that begins during registration."""
-        early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
-        moved = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
-        if (furthest := float(np.linalg.norm(moved, axis=-1).max())) > self.markers.largest_residual:
-            raise DataFileError(
-                f"{whole.source}: {what} by {_MILLI * furthest:.1f} mm during registration: "
-                "keep it still until the release, or in the first data.rest_seconds."
-            )
-
-    def _obstacles(
-        self, trial: Trial, whole: Recording, moving: Recording, transform: RigidTransform
-    ) -> dict[str, FloatArray]:
-        """(T, 6) motions of obstacles at the frames, in the frame of the body; recorded ones take precedence."""
-        own = {name: motion for name, motion in trial.obstacle_motion.items() if name not in moving.obstacles}
-        given = configured(self.data.obstacle_motion, own)
-        motions = prescribed_all(given, moving.time, self.data.folder or ".")
-        motions |= {name: in_frame(poses, transform) for name, poses in moving.obstacles.items()}
-        for name, poses in motions.items():
-            self._check_early(trial, whole, poses, f"the obstacle {name!r} moves")
-        return motions
-
-    def _turned_back(self, places: FloatArray, view: MarkerView) -> FloatArray:
-        """(M', 3) places in the frame of the recording, with tracked markers as seen in their own frame if it is used.
-
-        In their own frame, markers do not depend on the pose of the body: any motion registers them.
+        Recorded motions of obstacles take precedence over given ones.
         """
-        rotation, count = self.reader.rotation, len(view.nominal)
-        if not view.own or rotation is None:
-            return places
-        return np.concatenate([view.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
+        trial, moving, frame = observed.settings, observed.moving, observed.registration.transform
+        motion, folder, base = self._base_motion(trial), self.data.folder or ".", None
+        if isinstance(motion, MotionSettings):
+            base = prescribed(motion, moving.time, folder)
+        elif motion == "reference":
+            count = len(observed.columns)
+            base = in_frame(followed(whole.positions[:, count:], observed.still[count:], whole.source), frame)
+        elif motion is not None:
+            if moving.base is None:
+                raise DataFileError(
+                    f"{whole.source} has no array 'base' with the motion of the base: add it "
+                    "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
+                )
+            base = in_frame(moving.base, frame)
+        obstacles = prescribed_all(self.data.obstacle_motion, trial.obstacle_motion, moving.time, folder)
+        obstacles |= {name: in_frame(poses, frame) for name, poses in moving.obstacles.items()}
+        moved = {} if base is None else {"the base moves the body": base}
+        for what, poses in (moved | {f"the obstacle {name!r} moves": own for name, own in obstacles.items()}).items():
+            early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
+            shift = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
+            if (furthest := float(np.linalg.norm(shift, axis=-1).max())) > self.markers.largest_residual:
+                raise DataFileError(
+                    f"{whole.source}: {what} by {_MILLI * furthest:.1f} mm during registration: "
+                    "keep it still until the release, or in the first data.rest_seconds."
+                )
+        return replace(observed, base=base, obstacles=obstacles)
 
     def _register(
         self,
@@ -241,24 +188,31 @@ class Observer:
         expected: FloatArray,
         only_reference: bool = False,
     ) -> Registration:
-        chosen = self.markers.register_with
+        """Registers places (M', 3) of markers in the frame of a recording [m].
+
+        In their own frame, tracked markers do not depend on the pose of the body: any motion registers them.
+        """
+        chosen, view, rotation = self.markers.register_with, self.view(trial), self.rotation
         use = [*self.markers.reference] if only_reference else [*self.markers.tracked, *self.markers.reference]
         use = [label for label in use if label in recording.labels and (chosen is None or label in chosen)]
+        if view.own and rotation is not None:
+            count = len(view.nominal)
+            places = np.concatenate([view.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
         return register_markers(
-            *(self._turned_back(places, self.reader.view(trial)), expected, recording.labels),
+            *(places, expected, recording.labels),
             source=recording.source,
             largest_residual=self.markers.largest_residual,
             use=use,
-            rotation=self.reader.rotation,
-            vertical=self.reader.vertical,
+            rotation=rotation,
+            vertical=self.vertical,
         )
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """Observes a body that was held, undeformed or deformed, and then released."""
-        tracked = self.reader.tracked_in(trial)
-        still = _median(_frames(recording, *release.rest), tracked)
+        tracked = self.tracked_in(trial)
+        still = _central(_frames(recording, *release.rest), tracked, np.median, "is held")
         places = _rest_of(recording, tracked) if self.data.rest == "file" else still
-        registration = self._register(trial, places, recording, self.reader.expected(trial))
+        registration = self._register(trial, places, recording, self.expected(trial))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
         log.info(
             "import: %s is released in frame %.1f, registered to %.2f mm%s",
@@ -275,50 +229,47 @@ class Observer:
         check_motion(moving, tracked)
         # Inputs of released bodies are taken as constant.
         driven = None if self.drive is None else self._inputs(moving, trial, self.drive)[:1]
+        fields = (trial, recording, trial.tracked(self.tracked), self.view(trial), moving, still, registration, driven)
         first = int(np.ceil(release.frame))
-        whole = _frames(recording, first, first + len(moving.positions))
-        base = self._base(trial, whole, moving, still, registration.transform)
-        view, columns = self.reader.view(trial), trial.tracked(self.tracked)
-        obstacles = self._obstacles(trial, whole, moving, registration.transform)
-        fields = (trial, recording, columns, view, moving, still, registration, driven, release)
-        return Observed(*fields, base=base, obstacles=obstacles)
+        return self._with_motions(Observed(*fields, release), _frames(recording, first, first + len(moving.positions)))
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """Observes a body that rests until its inputs begin, or a static pose."""
-        static, tracked = trial.begins == STATIC, self.reader.tracked_in(trial)
+        static, tracked = trial.begins == STATIC, self.tracked_in(trial)
         if not static:
             assert self.data.steps is not None
             check_motion(_frames(recording, 0, self.data.steps + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
-        under_inputs = trial.begins in (UNDER_INPUTS, SLACK)
         loaded = driven is not None and not self._is_at_rest(driven[:1])[0] and trial.begins != SLACK
         unloaded = trial.payload == 0.0 and not loaded
         filled = fill_gaps(recording, self.data.longest_gap, mask_long=True)
-        still = _median(filled, tracked) if static and loaded else self._resting(trial, filled, driven, under_inputs)
+        if static and loaded:
+            still = _central(filled, tracked, np.median, "is held")
+        else:
+            still = self._resting(trial, filled, driven)
         # The reference markers show where the unloaded body is.
-        only_reference = not unloaded and len(self.markers.reference) >= self.reader.enough
-        registration = self._register(trial, still, recording, self.reader.expected(trial), only_reference)
+        only_reference = not unloaded and len(self.markers.reference) >= self.enough
+        registration = self._register(trial, still, recording, self.expected(trial), only_reference)
         moving = filled.select(tracked)
         if static:
             frames = max(round(POSE_SECONDS * moving.rate), 1)
-            last = _frames(moving, -frames, None)
-            moving = replace(moving, positions=_median(last, tracked)[None])
+            last = _central(_frames(moving, -frames, None), tracked, np.median, "is held")
+            moving = replace(moving, positions=last[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
-        base = None if static else self._base(trial, recording, moving, still, registration.transform)
-        view, columns = self.reader.view(trial), trial.tracked(self.tracked)
-        fields = (trial, recording, columns, view, moving, still, registration, driven)
-        obstacles = {} if static else self._obstacles(trial, recording, moving, registration.transform)
-        return Observed(*fields, shows_places=unloaded, base=base, obstacles=obstacles)
+        fields = (trial, recording, trial.tracked(self.tracked), self.view(trial), moving, still, registration, driven)
+        observed = Observed(*fields, shows_places=unloaded)
+        return observed if static else self._with_motions(observed, recording)
 
     def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
         """(T,) whether inputs (T, C) are zero up to the noise of a gauge."""
-        return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * self._limit)
+        return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * (self.data.input_limit or np.inf))
 
-    def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None, under_inputs: bool) -> FloatArray:
+    def _resting(self, trial: Trial, recording: Recording, driven: FloatArray | None) -> FloatArray:
         """(M', 3) mean positions of the markers before the inputs change [m], NaN for markers that are not seen."""
-        before = None if driven is None else driven - driven[0] if under_inputs else driven
-        acts = np.zeros(0, dtype=np.int64) if before is None else np.flatnonzero(~self._is_at_rest(before))
-        until = int(acts[0]) if len(acts) else len(recording.positions)
+        until = len(recording.positions)
+        if driven is not None:
+            before = driven - driven[0] if trial.begins in (UNDER_INPUTS, SLACK) else driven
+            until = next(iter(np.flatnonzero(~self._is_at_rest(before)).tolist()), until)
         if until < 1:
             assert self.drive is not None
             raise DataFileError(
@@ -327,11 +278,11 @@ class Observer:
                 "does not act yet."
             )
         resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
-        return _central(resting, self.reader.tracked_in(trial), np.mean, "rests")
+        return _central(resting, self.tracked_in(trial), np.mean, "rests")
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
         """(T, C) inputs of the body's parts; refuses a wrong number of parts and values beyond the limit."""
-        count = len(drive.parts)
+        count, limit = len(drive.parts), self.data.input_limit or np.inf
         if recording.actuation is None:
             if trial.is_released:
                 return np.zeros((len(recording.positions), count))
@@ -339,9 +290,9 @@ class Observer:
                 f"{recording.source} has no array 'actuation' with the {drive.quantity.plural} of the {drive.per}s: "
                 "add it (docs/recordings.md)."
             )
-        values = check_inputs(recording.actuation, drive.quantity, count, trial.scale * self._limit, recording.source)
+        values = check_inputs(recording.actuation, drive.quantity, count, trial.scale * limit, recording.source)
         if self.data.valve == "detected" and not trial.is_released:
-            opening = valve_opening(recording, self.reader.tracked_in(trial))
+            opening = valve_opening(recording, self.tracked_in(trial))
             # Inputs begin at the opening of the valve; they act during a part of that step.
             frame = (opening - recording.start) * recording.rate
             values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
@@ -353,21 +304,16 @@ def _frames(recording: Recording, first: int, last: int | None) -> Recording:
     return replace(recording, positions=recording.positions[first:last])
 
 
-def _median(recording: Recording, tracked: Sequence[str]) -> FloatArray:
-    """(M', 3) median positions of the markers of a held body [m], NaN for markers that are not seen."""
-    return _central(recording, tracked, np.median, "is held")
-
-
 def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it: str) -> FloatArray:
-    seen: NDArray[np.bool_] = recording.seen
-    hidden = np.flatnonzero(~seen.any(axis=0))
-    lost = [recording.labels[column] for column in hidden if recording.labels[column] in tracked]
+    """(M', 3) median or mean positions of markers [m], NaN for one that is not seen; refused for tracked ones."""
+    places = central_places(recording.positions, centre)
+    lost = [recording.labels[n] for n in np.flatnonzero(np.isnan(places[:, 0])) if recording.labels[n] in tracked]
     if lost:
         raise DataFileError(
             f"{recording.source}: {listed(owners(lost))} cannot be seen while the body {while_it}, so its place on the "
             "body is unknown; leave it out of the configured markers."
         )
-    return central_places(recording, centre)
+    return places
 
 
 def _rest_of(recording: Recording, tracked: Sequence[str]) -> FloatArray:

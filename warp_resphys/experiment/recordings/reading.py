@@ -1,9 +1,8 @@
 """Reads recordings, with names of the configured markers and the inputs that drove the body."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,13 @@ from ...data.recordings.recording import Recording
 from ...data.recordings.text import Table
 from ...data.registration import assign, axes_rotation
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
-from ...dynamics.simulator import Simulator
 from ...io.errors import DataFileError, InputError, listed
+from ...io.stages import StageContext
 from ...settings.stages import ImportStage
 from ...settings.trials import ReadingSettings, Trial
 from ...stepping.inputs import Inputs
-from ..actuators import Drive
-from ..build import bound_markers, marker_view_of, nominal_places
+from ..actuators import drive_of
+from ..build import bound_markers, build_simulator, marker_view_of, nominal_places
 from ..files import STATIC, payload_inputs
 
 log = logging.getLogger(__name__)
@@ -39,12 +38,10 @@ class Reader:
     """Reads recordings, and computes the expected places of their markers.
 
     Args:
-        settings: settings of the import.
-        run_dir: folder of the recordings of a laboratory.
-        simulator: simulator of the body.
-        drive: input that drives the body; None without actuators.
+        context: context of the stage.
 
     Attributes:
+        drive: input that drives the body; None without actuators.
         tracked: labels of the tracked markers and of the points of rigid bodies.
         nominal: (M, 3) their nominal places on the undeformed body [m].
         rotation: (3, 3) rotation from the frame of the recordings to the frame of the body; None if registration
@@ -53,19 +50,19 @@ class Reader:
         enough: number of reference markers that suffice to register a recording.
     """
 
-    def __init__(self, settings: ImportStage, run_dir: Path, simulator: Simulator, drive: Drive | None) -> None:
-        self.data, self.markers, self._payload_at = settings.data, settings.markers, settings.payload_at
+    def __init__(self, context: StageContext) -> None:
+        settings: ImportStage = context.settings
+        self.settings, self.data, self.markers = settings, settings.data, settings.markers
+        self.simulator = build_simulator(settings, settings.simulation, payload_at=settings.payload_at)
+        self.drive = drive_of(settings, self.simulator.body)
         self.tracked = list(self.markers.observed)
-        self.nominal = nominal_places(self.markers, simulator.body.mesh)
-        self._reference = _places(self.markers.reference)
-        axes, table = self.data.axes, self.data.table
-        self.rotation = None if axes is None else axes_rotation(axes)
-        self.vertical = vertical_of(self.data.up, settings.gravity)
+        self.nominal = nominal_places(self.markers, self.simulator.body.mesh)
+        self._reference = np.array([*self.markers.reference.values()], dtype=np.float64).reshape(-1, 3)
+        self.rotation = None if self.data.axes is None else axes_rotation(self.data.axes)
+        up, gravity = vertical(self.data.up), np.asarray(settings.gravity, dtype=np.float64)
+        self.vertical = None if up is None or not gravity.any() else (up, -gravity)
         self.enough = standing_enough(self.data, settings.gravity)
-        self._simulator, self._drive = simulator, drive
-        self._folder = run_dir if self.data.folder is None else None
-        self._table = None if table is None else Table(**table.plain())
-        self._bag = None if self.data.bag is None else Bag(**self.data.bag.plain())
+        self._run_dir = context.run_dir
         self._hanging: FloatArray | None = None
 
     def tracked_in(self, trial: Trial) -> list[str]:
@@ -80,34 +77,47 @@ class Reader:
         """View of the tracked markers in the recording of a trial."""
         return marker_view_of(self.markers, self.tracked_in(trial))
 
-    def expected(self, trial: Trial) -> FloatArray:
+    def expected(self, trial: Trial, places: FloatArray | None = None) -> FloatArray:
         """(M', 3) expected places of a trial's markers at registration, on the undeformed or the hanging body [m].
 
         Coordinates that are not seen have their nominal values.
+
+        Args:
+            trial: the trial.
+            places: (M, 3) of all tracked markers, in place of those on these bodies [m].
         """
-        if trial.is_released:
-            return np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])
+        has = trial.tracked(self.tracked)
+        if places is None and trial.is_released:
+            return np.concatenate([self.nominal[has], self._reference])
+        return np.concatenate(
+            [self.view(trial).of_arrays((self.hanging if places is None else places)[has]), self._reference]
+        )
+
+    @property
+    def hanging(self) -> FloatArray:
+        """(M, 3) tracked markers on the body that hangs under its weight alone [m]."""
         if self._hanging is None:
             self._hanging = self._posed(Inputs())[0]
-        return self._seen(trial, self._hanging)
+        return self._hanging
 
     def turned(self, trial: Trial) -> FloatArray:
         """(M, 3, 3) rotation of a rigid body from the undeformed body to the expected places; identity for markers."""
         turns = np.tile(np.eye(3), (len(self.tracked), 1, 1))
         if not trial.is_released:
-            self.expected(trial)
-            assert self._hanging is not None
             for own in corners_of(self.tracked).values():
-                turns[own] = motion_between(self.nominal[own], self._hanging[own]).rotation
+                turns[own] = motion_between(self.nominal[own], self.hanging[own]).rotation
         return turns
 
-    def _seen(self, trial: Trial, places: FloatArray) -> FloatArray:
-        """(M', 3) places of a trial's markers as seen in its recording, from places (M, 3) of all tracked ones."""
-        seen = self.view(trial).of_arrays(places[trial.tracked(self.tracked)])
-        return np.concatenate([seen, self._reference])
+    def _posed(self, inputs: Inputs) -> FloatArray:
+        """(R, M, 3) tracked markers of the uncorrected simulator in equilibrium [m]."""
+        markers = bound_markers(self.markers, self.simulator.body.mesh, self.nominal, tuple(self.tracked))
+        places = markers.to(self.simulator.rest_positions)(self.simulator.static_equilibrium(inputs).q)
+        return np.asarray(places.cpu().numpy())
 
     def read(self, trials: Sequence[Trial]) -> list[Recording]:
         """Reads the recordings of trials, with their configured markers in order.
+
+        In a plane, the unseen coordinate of every marker has its nominal value.
 
         Raises:
             DataFileError: a recording cannot be read or used; the message names the file and the marker.
@@ -115,114 +125,108 @@ class Reader:
         recordings = [self._read(trial) for trial in trials]
         if self.markers.labels == "assigned":
             recordings = self._assigned(trials, recordings)
-        for trial in trials:
-            if absent := [label for label in self.tracked if label not in self.labels(trial)]:
-                others = [label for label in trial.labels or () if label not in owners(self.labels(trial))]
+        result = []
+        for trial, recording in zip(trials, recordings, strict=True):
+            labels = self.labels(trial)
+            if absent := [label for label in self.tracked if label not in labels]:
+                others = [label for label in trial.labels or () if label not in owners(labels)]
                 log.log(
                     logging.WARNING if others else logging.INFO,
                     "import: %s has no %s, by data.trials.%s.labels%s",
                     *(trial.name, listed(owners(absent)), trial.name),
                     f", and {listed(others)} of it are not configured" if others else "",
                 )
-        pairs = zip(trials, recordings, strict=True)
-        return [self._with_depth(trial, recording.select(self.labels(trial))) for trial, recording in pairs]
-
-    def _with_depth(self, trial: Trial, recording: Recording) -> Recording:
-        """Returns a recording in which the unseen coordinate of every marker has its nominal value."""
-        unseen = self.view(trial).unseen
-        if unseen is None:
-            return recording
-        assert self.rotation is not None  # A plane needs data.axes.
-        axis = self.rotation[unseen]
-        deep = np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])[:, unseen]
-
-        def moved(points: FloatArray) -> FloatArray:
-            return np.asarray(points + (deep - points @ axis)[..., None] * axis)
-
-        rest = None if recording.rest is None else moved(recording.rest)
-        return replace(recording, positions=moved(recording.positions), rest=rest)
+            own, unseen = recording.select(labels), self.view(trial).unseen
+            if unseen is not None:
+                assert self.rotation is not None  # A plane needs data.axes.
+                axis = self.rotation[unseen]
+                deep = np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])[:, unseen]
+                positions, rest = (
+                    None if points is None else points + (deep - points @ axis)[..., None] * axis
+                    for points in (own.positions, own.rest)
+                )
+                assert positions is not None
+                own = replace(own, positions=positions, rest=rest)
+            result.append(own)
+        return result
 
     def _read(self, trial: Trial) -> Recording:
-        if self._folder is not None:
-            recording = read_recording(self._folder / trial.recording)
+        """Reads the recording of a trial, with its rigid bodies, inputs of the body's parts and obstacles."""
+        data, drive = self.data, self.drive
+        if data.folder is None:
+            recording = read_recording(self._run_dir / trial.recording)
         else:
             assert trial.file is not None
-            given = self.data.units, self.data.rate, trial.labels, self._table, self._bag
-            recording = read_recording(Path(trial.file), *given)
+            table = None if data.table is None else Table(**data.table.plain())
+            bag = None if data.bag is None else Bag(**data.bag.plain())
+            recording = read_recording(trial.file, data.units, data.rate, trial.labels, table, bag)
         lengths = {name: body.length for name, body in self.markers.rigid_bodies.items() if trial.has(name)}
         recording = with_corners(recording, lengths)
-        seconds = _HELD_SECONDS if trial.is_released else self.data.rest_seconds
-        shown = [name for name, motion in self.data.obstacle_motion.items() if motion == "recorded"]
+        seconds = _HELD_SECONDS if trial.is_released else data.rest_seconds
+        shown = [name for name, motion in data.obstacle_motion.items() if motion == "recorded"]
         recording = replace(recording, obstacles={name: recorded(recording, name, seconds) for name in shown})
-        if self._drive is None:
-            if trial.inputs is not None:
-                raise InputError(
-                    f"data.trials.{trial.name}.inputs is set, but the body has no chambers, tendons or muscles."
-                )
-            if recording.actuation is not None:
-                raise DataFileError(
-                    f"{recording.source} holds an actuation, {recording.actuation.shape[1]} in each frame, which "
-                    "nothing here uses: take an experiment with pressures (/recordings: pressure), or leave it out of "
-                    "the file."
-                )
-        elif trial.inputs is not None:
-            frames = np.arange(len(recording.positions)) + recording.start * recording.rate
-            share = 1.0 if trial.onset is None else np.clip(frames - trial.onset * recording.rate, 0.0, 1.0)
-            inputs = np.asarray(trial.inputs, dtype=np.float64)
-            recording = replace(recording, actuation=(np.ones_like(frames) * share)[:, None] * inputs)
-        if abs(trial.input_delay) * recording.rate >= len(recording.positions):
+        driven, rate, frames = recording.actuation, recording.rate, np.arange(len(recording.positions))
+        if abs(trial.input_delay) * rate >= len(frames):
             raise InputError(
                 f"data.trials.{trial.name}.input_delay is {trial.input_delay:g} s, longer than the recording: give "
                 "it in s."
             )
-        if self._drive is None or recording.actuation is None:
+        if drive is None:
+            if trial.inputs is not None:
+                raise InputError(
+                    f"data.trials.{trial.name}.inputs is set, but the body has no chambers, tendons or muscles."
+                )
+            if driven is not None:
+                raise DataFileError(
+                    f"{recording.source} holds an actuation, {driven.shape[1]} in each frame, which nothing here uses: "
+                    "take an experiment with pressures (/recordings: pressure), or leave it out of the file."
+                )
             return recording
-        driven = self._of_parts(recording.actuation, recording.source, self._drive)
-        if trial.input_delay:
-            own = np.arange(len(driven), dtype=np.float64)
-            logged = own - trial.input_delay * recording.rate
-            driven = np.stack([np.interp(logged, own, column) for column in driven.T], axis=1)
-        return replace(recording, actuation=driven)
-
-    def _of_parts(self, columns: FloatArray, source: Path, drive: Drive) -> FloatArray:
-        """(T, C) inputs of the parts of the body, from the columns (T, A) of a recording."""
-        parts, count = self.data.parts, len(drive.parts)
-        if columns.shape[1] != (count if parts is None else len(parts)):
+        if trial.inputs is not None:
+            since = frames + (recording.start - (trial.onset or 0.0)) * rate
+            share = np.ones(len(frames)) if trial.onset is None else np.clip(since, 0.0, 1.0)
+            driven = share[:, None] * np.asarray(trial.inputs, dtype=np.float64)
+        if driven is None:
+            return recording
+        parts, count = data.parts, len(drive.parts)
+        if driven.shape[1] != (count if parts is None else len(parts)):
             names = "the body has" if parts is None else "data.parts names"
             raise DataFileError(
-                f"{source} has {drive.quantity.plural} of {columns.shape[1]} {drive.per}s, but {names} "
+                f"{recording.source} has {drive.quantity.plural} of {driven.shape[1]} {drive.per}s, but {names} "
                 f"{count if parts is None else len(parts)}: name the body's {drive.per} of each column in data.parts."
             )
-        if parts is None:
-            return columns
-        inputs = np.zeros((len(columns), count))
-        inputs[:, np.array(parts) - 1] = columns
-        return inputs
+        inputs = np.zeros((len(driven), count))
+        inputs[:, slice(None) if parts is None else np.array(parts) - 1] = driven
+        if trial.input_delay:
+            logged = frames - trial.input_delay * rate
+            inputs = np.stack([np.interp(logged, frames, column) for column in inputs.T], axis=1)
+        return replace(recording, actuation=inputs)
 
     def _assigned(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> list[Recording]:
         """Labels the markers of recordings by their places while the body rests or is held."""
-        expected = [self.expected(trial) for trial in trials]
-        poses = [row for row, trial in enumerate(trials) if trial.begins == STATIC and trial.labels is None]
-        if poses:
-            posed = self._posed(self._held([trials[row] for row in poses], [recordings[row] for row in poses]))
-            for row, places in zip(poses, posed, strict=True):
-                expected[row] = self._seen(trials[row], places)
+        places: dict[str, FloatArray | None] = {trial.name: None for trial in trials}
+        static = [(t, r) for t, r in zip(trials, recordings, strict=True) if t.begins == STATIC and t.labels is None]
+        if static:
+            posed = self._posed(self._held(*zip(*static, strict=True)))
+            places |= {trial.name: own for (trial, _), own in zip(static, posed, strict=True)}
         labelled = []
-        for row, (trial, recording) in enumerate(zip(trials, recordings, strict=True)):
+        for trial, recording in zip(trials, recordings, strict=True):
             if trial.labels is not None:
                 labelled.append(recording)
                 continue
-            unseen, labels = self.view(trial).unseen, self.labels(trial)
-            if unseen is not None:  # The recordings have no depth.
-                expected[row][:, unseen] = 0.0
+            expected, labels = self.expected(trial, places[trial.name]), self.labels(trial)
+            if (unseen := self.view(trial).unseen) is not None:  # The recordings have no depth.
+                expected[:, unseen] = 0.0
             standing = list(range(len(self.tracked), len(labels)))
-            bent = trial.begins == STATIC or len(standing) >= self.enough
+            still = slice(-_count(POSE_SECONDS, recording), None)
+            if trial.begins != STATIC:
+                still = slice(_count(_HELD_SECONDS, recording))
             pairs = assign(
-                central_places(replace(recording, positions=_still_frames(trial, recording)), np.median),
-                expected[row],
+                central_places(recording.positions[still], np.median),
+                expected,
                 labels,
                 source=recording.source,
-                anchors=standing if bent else None,
+                anchors=standing if trial.begins == STATIC or len(standing) >= self.enough else None,
                 rotation=self.rotation,
             )
             log.info(
@@ -237,28 +241,21 @@ class Reader:
 
     def _held(self, trials: Sequence[Trial], recordings: Sequence[Recording]) -> Inputs:
         """Inputs of the body in static poses."""
-        like, fields = self._simulator.rest_positions, {}
-        if self._drive is not None:
-            last = []
-            for recording in recordings:
-                driven = recording.actuation
-                if driven is None:
-                    raise DataFileError(
-                        f"{recording.source} has no inputs of the body: add them to the file, or as "
-                        "data.trials.NAME.inputs."
-                    )
-                last.append(np.median(driven[-_count(POSE_SECONDS, recording) :], axis=0))
-            fields[self._drive.quantity.name] = like.new_tensor(np.stack(last))
+        like, fields = self.simulator.rest_positions, {}
+        if self.drive is not None:
+            if lacking := [recording.source for recording in recordings if recording.actuation is None]:
+                raise DataFileError(
+                    f"{lacking[0]} has no inputs of the body: add them to the file, or as data.trials.NAME.inputs."
+                )
+            last = [
+                np.median(recording.actuation[-_count(POSE_SECONDS, recording) :], axis=0)
+                for recording in recordings
+                if recording.actuation is not None
+            ]
+            fields[self.drive.quantity.name] = like.new_tensor(np.stack(last))
         loads = np.array([trial.payload for trial in trials])
-        hung = payload_inputs(self._simulator.body, self._payload_at, loads)
+        hung = payload_inputs(self.simulator.body, self.settings.payload_at, loads)
         return Inputs(**fields, **{key: like.new_tensor(masses) for key, masses in hung.items()})
-
-    def _posed(self, inputs: Inputs) -> FloatArray:
-        """(R, M, 3) tracked markers of the uncorrected simulator in equilibrium [m]."""
-        simulator = self._simulator
-        markers = bound_markers(self.markers, simulator.body.mesh, self.nominal, tuple(self.tracked))
-        places = markers.to(simulator.rest_positions)(simulator.static_equilibrium(inputs).q)
-        return np.asarray(places.cpu().numpy())
 
 
 def standing_enough(data: ReadingSettings, gravity: Sequence[float]) -> int:
@@ -270,7 +267,7 @@ def standing_enough(data: ReadingSettings, gravity: Sequence[float]) -> int:
     """
     if data.axes is not None:
         return 1
-    return 3 if vertical_of(data.up, gravity) is None else 2
+    return 3 if data.up is None or not any(gravity) else 2
 
 
 def vertical(up: str | Sequence[float] | None) -> FloatArray | None:
@@ -287,36 +284,14 @@ def vertical(up: str | Sequence[float] | None) -> FloatArray | None:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def vertical_of(up: str | Sequence[float] | None, gravity: Sequence[float]) -> tuple[FloatArray, FloatArray] | None:
-    """(3,) upward directions in the frames of the recordings and of the body; None if either is unknown.
-
-    Args:
-        up: see `vertical`.
-        gravity: (3,) gravity in the frame of the body [m/s^2].
-    """
-    upwards, down = vertical(up), np.asarray(gravity, dtype=np.float64)
-    return None if upwards is None or not down.any() else (upwards, -down)
-
-
-def central_places(recording: Recording, centre: Callable[..., Any]) -> FloatArray:
-    """(M, 3) mean or median position of each marker [m], NaN for a marker that is never seen."""
-    places = np.full(recording.positions.shape[1:], np.nan)
-    for column, frames in enumerate(recording.seen.T):
+def central_places(positions: FloatArray, centre: Callable[..., Any]) -> FloatArray:
+    """(M, 3) mean or median of positions (T, M, 3) of each marker [m], NaN for a marker that is never seen."""
+    places = np.full(positions.shape[1:], np.nan)
+    for column, frames in enumerate(np.isfinite(positions).all(-1).T):
         if frames.any():
-            places[column] = centre(recording.positions[frames, column], axis=0)
+            places[column] = centre(positions[frames, column], axis=0)
     return places
-
-
-def _still_frames(trial: Trial, recording: Recording) -> FloatArray:
-    """(T', M, 3) marker positions while the body is in a static pose, rests or is held [m]."""
-    if trial.begins == STATIC:
-        return recording.positions[-_count(POSE_SECONDS, recording) :]
-    return recording.positions[: _count(_HELD_SECONDS, recording)]
 
 
 def _count(seconds: float, recording: Recording) -> int:
     return max(round(seconds * recording.rate), 1)
-
-
-def _places(markers: Mapping[str, Any]) -> FloatArray:
-    return np.array([*markers.values()], dtype=np.float64).reshape(-1, 3)

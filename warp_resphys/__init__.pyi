@@ -79,7 +79,7 @@ from .pictures.misfit import PictureMisfit as PictureMisfit
 from .pictures.motion import ReleasedForce as ReleasedForce
 from .pictures.outlines import ClosedSurface as ClosedSurface
 from .pictures.outlines import Outline as Outline
-from .pictures.scans import read_scan as read_scan
+from .pictures.reading import read_scan as read_scan
 from .pictures.seen import Photo as Photo
 from .pictures.seen import SeenPose as SeenPose
 from .robot.loading import load as load

@@ -134,7 +134,7 @@ def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
     again = settings("experiment=beam_real", *SMALL, "seed=1")
     assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(run)[0], {})
     one, other = (make_setup(PlayedSettings.of(own, files={})) for own in (again, run))
-    assert np.abs(one.translation - other.translation).min() > 1e-3
+    assert np.abs(one.frame.translation - other.frame.translation).min() > 1e-3
 
 
 class Shelf:

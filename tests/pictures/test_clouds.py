@@ -14,14 +14,14 @@ from warp_resphys.experiment.pictures.laboratory import depth_image
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
-from warp_resphys.pictures.clouds import Cloud, distances_of
+from warp_resphys.pictures.clouds import Cloud
 from warp_resphys.pictures.misfit import PictureMisfit, values_of
 from warp_resphys.pictures.outlines import ClosedSurface
 from warp_resphys.pictures.seen import Photo, SeenPose
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)
 CLAMP = wr.select_vertices(MESH, x=0.0)
-SURFACE = ClosedSurface.of_mesh(MESH)
+SURFACE = ClosedSurface.of(MESH)
 REST = torch.as_tensor(MESH.vertices)
 CENTRE = MESH.vertices[CLAMP].mean(0)
 SCANNER = PlacedCamera(None, torch.eye(4), CENTRE)
@@ -92,11 +92,11 @@ def test_only_the_visible_side_is_compared():
     places = np.array([[0.05, 0.01, 0.004], [0.07, 0.012, 0.024]])
     pixels = CAMERA.pixels(torch.as_tensor(places), PLAIN).numpy()
     measured = np.column_stack([pixels, 0.3 - places[:, 2]])
-    seen = distances_of(Cloud(measured, measured * (1.0, 1.0, 0.0)), CAMERA, PLAIN, SURFACE.triangles, REST)
+    seen = Cloud(measured, measured * (1.0, 1.0, 0.0)).distances(CAMERA, PLAIN, SURFACE.triangles, REST)
     assert seen.places == pytest.approx(places, abs=1e-12)
     assert seen.distances == pytest.approx([-0.016, 0.004], abs=1e-12)
     assert seen.directions == pytest.approx(np.array([[0.0, 0.0, 1.0]] * 2), abs=1e-9)
-    blind = distances_of(Cloud(measured), CAMERA, PLAIN, SURFACE.triangles, REST)
+    blind = Cloud(measured).distances(CAMERA, PLAIN, SURFACE.triangles, REST)
     assert blind.distances == pytest.approx([-0.004, 0.004], abs=1e-12)
     shares = (MESH.vertices[seen.triangles] * seen.shares[..., None]).sum(1)
     assert shares == pytest.approx(places * (1.0, 1.0, 0.0) + (0.0, 0.0, 0.02), abs=1e-12)

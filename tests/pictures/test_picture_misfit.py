@@ -40,7 +40,7 @@ def pose(outline=True, tracked=False, name="beam", both_ends=False):
     ends = (wr.select_vertices(MESH, x=0.0), wr.select_vertices(MESH, x=0.1))[: 1 + both_ends]
     body = wr.Body(MESH, fixed=np.concatenate(ends))
     simulator = wr.Simulator(body, wr.Corotated(2e5, 0.45), gravity=(0.0, 0.0, -9.81))
-    surface = ClosedSurface.of_mesh(MESH)
+    surface = ClosedSurface.of(MESH)
     plain = SeenPose(name, simulator, surface, ends, (Photo("0", CAMERA),), points=POINTS)
     q = plain.shape(TRUTH)
     corrections = PlacedCamera.corrections(TRUTH)

@@ -54,7 +54,7 @@ def released(frames=18, row_time=ROW_TIME, outlines=False):
     simulator = wr.Simulator(
         body, wr.Corotated(2e5, 0.45), time_step=1.0 / 240.0, gravity=(0.0, 0.0, -9.81), integrator="bdf2"
     )
-    surface = ClosedSurface.of_mesh(MESH)
+    surface = ClosedSurface.of(MESH)
     photos = tuple(Photo(f"{n}", CAMERA, time=n / RATE, row_time=row_time) for n in range(frames))
     force = ReleasedForce(TIP, (0.0, 0.0, 0.1), 0.05)
     pose = SeenPose("beam", simulator, surface, (CLAMP,), photos, points=POINTS, release=force)

@@ -28,7 +28,7 @@ from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on, workers_for
-from .simulate import build_target, held_state
+from .simulate import build_target, under_forces
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
@@ -74,7 +74,8 @@ def generate_motion(context: StageContext) -> None:
     data = settings.data
     target, simulation = build_target(settings, settings.target), build_simulator(settings, settings.simulation)
     with torch.no_grad():
-        held = held_state(target.simulator, data.load, 1e-3 * np.array(data.weights_g.observed))
+        weights = 1e-3 * np.array(data.weights_g.observed)[:, None] * np.asarray(target.simulator.gravity)
+        held = under_forces(target.simulator, data.load, weights)
         moved = target.simulator.rollout(held, data.steps * target.substeps).q[:: target.substeps, 0]
         start = State(target.seen(held.q), target.seen(held.v))
         motion = {"q": target.seen(moved), "uncorrected_q": simulation.rollout(start, data.steps).q[:, 0]}

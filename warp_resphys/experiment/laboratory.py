@@ -6,9 +6,7 @@ slightly from their nominal places, and cameras see the markers in their own fra
 """
 
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +19,7 @@ from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
 from ..data.rigid import RigidTransform
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
-from ..dynamics.simulator import Constants, Simulator
+from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.stages import StageContext
@@ -36,7 +34,7 @@ from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from .recordings.reading import vertical
-from .simulate import base_of, contact_series, distributed, fixed_positions, obstacles_of, substeps_of, target_settings
+from .simulate import distributed, played, substeps_of, target_settings, true_motions
 
 FloatArray = NDArray[np.float64]
 
@@ -52,22 +50,15 @@ class Setup:
 
     Attributes:
         gravity: (3,) gravity in the frame of the body [m/s^2].
-        rotation: rotation from the frame of the body to the frame of the recordings.
-        translation: (3,) translation between these frames [m].
+        frame: transform from the frame of the body to the frame of the recordings.
         tracked: (M, 3) places of the observed points on the undeformed body [m].
         reference: (S, 3) places of the reference markers [m].
     """
 
     gravity: FloatArray
-    rotation: Rotation
-    translation: FloatArray
+    frame: RigidTransform
     tracked: FloatArray
     reference: FloatArray
-
-    @property
-    def frame(self) -> RigidTransform:
-        """Transform from the frame of the body to the frame of the recordings."""
-        return RigidTransform(self.rotation.as_matrix(), self.translation)
 
     def recorded(self, positions: FloatArray, base: FloatArray) -> FloatArray:
         """(T, M + S, 3) all markers in the frame of the recordings [m].
@@ -76,8 +67,7 @@ class Setup:
             positions: (T, M, 3) observed points in the frame of the body [m].
             base: (T, 6) motion of the base, with which the reference markers move.
         """
-        reference = rigid(base).apply(np.broadcast_to(self.reference, (len(positions), *self.reference.shape)))
-        return self.frame.apply(np.concatenate([positions, reference], axis=1))
+        return self.frame.apply(np.concatenate([positions, rigid(base).apply(self.reference)], axis=1))
 
 
 def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
@@ -92,25 +82,48 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         ConvergenceError, WorkerError: a step of the simulation fails.
     """
     settings: LaboratoryStage = context.settings
-    trials, parts = settings.trials, list[TrialPart]()
+    laboratory, trials, parts = settings.laboratory, settings.trials, list[TrialPart]()
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
-        parts += split_into_parts(context, names, _frame_count(settings, begins), begins, batch=settings.batch)
+        if begins == STATIC:
+            frames = max(int(_POSE_SECONDS * _rate_of(settings)), 5)
+        elif begins in RESTING:
+            assert settings.data.steps is not None
+            frames = settings.data.steps + 1
+        else:
+            assert laboratory.seconds is not None
+            frames = max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
+        parts += split_into_parts(context, names, frames, begins, batch=settings.batch)
     work_on(parts, _played, workers)
     setup = make_setup(settings)
     markers = {name: row for part in parts for name, row in zip(part.names, part.read("markers"), strict=True)}
     noise = [_record(context, setup, trial, markers[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
-        write_json(context.run_dir / TRUTH, _truth(settings, setup, trials, float(np.mean(noise))))
+        material, fibres, muscles = (getattr(laboratory, key) for key in ("material", "fibres", "muscles"))
+        wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
+        wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
+        released = {trial.name: _drawn(settings, trial)[1] for trial in trials}
+        zeros = {"zeros": {trial.name: _zero_of(settings, trial) for trial in trials}}
+        truth = {
+            "material": {"model": material.model, **material.parameters, **wound},
+            "fibre_angles": [] if fibres is None else fibres.angles,
+            "gravity": setup.gravity,
+            "rotation": setup.frame.rotation,
+            "translation": setup.frame.translation,
+            "bound": dict(zip(settings.binding.observed, setup.tracked, strict=True)),
+            "noise_mm": 1e3 * float(np.mean(noise)),
+            **(zeros if laboratory.zero_noise else {}),
+            "released_s": {name: at for name, at in released.items() if at is not None},
+        }
+        write_json(context.run_dir / TRUTH, truth)
     remove_parts(context)
 
 
 def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray) -> float:
     """Writes the recording of a trial; returns the mean distance by which noise moves its tracked markers [m]."""
     settings: LaboratoryStage = context.settings
-    laboratory, common = settings.laboratory, settings.data.base_motion
-    draw = _random_of(settings, trial)
-    released = _released_at(settings, trial, draw)
+    laboratory, data = settings.laboratory, settings.data
+    draw, released = _drawn(settings, trial)
     rate = _rate_of(settings) if trial.is_released else 1.0 / settings.time_step
     times = np.arange(len(series)) / rate  # s since the release
     if released is not None:
@@ -120,7 +133,9 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
         times = np.maximum(np.arange(frames) / rate - released, 0.0)
         sampled = sample(torch.from_numpy(series)[None], torch.from_numpy(times)[None], laboratory.time_step)
         series = sampled[0].numpy()
-    poses = base_of(common, trial, times)
+    base, pushing = true_motions(data, [trial], times)
+    still = np.zeros((len(times), 6))
+    poses = still if base is None else base[0]
     positions = setup.recorded(series, poses)
     noise = laboratory.noise * draw.standard_normal(positions.shape)
     for own in corners_of(settings.binding.observed).values():
@@ -128,12 +143,11 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
         spoke = positions[:, own] - positions[:, own].mean(axis=1, keepdims=True)
         noise[:, own] = noise[:, own][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
     labels = [*settings.binding.observed, *settings.binding.reference]
-    pushing = obstacles_of(settings.data.obstacle_motion, [trial], times)
-    for name in [name for name, motion in settings.data.obstacle_motion.items() if motion == "recorded"]:
-        way = pushing[name][0] if name in pushing else np.zeros((len(times), 6))
+    for name in [name for name, motion in data.obstacle_motion.items() if motion == "recorded"]:
+        way = pushing[name][0] if name in pushing else still
         arms = ["", *(f" +{axis}" for axis in "xyz")][: 4 if way[:, 3:].any() else 1]
         places = np.asarray(laboratory.obstacles[name].position) + ARM * np.eye(4, 3, -1)[: len(arms)]
-        seen = setup.frame.apply(rigid(way).apply(np.broadcast_to(places, (len(way), *places.shape))))
+        seen = setup.frame.apply(rigid(way).apply(places))
         labels += [f"{name}{arm}" for arm in arms]
         positions = np.concatenate([positions, seen], axis=1)
         noise = np.concatenate([noise, laboratory.noise * draw.standard_normal(seen.shape)], axis=1)
@@ -141,20 +155,25 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     if trial.is_driven:
         least = getattr(driving_quantity(laboratory), "lower", -np.inf)
         actuation = np.maximum(_inputs_of(settings, trial) + _zero_of(settings, trial), least)
-    if actuation is not None and len(actuation) != len(positions):
-        actuation = np.repeat(actuation[-1:], len(positions), axis=0)
-    rest = None if trial.pull is None else setup.recorded(setup.tracked[None], np.zeros((1, 6)))[0]
-    base = in_frame(poses, setup.frame) if common == "recorded" else None
+        if len(actuation) != len(positions):
+            actuation = np.repeat(actuation[-1:], len(positions), axis=0)
+    rest = None if trial.pull is None else setup.recorded(setup.tracked[None], still[:1])[0]
+    motion = in_frame(poses, setup.frame) if data.base_motion == "recorded" else None
     path = context.run_dir / trial.recording
-    recording = Recording(tuple(labels), positions + noise, rate, path, actuation=actuation, rest=rest, base=base)
+    recording = Recording(tuple(labels), positions + noise, rate, path, actuation=actuation, rest=rest, base=motion)
     lengths = {name: body.length for name, body in settings.binding.rigid_bodies.items()}
     write_recording(path, with_axes(recording, lengths), {"payload_kg": trial.payload})
     moved = as_markers(noise[:, : series.shape[1]], settings.binding.observed)
     return float(np.linalg.norm(moved, axis=-1).mean())
 
 
-def _random_of(settings: PlayedSettings, trial: Trial) -> np.random.Generator:
-    return np.random.default_rng([settings.seed, zlib.crc32(trial.name.encode())])
+def _drawn(settings: PlayedSettings, trial: Trial) -> tuple[np.random.Generator, float | None]:
+    """Random numbers of a trial, and when its body is released, between two frames [s]; None if it is not held."""
+    draw = np.random.default_rng([settings.seed, zlib.crc32(trial.name.encode())])
+    if trial.begins != "held":
+        return draw, None
+    assert settings.laboratory.held_seconds is not None
+    return draw, float(settings.laboratory.held_seconds + draw.random() / _rate_of(settings))
 
 
 def _zero_of(settings: PlayedSettings, trial: Trial) -> float:
@@ -163,36 +182,9 @@ def _zero_of(settings: PlayedSettings, trial: Trial) -> float:
     return float(settings.laboratory.zero_noise * np.clip(draw.standard_normal(), -_FURTHEST_ZERO, _FURTHEST_ZERO))
 
 
-def _released_at(settings: PlayedSettings, trial: Trial, draw: np.random.Generator) -> float | None:
-    """Time at which a held body is released, between two frames [s]; None for other trials."""
-    if trial.begins != "held":
-        return None
-    assert settings.laboratory.held_seconds is not None
-    return float(settings.laboratory.held_seconds + draw.random() / _rate_of(settings))
-
-
 def _rate_of(settings: PlayedSettings) -> float:
     """Frame rate of the cameras [Hz]."""
     return settings.laboratory.rate or 1.0 / settings.time_step
-
-
-def _truth(settings: PlayedSettings, setup: Setup, trials: Sequence[Trial], noise: float) -> dict[str, Any]:
-    """Contents of truth.json: what the recordings were made with; ``noise`` in metres."""
-    material, fibres, muscles = (getattr(settings.laboratory, key) for key in ("material", "fibres", "muscles"))
-    wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
-    wound |= {} if muscles is None else {"muscle_stiffness": muscles.stiffness}
-    released = {trial.name: _released_at(settings, trial, _random_of(settings, trial)) for trial in trials}
-    return {
-        "material": {"model": material.model, **material.parameters, **wound},
-        "fibre_angles": [] if fibres is None else fibres.angles,
-        "gravity": setup.gravity,
-        "rotation": setup.rotation.as_matrix(),
-        "translation": setup.translation,
-        "bound": dict(zip(settings.binding.observed, setup.tracked, strict=True)),
-        "noise_mm": 1e3 * noise,
-        **({"zeros": {t.name: _zero_of(settings, t) for t in trials}} if settings.laboratory.zero_noise else {}),
-        "released_s": {name: at for name, at in released.items() if at is not None},
-    }
 
 
 def make_setup(settings: PlayedSettings) -> Setup:
@@ -224,7 +216,7 @@ def make_setup(settings: PlayedSettings) -> Setup:
         moved = centre + draw.uniform(-_LARGEST_MOUNTING, _LARGEST_MOUNTING, 3)
         observed[own] = moved + mounting.apply(observed[own] - centre)
     observed[:count] = places[:count]
-    return Setup(gravity, rotation, translation, observed, places[count:])
+    return Setup(gravity, RigidTransform(rotation.as_matrix(), translation), observed, places[count:])
 
 
 def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simulator:
@@ -234,14 +226,10 @@ def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simul
 
 
 def input_sequences(settings: PlayedSettings) -> InputSequences:
-    """Distribution of the laboratory's random inputs, so that recorded ones stay within the limit."""
-    return InputSequences(limit=_largest_input(settings), **dict(settings.laboratory.sequences))
-
-
-def _largest_input(settings: PlayedSettings) -> float:
-    """Largest input, in its unit, that is recorded within the limit with any zero."""
+    """Distribution of the laboratory's random inputs, so that recorded ones stay within the limit with any zero."""
     assert settings.data.input_limit is not None
-    return settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
+    largest = settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
+    return InputSequences(limit=largest, **dict(settings.laboratory.sequences))
 
 
 def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
@@ -250,10 +238,11 @@ def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     assert settings.data.steps is not None
     before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
     steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
+    sequences = input_sequences(settings)
     if trial.waves is not None:
-        drawn = InputWaves(limit=_largest_input(settings), **dict(trial.waves)).series(steps, settings.time_step)
+        drawn = InputWaves(limit=sequences.limit, **dict(trial.waves)).series(steps, settings.time_step)
     else:
-        drawn = input_sequences(settings).draw(steps, settings.time_step, parts, draw)
+        drawn = sequences.draw(steps, settings.time_step, parts, draw)
     drawn = drawn[before:]
     if trial.is_released:
         drawn = np.zeros_like(drawn)
@@ -262,81 +251,47 @@ def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     return trial.scale * drawn
 
 
-def _frame_count(settings: PlayedSettings, begins: str) -> int:
-    """Number of simulated frames, or of states of released bodies, of trials that begin in a given way."""
-    if begins == STATIC:
-        return max(int(_POSE_SECONDS * _rate_of(settings)), 5)
-    if begins in RESTING:
-        assert settings.data.steps is not None
-        return settings.data.steps + 1
-    laboratory = settings.laboratory
-    assert laboratory.seconds is not None
-    return max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
-
-
 def _played(part: TrialPart, report: Report) -> Arrays:
     """Tracked markers of bodies in the laboratory in the frame of the body: released, driven, or in a static pose.
 
-    At every step of released bodies, from time zero on, and at the frames of driven bodies, with several steps from
-    frame to frame.
+    At every step of released bodies, from time zero on, and at the frames of driven bodies, whose inputs are
+    interpolated linearly.
     """
     settings: LaboratoryStage = part.context.settings
     setup, binding = make_setup(settings), settings.binding
     simulator = laboratory_simulator(settings, setup.gravity)
-    by_name, constants = {trial.name: trial for trial in settings.trials}, simulator.prepare()
+    by_name = {trial.name: trial for trial in settings.trials}
     trials = [by_name[name] for name in part.names]
     begins, released = trials[0].begins, trials[0].is_released
-    substeps = 1 if released else substeps_of(settings.time_step, settings.laboratory, "laboratory")
-    markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed)
-    markers = markers.to(simulator.rest_positions)
+    markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed).to(simulator.rest_positions)
     payload = np.array([trial.payload for trial in trials])
-    hung = payload_inputs(simulator.body, settings.payload_at, payload)
-    weights = Inputs(**{key: simulator.tensor(masses) for key, masses in hung.items()} if payload.any() else {})
-    driven: torch.Tensor | None = None
-    quantity = driving_quantity(settings.laboratory)
+    hung = payload_inputs(simulator.body, settings.payload_at, payload) if payload.any() else {}
+    weights = Inputs(**{key: simulator.tensor(masses) for key, masses in hung.items()})
+    quantity, driven = driving_quantity(settings.laboratory), None
     if all(trial.is_driven for trial in trials) and quantity is not None:
         driven = simulator.tensor(np.stack([_inputs_of(settings, trial) for trial in trials]))
-    common, times = settings.data.base_motion, simulator.time_step * np.arange((part.frames - 1) * substeps + 1)
-    moved = contact_series(simulator, settings.data.obstacle_motion, trials, times)
-    fixed: list[torch.Tensor] | None = None
-    if common is not None or any(trial.base_motion is not None for trial in trials):
-        poses = [base_of(common, trial, times[1:]) for trial in trials]
-        fixed = fixed_positions(simulator, np.stack(poses, axis=1))
 
-    def inputs_at(frame: int, share: float = 0.0) -> Inputs:
-        """Inputs at a share of the time from a frame to the next, interpolated linearly."""
-        if driven is None:
+    def inputs_at(number: int, share: float) -> Inputs:
+        if driven is None or quantity is None:
             return weights
-        assert quantity is not None
-        before, after = driven[:, frame], driven[:, frame + (share > 0.0)]
-        return weights.replace(**{quantity.name: torch.lerp(before, after, share)})
+        number, share = (number, share) if begins in RESTING else (0, 0.0)
+        own = torch.lerp(driven[:, number], driven[:, number + (share > 0.0)], share)
+        return weights.replace(**{quantity.name: own})
 
-    state = _beginning(simulator, settings, trials, inputs_at(0), constants)
-    seen = [markers(state.q)]
-    report()
-    for number in range(part.frames - 1):
-        for i in range(1, 1 + (0 if begins == STATIC else substeps)):
-            # Inputs are taken at the end of a substep, or in its middle.
-            share = (i - 0.5 * (simulator.integrator == "midpoint")) / substeps
-            inputs, at = inputs_at(number, share) if begins in RESTING else inputs_at(0), number * substeps + i
-            inputs = inputs.replace(**{name: values[at] for name, values in moved.items()})
-            if fixed is not None:
-                inputs = inputs.replace(fixed_positions=fixed[at - 1])
-            state, _ = simulator.step(state, inputs, constants)
+    if not released:
+        begin = simulator.static_equilibrium(inputs_at(0, 0.0), simulator.prepare(), batch=len(trials))
+    elif any(trial.pull for trial in trials):
+        pulls = simulator.tensor([trial.pull or (0.0, 0.0, 0.0) for trial in trials])
+        force = distributed(simulator, select_vertices(simulator.body.mesh, **settings.tip.arguments()), pulls)
+        begin = simulator.static_equilibrium(inputs_at(0, 0.0).plus(force), simulator.prepare())
+        begin = State(begin.q, torch.zeros_like(begin.q))
+    else:
+        begin = simulator.rest_state(len(trials))
+    substeps = 1
+    if not released:
+        substeps = 0 if begins == STATIC else substeps_of(settings.time_step, settings.laboratory, "laboratory")
+    seen = []
+    for state in played(part, simulator, substeps, settings.data, trials, begin, inputs_at):
         seen.append(markers(state.q))
         report()
     return {"markers": (torch.stack(seen, 1).cpu().numpy(), "m")}
-
-
-def _beginning(
-    simulator: Simulator, settings: LaboratoryStage, trials: Sequence[Trial], inputs: Inputs, constants: Constants
-) -> State:
-    """Held bodies undeformed or pulled at the tip, other bodies in equilibrium with their inputs."""
-    if not trials[0].is_released:
-        return simulator.static_equilibrium(inputs, constants, batch=len(trials))
-    pulls = np.array([trial.pull or (0.0, 0.0, 0.0) for trial in trials])
-    if not any(trial.pull for trial in trials):
-        return simulator.rest_state(len(trials))
-    tip = select_vertices(simulator.body.mesh, **settings.tip.arguments())
-    held = simulator.static_equilibrium(inputs.plus(distributed(simulator, tip, simulator.tensor(pulls))), constants)
-    return State(held.q, torch.zeros_like(held.q))

@@ -10,7 +10,7 @@ which is exact for fields of the degree of the cells (tests/experiment/test_targ
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -34,10 +34,10 @@ from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.stages import PlayedSettings, SimulateStage
 from ..settings.trials import (
-    BaseMotion,
     HeldSettings,
     MotionSettings,
     MovingBase,
+    ReadingSettings,
     ReleaseFromLoad,
     ReleaseFromTwist,
     SimulatedData,
@@ -133,15 +133,12 @@ def vertices_in(mesh: Mesh, other: Mesh) -> Observation:
 def simulate(context: StageContext) -> None:
     """Writes dataset.h5: positions and velocities (R, T + 1, N, 3) of all trials, starting from the held state."""
     settings: SimulateStage = context.settings
-    trials, motion = settings.trials, settings.data.base_motion
-    frames, names = settings.data.steps + 1, tuple(trial.name for trial in trials)
-    poses, times = None, settings.time_step * np.arange(frames, dtype=np.float64)
-    points = whole_mesh(settings).vertices
-    if motion is not None:
-        poses = np.stack([base_of(motion, trial, times, _motion_scale(settings, trial)) for trial in trials])
-        for motion_of_trial in poses:
-            check_steps(motion_of_trial, points, "data.base_motion")
-    obstacles = obstacles_of(settings.data.obstacle_motion, trials, times)
+    trials, data = settings.trials, settings.data
+    frames, names = data.steps + 1, tuple(trial.name for trial in trials)
+    times, points = settings.time_step * np.arange(frames, dtype=np.float64), whole_mesh(settings).vertices
+    base, obstacles = true_motions(data, trials, times)
+    for poses in () if base is None else base:
+        check_steps(poses, points, "data.base_motion")
     for name, moved in obstacles.items():
         check_steps(moved[0], points, f"data.obstacle_motion.{name}", f"the obstacle {name!r}")
     parts = split_into_parts(context, names, frames)
@@ -158,102 +155,110 @@ def simulate(context: StageContext) -> None:
         gravity=np.asarray(settings.gravity, dtype=np.float64),
         time_step=settings.time_step,
         velocity=read_parts(parts, "velocity"),
-        base=poses,
+        base=base,
         obstacles=obstacles,
     ).write(context.run_dir / DATASET)
     remove_parts(context)
 
 
-def base_of(common: BaseMotion, trial: Trial, times: NDArray[Any], scale: float = 1.0) -> FloatArray:
-    """(T, 6) true motion of the base of a body, in the frame of the body.
+def true_motions(
+    data: SimulatedData | ReadingSettings, trials: Sequence[Trial], times: NDArray[Any]
+) -> tuple[FloatArray | None, dict[str, FloatArray]]:
+    """Returns the true motions of the base and of obstacles in the frame of the body.
 
     Args:
-        common: motion of trials without a motion of their own.
-        trial: the trial.
+        data: motions of trials without their own.
+        trials: R trials.
         times: (T,) times [s].
-        scale: factor of the motion.
+
+    Returns:
+        (R, T, 6) of the base, None if it stands still in all trials, and of obstacles by name, zero in trials in which
+        they stand still.
     """
-    motion = common if trial.base_motion is None and isinstance(common, MotionSettings) else trial.base_motion
-    return np.zeros((len(times), 6)) if motion is None else prescribed(motion, times, scale=scale)
+    common, still = data.base_motion, np.zeros((len(times), 6))
+    given = [trial.base_motion or (common if isinstance(common, MotionSettings) else None) for trial in trials]
+    scales = [trial.amount if isinstance(data, MovingBase) else 1.0 for trial in trials]
+    base = [
+        still if motion is None else prescribed(motion, times, scale=scale)
+        for motion, scale in zip(given, scales, strict=True)
+    ]
+    pushed = [prescribed_all(data.obstacle_motion, trial.obstacle_motion, times) for trial in trials]
+    obstacles = {name: np.stack([own.get(name, still) for own in pushed]) for own in pushed for name in own}
+    return np.stack(base) if any(given) else None, obstacles
 
 
-def obstacles_of(common: Mapping[str, Any], trials: Sequence[Trial], times: NDArray[Any]) -> dict[str, FloatArray]:
-    """(R, T, 6) true motions of obstacles by name, in the frame of the body; zero in trials in which they stand still.
+def played(
+    part: TrialPart,
+    simulator: Simulator,
+    substeps: int,
+    data: SimulatedData | ReadingSettings,
+    trials: Sequence[Trial],
+    begin: State,
+    inputs_at: Callable[[int, float], Inputs] = lambda number, share: Inputs(),
+) -> Iterator[State]:
+    """Yields the states at the frames of bodies that stand in for real ones.
 
     Args:
-        common: motions of trials without their own.
-        trials: the trials.
-        times: (T,) times [s].
+        part: part of the stage.
+        simulator: of the bodies.
+        substeps: steps from frame to frame.
+        data: motions of trials without their own.
+        trials: trials of the part.
+        begin: state of the first frame.
+        inputs_at: inputs besides motions, at a share of the time from a frame to the next.
     """
-    motions = [prescribed_all(common, trial.obstacle_motion, times) for trial in trials]
-    still = np.zeros((len(times), 6))
-    return {name: np.stack([own.get(name, still) for own in motions]) for own in motions for name in own}
-
-
-def _motion_scale(settings: SimulateStage, trial: Trial) -> float:
-    """Factor of the motion of the base of a trial."""
-    return trial.amount if isinstance(settings.data, MovingBase) else 1.0
-
-
-def fixed_positions(simulator: Simulator, motions: FloatArray) -> list[torch.Tensor]:
-    """Positions (B, D, 3) of the fixed vertices at each of T times [m], for motions (T, B, 6) of their bases."""
-    fixed = np.asarray(simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64)
-    size = (motions.shape[1], *fixed.shape)
-    return [simulator.tensor(rigid(poses).apply(np.broadcast_to(fixed, size))) for poses in motions]
-
-
-def contact_series(
-    simulator: Simulator, common: Mapping[str, Any], trials: Sequence[Trial], times: NDArray[Any]
-) -> dict[str, torch.Tensor]:
-    """Inputs (T, B, O) of contact by name at times (T,) [s], for the true motions of obstacles in trials."""
-    motions = obstacles_of(common, trials, times)
-    if not motions:
-        return {}
-    inputs = contact_inputs(simulator.body, {name: poses.swapaxes(0, 1) for name, poses in motions.items()})
-    return {name: simulator.tensor(values) for name, values in inputs.items()}
+    times = simulator.time_step * np.arange((part.frames - 1) * substeps + 1)
+    base, obstacles = true_motions(data, trials, times)
+    constants, moving = simulator.prepare(), dict[str, torch.Tensor]()  # inputs at the times, by name
+    if obstacles:
+        moved = contact_inputs(simulator.body, {name: poses.swapaxes(0, 1) for name, poses in obstacles.items()})
+        moving |= {name: simulator.tensor(values) for name, values in moved.items()}
+    if base is not None:
+        fixed = np.asarray(simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64)
+        at_times = rigid(base.swapaxes(0, 1).reshape(-1, 6)).apply(fixed)
+        moving["fixed_positions"] = simulator.tensor(at_times).unflatten(0, (len(times), -1))
+    state = begin
+    yield state
+    for number in range(part.frames - 1):
+        for i in range(1, substeps + 1):
+            # Inputs are taken at the end of a step, or in its middle.
+            share = (i - 0.5 * (simulator.integrator == "midpoint")) / substeps
+            at = number * substeps + i
+            inputs = inputs_at(number, share).replace(**{name: own[at] for name, own in moving.items()})
+            state = simulator.step(state, inputs, constants)[0]
+        yield state
 
 
 def _free_motion(part: TrialPart, report: Report) -> Arrays:
-    """Positions and velocities of released bodies, or of bodies with a moving base."""
+    """Positions and velocities of all vertices of released bodies, or of bodies with a moving base."""
     settings: SimulateStage = part.context.settings
-    target, data = build_target(settings, settings.target), settings.data
-    simulator, trials = target.simulator, [trial for trial in settings.trials if trial.name in part.names]
-    constants, fixed = simulator.prepare(), None
-    times = simulator.time_step * np.arange((part.frames - 1) * target.substeps + 1)
-    moved = contact_series(simulator, data.obstacle_motion, trials, times)
-    if (motion := data.base_motion) is not None:
-        poses = [base_of(motion, trial, times[1:], _motion_scale(settings, trial)) for trial in trials]
-        fixed = fixed_positions(simulator, np.stack(poses, axis=1))
-    states = [initial_state(simulator, data, trials)]
-    report()
-    for number in range(part.frames - 1):
-        state = states[-1]
-        for at in range(number * target.substeps, (number + 1) * target.substeps):
-            acting = {name: values[at + 1] for name, values in moved.items()}
-            inputs = Inputs(fixed_positions=None if fixed is None else fixed[at], **acting)
-            state = simulator.step(state, inputs, constants)[0]
-        states.append(state)
+    target, seen = build_target(settings, settings.target), list[tuple[torch.Tensor, torch.Tensor]]()
+    trials = [trial for trial in settings.trials if trial.name in part.names]
+    begin = initial_state(target.simulator, settings.data, trials)
+    for state in played(part, target.simulator, target.substeps, settings.data, trials, begin):
+        seen.append((target.seen(state.q), target.seen(state.v)))
         report()
-    series = {"observed": ([state.q for state in states], "m"), "velocity": ([state.v for state in states], "m/s")}
-    return {
-        name: (torch.stack([target.seen(x) for x in values], 1).cpu().numpy(), unit)
-        for name, (values, unit) in series.items()
-    }
+    observed, velocity = (torch.stack(values, 1).cpu().numpy() for values in zip(*seen, strict=True))
+    return {"observed": (observed, "m"), "velocity": (velocity, "m/s")}
 
 
 def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Trial]) -> State:
     """Initial states of trials, by ``data.kind``, or as a trial is held by itself."""
-    common = [trial.amount for trial in trials if trial.load is None]
-    states = [_common_state(simulator, data, np.array(common))] if common else []
-    states += [_alone(simulator, data, trial.load) for trial in trials if trial.load is not None]
-    order = np.argsort([k for own in (True, False) for k, t in enumerate(trials) if (t.load is None) == own])
-    whole = State(torch.cat([s.q for s in states]), torch.cat([s.v for s in states]))
-    return whole.map(lambda values: values[torch.as_tensor(order, device=values.device)])
-
-
-def _alone(simulator: Simulator, data: SimulatedData, held: HeldSettings) -> State:
-    assert isinstance(data, ReleaseFromLoad)
-    return held_alone(simulator, held, held.at or data.load, "data.others" if held.at else "data.load")
+    rows = [row for row, trial in enumerate(trials) if trial.load is None]
+    amounts, q = np.array([trials[row].amount for row in rows]), simulator.rest_state(len(trials)).q.clone()
+    if rows and isinstance(data, MovingBase):
+        q[rows] = simulator.static_equilibrium(Inputs(), batch=len(rows)).q
+    elif rows and isinstance(data, ReleaseFromTwist):
+        q[rows] = twisted(simulator.rest_positions, simulator.tensor(amounts), "xyz".index(data.twist_axis))
+    elif rows and isinstance(data, ReleaseFromLoad):
+        log.info("computing the equilibrium under %d weights", len(rows))
+        q[rows] = under_forces(simulator, data.load, amounts[:, None] * np.asarray(simulator.gravity)).q
+    for row, trial in enumerate(trials):
+        if trial.load is not None:
+            assert isinstance(data, ReleaseFromLoad)
+            key = "data.others" if trial.load.at else "data.load"
+            q[row] = held_alone(simulator, trial.load, trial.load.at or data.load, key).q[0]
+    return State(q, torch.zeros_like(q))
 
 
 def held_alone(simulator: Simulator, held: HeldSettings, load: PlaceSettings, key: str) -> State:
@@ -274,31 +279,15 @@ def held_alone(simulator: Simulator, held: HeldSettings, load: PlaceSettings, ke
         return State(q, torch.zeros_like(q))
     along = np.asarray(held.direction, dtype=np.float64) / np.linalg.norm(held.direction)
     force = 1e-3 * held.weight_g * float(np.linalg.norm(simulator.gravity)) * along
-    return _under_forces(simulator, load, force[None], key)
+    return under_forces(simulator, load, force[None], key)
 
 
-def _common_state(simulator: Simulator, data: SimulatedData, values: NDArray[Any]) -> State:
-    """Initial states of a batch for (B,) weights [kg], angles [rad] or factors of the motion, by ``data.kind``."""
-    if isinstance(data, MovingBase):
-        return simulator.static_equilibrium(Inputs(), batch=len(values))
-    if isinstance(data, ReleaseFromTwist):
-        q = twisted(simulator.rest_positions, simulator.tensor(values), "xyz".index(data.twist_axis))
-        return State(q, torch.zeros_like(q))
-    return held_state(simulator, data.load, values)
-
-
-def held_state(simulator: Simulator, load: PlaceSettings, weights: NDArray[Any]) -> State:
-    """Equilibrium of the body under weights (B,) [kg] on the vertices of a place, in equal shares.
+def under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: str = "data.load") -> State:
+    """Equilibrium of the body under forces (B, 3) [N] on the vertices of a place, in equal shares.
 
     Raises:
         InputError: all vertices of the place are fixed.
     """
-    log.info("computing the equilibrium under %d weights", len(weights))
-    return _under_forces(simulator, load, weights[:, None] * np.asarray(simulator.gravity))
-
-
-def _under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: str = "data.load") -> State:
-    """Equilibrium of the body under forces (B, 3) [N] on the vertices of a place, in equal shares."""
     face = select_vertices(simulator.body.mesh, **load.arguments())
     if np.isin(face, simulator.body.fixed_vertices).all():
         raise InputError(f"{key} selects fixed vertices only: hang the weights on vertices that can move.")

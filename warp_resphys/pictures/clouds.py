@@ -57,10 +57,6 @@ class Cloud:
         measured = np.stack([columns, rows, depth[seen]], 1).astype(np.float64)
         return cls(measured, measured * (1.0, 1.0, 0.0), noise, reach)  # at depth zero is the camera
 
-    def _chosen(self, index: IntArray | Mask) -> Self:
-        outside = None if self.outside is None else self.outside[index]
-        return replace(self, measured=self.measured[index], outside=outside)
-
     def around(self, camera: PlacedCamera, mesh: Mesh, clamped: IntArray, count: int = 1000, seed: int = 0) -> Self:
         """Returns at most a number of points that may be of a body, in their order along the longest axis.
 
@@ -105,7 +101,33 @@ class Cloud:
                 "check the directions of its pose (world_to_cloud, world_to_camera)."
             )
         longest = np.linalg.eigh(np.cov(places[close].T))[1][:, -1]
-        return self._chosen(close[np.argsort(places[close] @ longest)])
+        chosen = close[np.argsort(places[close] @ longest)]
+        outside = None if self.outside is None else self.outside[chosen]
+        return replace(self, measured=self.measured[chosen], outside=outside)
+
+    def distances(
+        self, camera: PlacedCamera, corrections: torch.Tensor, triangles: IntArray, q: torch.Tensor
+    ) -> "CloudDistances":
+        """Returns the distances from a surface.
+
+        Args:
+            camera: by which the points are located.
+            corrections: (9,) of it.
+            triangles: (F, 3) of the surface.
+            q: (N, 3) vertices [m].
+        """
+        import trimesh
+
+        vertices, towards = q.double().cpu().numpy(), None
+        places = camera.located(torch.as_tensor(self.measured), corrections).numpy()
+        if self.outside is not None:
+            towards = camera.located(torch.as_tensor(self.outside), corrections).numpy() - places
+        closest = closest_of(triangles, vertices, places, towards)
+        offset = places - closest.points
+        length = np.maximum(np.abs(closest.distances), 1e-12)[:, None]
+        directions = np.where(length > 1e-9, np.sign(closest.distances)[:, None] * offset / length, closest.normals)
+        shares = trimesh.triangles.points_to_barycentric(vertices[closest.triangles], closest.points)
+        return CloudDistances(places, closest.triangles, np.asarray(shares), closest.distances, directions)
 
 
 @dataclass(frozen=True)
@@ -122,34 +144,3 @@ class CloudDistances:
         """Returns derivatives (K, P) of the distances by K motions (K, N, 3) of the vertices [m]."""
         at = torch.einsum("kpci,pc->kpi", tangents[:, torch.as_tensor(self.triangles)], torch.as_tensor(self.shares))
         return -np.einsum("kpi,pi->kp", at.numpy(), self.directions)
-
-
-def distances_of(
-    cloud: Cloud, camera: PlacedCamera, corrections: torch.Tensor, triangles: IntArray, q: torch.Tensor
-) -> CloudDistances:
-    """Returns the distances of a cloud from a surface.
-
-    Args:
-        cloud: the points.
-        camera: by which they are located.
-        corrections: (9,) of it.
-        triangles: (F, 3) of the surface.
-        q: (N, 3) vertices [m].
-    """
-    vertices, towards = q.double().cpu().numpy(), None
-    places = camera.located(torch.as_tensor(cloud.measured), corrections).numpy()
-    if cloud.outside is not None:
-        towards = camera.located(torch.as_tensor(cloud.outside), corrections).numpy() - places
-    closest = closest_of(triangles, vertices, places, towards)
-    offset = places - closest.points
-    length = np.maximum(np.abs(closest.distances), 1e-12)[:, None]
-    directions = np.where(length > 1e-9, np.sign(closest.distances)[:, None] * offset / length, closest.normals)
-    shares = _barycentric(vertices[closest.triangles], closest.points)
-    return CloudDistances(places, closest.triangles, shares, closest.distances, directions)
-
-
-def _barycentric(corners: FloatArray, points: FloatArray) -> FloatArray:
-    """Shares (P, 3) of the corners (P, 3, 3) of triangles in points (P, 3) on them."""
-    import trimesh
-
-    return np.asarray(trimesh.triangles.points_to_barycentric(corners, points))

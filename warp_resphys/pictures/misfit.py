@@ -27,7 +27,7 @@ from ..io.errors import ConvergenceError, InputError
 from ..learning.identification import BoundedMisfit
 from ..learning.parameters import Bounds, split_name
 from ..learning.uncertainty import FloatArray, Linearised, LinearMisfit
-from .motion import RELEASE_DELAY, derivatives_at_own_times
+from .motion import RELEASE_DELAY
 from .seen import Photo, SeenPose, Shape
 
 _DIFFERENCE: Final = 1e-4  # of a physical parameter, as a fraction of its range
@@ -132,7 +132,10 @@ class PictureMisfit(BoundedMisfit):
                     parts, points = self._of_photo(pose, photo, own, shapes, columns, share)
                     trials += parts
                     (series.setdefault(photo.lens, []) if pose.moves else trials).extend(points)
-                trials += [_joined(frames) for frames in series.values() if frames]
+                for frames in filter(None, series.values()):  # errors of the same points may be correlated in time
+                    rows, jacobians, counts = zip(*frames, strict=True)
+                    joined = np.stack([own.ravel() for own in rows])
+                    trials.append((joined, np.concatenate(jacobians), sum(counts)))
             except ConvergenceError:
                 return None
             except InputError:
@@ -197,17 +200,15 @@ class PictureMisfit(BoundedMisfit):
         q, moved = vertices[0], torch.cat([vertices[1:], velocities[None]])
         share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
         if photo.outline is not None:
-            seen = pose.outlines(photo, q, corrections)
-            rim = seen.silhouette
+            rim, of_simulated, of_measured = pose.outlines(photo, q, corrections)
             slopes = self._pixel_slopes(pose, photo, rim.points(q), rim.points(moved), corrections, columns)
             distance, along = photo.outline.signed(rim.pixels)
             order = np.argsort(cKDTree(photo.outline.points).query(rim.pixels)[1], kind="stable")
             jacobian = np.einsum("kpi,pi->pk", slopes, along)[order, None]
-            weights = seen.of_simulated[order]
-            parts.append(_weighted(0.5 * share, weights, distance[order, None], jacobian, 2 * copies))
+            parts.append(_weighted(0.5 * share, of_simulated[order], distance[order, None], jacobian, 2 * copies))
             index, distance, along = rim.closest(photo.outline.points)
             jacobian = np.einsum("kpi,pi->pk", slopes[:, index], along)[:, None]
-            parts.append(_weighted(0.5 * share, seen.of_measured, -distance[:, None], jacobian, 2 * copies))
+            parts.append(_weighted(0.5 * share, of_measured, -distance[:, None], jacobian, 2 * copies))
         if photo.tracked is not None and pose.points is not None:
             places = pose.points(q[None])[0]
             moves = (moved.flatten(1) @ pose.points.transposed_jacobian(q[None])[0]).unflatten(1, (-1, 3))
@@ -218,7 +219,8 @@ class PictureMisfit(BoundedMisfit):
             if visible.any():
                 points.append(_weighted(share, visible.astype(np.float64), away, jacobian, copies))
         if photo.cloud is not None:
-            cloud, closest = photo.cloud, pose.cloud_distances(photo, q, corrections)
+            cloud = photo.cloud
+            closest = cloud.distances(camera, corrections, pose.surface.triangles, q)
             slopes = np.zeros((len(self.bounds), len(closest.distances)))
             if columns is not None:
                 placed = camera.located_by(torch.as_tensor(cloud.measured), corrections).numpy()
@@ -241,8 +243,8 @@ class PictureMisfit(BoundedMisfit):
         if columns is None:
             return np.zeros((len(self.bounds), len(points), 2))
         by = photo.camera.derivative(points, corrections, moved).numpy()
-        by = derivatives_at_own_times(by, by[len(columns)], photo.row_time)
-        return self._slopes(pose, photo, by, columns)
+        late = photo.row_time * by[len(columns)]  # where rows have times of their own, see `motion`
+        return self._slopes(pose, photo, by + late / (1.0 - late[:, 1:]) * by[..., 1:], columns)
 
     def _slopes(self, pose: SeenPose, photo: Photo, by: FloatArray, columns: Sequence[int]) -> FloatArray:
         """Derivatives (P, ...) by all P parameters.
@@ -288,12 +290,6 @@ def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: 
     rows = scale * distance
     count = max(round(int((weight > 0.0).sum()) * distance.shape[1] / copies), 1)
     return rows, (scale[..., None] * slopes).reshape(rows.size, -1), count
-
-
-def _joined(frames: Sequence[Linearised]) -> Linearised:
-    """Residuals (T, C) of T frames with the same points, whose errors may be correlated in time."""
-    rows = np.stack([own.ravel() for own, _, _ in frames])
-    return rows, np.concatenate([jacobian for _, jacobian, _ in frames]), sum(count for *_, count in frames)
 
 
 def values_of(pose: SeenPose, values: Mapping[str, float], lens: str = "") -> dict[str, float]:

@@ -30,7 +30,7 @@ from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
 from ..learning.replay import Replay, Start, sample
 from ..stepping.inputs import Inputs
-from .outlines import FloatArray, IntArray
+from .outlines import IntArray
 
 RELEASE_DELAY: Final = "release_delay"  # s
 RELEASE_FORCES: Final = ("release_force_1", "release_force_2", "release_force_3")  # N
@@ -144,15 +144,3 @@ def at_own_times(
     velocities = jacobians(places, times)[0][..., 0]
     others = sample(series.permute(2, 1, 0, 3), times.clamp_min(0.0), step)[:, 0]
     return others.transpose(0, 1), velocities
-
-
-def derivatives_at_own_times(by: FloatArray, velocities: FloatArray, row_time: float) -> FloatArray:
-    """Returns derivatives (K, P, 2) of pixels where rows have times of their own, from those at constant times [px].
-
-    Args:
-        by: (K, P, 2) derivatives at constant times [px].
-        velocities: (P, 2) v in the picture [px/s].
-        row_time: r, between two rows [s].
-    """
-    late = row_time * velocities
-    return by + late / (1.0 - late[:, 1:]) * by[..., 1:]

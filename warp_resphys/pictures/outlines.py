@@ -122,19 +122,15 @@ class ClosedSurface:
     beside: IntArray  # (E, 2)
 
     @classmethod
-    def of_mesh(cls, mesh: Mesh) -> "ClosedSurface":
-        """Returns the surface of a body's mesh."""
-        return cls.of(boundary_triangles(mesh))
-
-    @classmethod
-    def of(cls, triangles: IntArray) -> "ClosedSurface":
-        """Returns the surface of triangles (F, 3).
+    def of(cls, body: Mesh | IntArray) -> "ClosedSurface":
+        """Returns the surface of a body's mesh, or of triangles (F, 3).
 
         Raises:
             InputError: it is not closed.
         """
         import trimesh
 
+        triangles = boundary_triangles(body) if isinstance(body, Mesh) else body
         beside, edges = trimesh.graph.face_adjacency(triangles, return_edges=True)
         if 2 * len(edges) != 3 * len(triangles):
             raise InputError("the surface of the body is not closed: every edge must belong to two triangles.")

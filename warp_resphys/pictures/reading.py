@@ -1,4 +1,4 @@
-"""Pictures of a scene in a folder: the places of their cameras, masks of the body, depths, and tracked points.
+"""Pictures of a scene in a folder: places of their cameras, masks of the body, depths, tracked points, and scans.
 
 A scene's `camera.json` has `frames`, each with an `image` (a file beside it), `world_to_camera` (4 x 4, row-major,
 metres; camera axes: x right, y down, z forward) and perhaps a `mask`, a file whose pixels are bright where the body is,
@@ -11,20 +11,23 @@ tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or f
 
 import csv
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import scipy.ndimage
+import torch
 from matplotlib.colors import rgb_to_hsv
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
+from pydantic import ConfigDict, Strict
 
+from ..data.camera import PlacedCamera
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_arrays
+from ..io.settings import Count, Many, Positive, Settings, Some, Word, parse
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -32,7 +35,9 @@ Mask = NDArray[np.bool_]
 _LEAST_MOVING = 3  # frames after a release, from which its motion is seen
 _SPECKS = 2  # px, of an opening that removes them
 _HEADS = ("scorer", "individuals", "bodyparts", "coords")
-_RIGID = 1e-3  # of a rotation
+_READ_BY_TRIMESH = (".ply", ".xyz", ".obj", ".off", ".stl")
+_SAMPLED = 20_000  # points on the triangles of a scanned surface
+_PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,36 @@ class Colours:
         largest = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
         whole = scipy.ndimage.binary_dilation(largest, iterations=_SPECKS, mask=right)  # with its corners
         return np.asarray(scipy.ndimage.binary_fill_holes(whole))
+
+
+_Row = Annotated[tuple[float, float, float, float], Strict(False)]
+_Pose = Annotated[tuple[_Row, _Row, _Row, _Row], Strict(False)]
+
+
+class _Entry(Settings):
+    model_config = ConfigDict(extra="ignore")
+
+    image: Word | None = None
+    mask: Word | None = None
+    depth: Word | None = None
+    lens: str = ""
+    time: float | None = None
+    world_to_camera: _Pose | None = None
+
+
+class _Clamp(Settings):
+    model_config = ConfigDict(extra="ignore")
+
+    vertices: Some[Count]
+
+
+class _Scene(Settings):
+    model_config = ConfigDict(extra="ignore")
+
+    frames: Many[_Entry] = ()
+    fixed: Many[_Clamp] = ()
+    frame_rate: Positive | None = None
+    world_to_cloud: _Pose | None = None
 
 
 @dataclass(frozen=True)
@@ -102,42 +137,36 @@ def read_scene(path: Path, scanned: bool = False) -> SceneFile:
     Raises:
         DataFileError: it is missing or damaged, or an entry is missing or of a wrong shape.
     """
-    if scanned and not path.exists():
-        return SceneFile(path, (), (), np.eye(4))
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8")) if path.exists() or not scanned else {}
+        scene = parse(_Scene, content if isinstance(content, dict) else {})
     except OSError as error:
         raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.poses.") from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DataFileError(f"{path} is no JSON ({error}): write the cameras of its pictures anew.") from error
-    frames = content.get("frames", [] if scanned else None) if isinstance(content, dict) else None
-    if not isinstance(frames, list) or not (frames or scanned):
+    except InputError as error:
+        raise DataFileError(f"{path}: {error}") from None
+    if not (scene.frames or scanned):
         raise DataFileError(f"{path} has no list 'frames': give an entry for every picture (docs/pictures.md).")
-    groups = content.get("fixed", [])
+    frames = []
+    for number, entry in enumerate(scene.frames):
+        image = entry.image or entry.depth
+        if image is None:
+            raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
+        mask, depth = (None if own is None else path.parent / own for own in (entry.mask, entry.depth))
+        pose = None if entry.world_to_camera is None else _rigid(entry.world_to_camera, path)
+        time = number / scene.frame_rate if entry.time is None and scene.frame_rate else entry.time
+        frames.append(Frame(number, path.parent / image, pose, mask, depth, entry.lens, time))
+    clamps = tuple(np.array(clamp.vertices) for clamp in scene.fixed)
+    return SceneFile(path, tuple(frames), clamps, _rigid(scene.world_to_cloud or np.eye(4).tolist(), path))
+
+
+def _rigid(pose: Sequence[Sequence[float]], path: Path) -> FloatArray:
+    """Returns a pose (4, 4) of a file, refused by the camera that has it if it is no rigid motion."""
     try:
-        clamps = tuple(np.array(group["vertices"], dtype=np.int64).ravel() for group in groups)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataFileError(f"{path}: 'fixed' is a list of clamps, each with its 'vertices': {error}.") from error
-    if not all(len(clamp) for clamp in clamps):
-        raise DataFileError(f"{path}: a clamp of 'fixed' has no 'vertices': leave it out.")
-    scan_pose = _pose(f"{path}", "world_to_cloud", content)
-    rate = content.get("frame_rate")
-    if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0.0):
-        raise DataFileError(f"{path}: 'frame_rate' is {rate!r}: give a positive number, in Hz.")
-    shown = tuple(_frame(path, number, entry, rate) for number, entry in enumerate(frames))
-    return SceneFile(path, shown, clamps, np.eye(4) if scan_pose is None else scan_pose)
-
-
-def _frame(path: Path, number: int, entry: Any, rate: float | None) -> Frame:
-    image = entry.get("image", entry.get("depth")) if isinstance(entry, dict) else None
-    if not isinstance(image, str):
-        raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
-    mask, depth = (None if entry.get(key) is None else path.parent / str(entry[key]) for key in ("mask", "depth"))
-    pose = _pose(f"{path}: frame {number}", "world_to_camera", entry)
-    time = entry.get("time", None if rate is None else number / rate)
-    if time is not None and not (isinstance(time, int | float) and math.isfinite(time)):
-        raise DataFileError(f"{path}: frame {number} has the 'time' {time!r}: give a number, in s.")
-    return Frame(number, path.parent / image, pose, mask, depth, str(entry.get("lens", "")), time)
+        return np.asarray(PlacedCamera(None, torch.tensor(pose, dtype=torch.float64)).pose.numpy())
+    except InputError as error:
+        raise DataFileError(f"{path}: {error}") from None
 
 
 def check_times(scene: SceneFile, release: float) -> None:
@@ -169,26 +198,6 @@ def check_times(scene: SceneFile, release: float) -> None:
             f"{scene.path} has fewer than {_LEAST_MOVING} different frames after the release at {release:g} s: check "
             "the times, the release (data.poses) and the chosen frames, or leave the release out of a body at rest."
         )
-
-
-def _pose(where: str, key: str, entry: Mapping[str, Any]) -> FloatArray | None:
-    """A rigid motion (4, 4) of an entry; None without."""
-    try:
-        given = entry.get(key)
-        pose = None if given is None else np.array(given, dtype=np.float64).reshape(4, 4)
-        rigid = pose is None or (
-            np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=_RIGID)
-            and np.linalg.det(pose[:3, :3]) > 0.0
-            and np.allclose(pose[3], (0.0, 0.0, 0.0, 1.0), atol=_RIGID)
-        )
-    except (TypeError, ValueError) as error:
-        raise DataFileError(f"{where}: '{key}' has 4 rows of 4 numbers ({error}).") from error
-    if not rigid:
-        raise DataFileError(
-            f"{where}: '{key}' is no rotation with a shift, above 0, 0, 0, 1: write it row by row, for right-handed "
-            "axes."
-        )
-    return pose
 
 
 def read_picture(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
@@ -304,3 +313,77 @@ def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArr
         sure = np.array([values.get(f"{name}.likelihood", 1.0) for name in names])
         result[int(values["frame"])] = np.where(sure[:, None] >= least, points, np.nan)
     return result
+
+
+def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray, FloatArray | None]:
+    """Reads the points (P, 3) of a scan [m], and its outer unit normals (P, 3); None without triangles.
+
+    Of a surface of triangles, points are spread evenly over these, which must be counter-clockwise from outside.
+
+    Args:
+        path: the file; its extension determines the format.
+        unit: length of a unit of the file [m].
+        seed: of the points on triangles.
+
+    Raises:
+        DataFileError: it is missing or damaged, or has no points.
+    """
+    path, normals = Path(path), None
+    try:
+        if path.suffix == ".npy":
+            points = np.asarray(read_arrays(path)[""], dtype=np.float64)
+        elif path.suffix == ".pcd":
+            points = _pcd(path)
+        elif path.suffix in _READ_BY_TRIMESH:
+            points, normals = _by_trimesh(path, seed)
+        else:
+            known = ", ".join((".npy", ".pcd", *_READ_BY_TRIMESH))
+            raise ValueError(f"its extension is none of {known}")
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"it has the shape {points.shape}, not (points, 3)")
+    except DataFileError:
+        raise
+    except Exception as error:  # readers raise all kinds of errors on damaged files
+        raise DataFileError(f"cannot read a scan from {path} ({error}): export it as .ply again.") from error
+    seen = np.isfinite(points).all(1)
+    if not seen.any():
+        raise DataFileError(f"{path} has no points: scan again, or leave data.poses.NAME.cloud out.")
+    return unit * points[seen], None if normals is None else normals[seen]
+
+
+def _by_trimesh(path: Path, seed: int) -> tuple[FloatArray, FloatArray | None]:
+    import trimesh
+
+    if not path.is_file():
+        raise ValueError("there is no such file")
+    read: Any = trimesh.load(str(path), process=False)
+    if isinstance(read, trimesh.Scene):
+        read = read.to_mesh()
+    if isinstance(read, trimesh.Trimesh) and len(read.faces):
+        points, faces = trimesh.sample.sample_surface(read, _SAMPLED, seed=seed)
+        return np.asarray(points, dtype=np.float64), np.asarray(read.face_normals[faces], dtype=np.float64)
+    return np.asarray(read.vertices, dtype=np.float64), None
+
+
+def _pcd(path: Path) -> FloatArray:
+    """Points of a file of the Point Cloud Library, as text or binary."""
+    content, start, head = path.read_bytes(), 0, dict[str, list[str]]()
+    while "DATA" not in head:
+        end = content.index(b"\n", start)
+        key, *values = content[start:end].decode("ascii").split() or ["#"]
+        head[key], start = values, end + 1
+    counts = [int(count) for count in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
+    if head["DATA"] == ["ascii"]:
+        column = dict(zip(head["FIELDS"], np.cumsum([0, *counts]), strict=False))
+        rows = np.array([line.split() for line in content[start:].decode("ascii").splitlines() if line], dtype=float)
+        return np.asarray(rows[:, [column[axis] for axis in "xyz"]])
+    if head["DATA"] != ["binary"]:
+        raise ValueError(f"its data are {' '.join(head['DATA'])}, and must be ascii or binary")
+    fields = [
+        (f"{number}_{name}" if name == "_" else name, f"<{_PCD_TYPES[kind]}{size}", (count,))
+        for number, (name, kind, size, count) in enumerate(
+            zip(head["FIELDS"], head["TYPE"], head["SIZE"], counts, strict=True)
+        )
+    ]
+    rows = np.frombuffer(content, np.dtype(fields), int(head["POINTS"][0]), start)
+    return np.concatenate([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)

@@ -16,7 +16,7 @@ from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
-from .clouds import Cloud, CloudDistances, distances_of
+from .clouds import Cloud
 from .motion import OF_RELEASE, ReleasedForce, at_own_times
 from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, visibility, within
 
@@ -73,21 +73,6 @@ class Photo:
         measured = (self.tracked, None if self.cloud is None else self.cloud.measured)
         rows += [float(np.nanmax(own[:, 1], initial=0.0)) for own in measured if own is not None]
         return self.time + max(self.row_time * max(rows), 0.0)
-
-
-@dataclass(frozen=True)
-class SeenOutline:
-    """The simulated outline of a body in a picture, beside the measured one.
-
-    Attributes:
-        silhouette: the simulated outline.
-        of_simulated: (P,) weights of its points: the length that each stands for [px], less where a clamp hides it.
-        of_measured: (Q,) weights of the measured points.
-    """
-
-    silhouette: Silhouette
-    of_simulated: FloatArray
-    of_measured: FloatArray
 
 
 @dataclass(frozen=True)
@@ -290,13 +275,19 @@ class SeenPose:
         mine = torch.isin(sim.fixed, torch.as_tensor(self.clamps[1]).to(sim.fixed))[:, None]
         return torch.where(mine, (self._turned(rest, turn) + shift * axis)[sim.fixed], rest[sim.fixed])
 
-    def outlines(self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor) -> SeenOutline:
+    def outlines(
+        self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor
+    ) -> tuple[Silhouette, FloatArray, FloatArray]:
         """Returns the outline of the body (N, 3) in a picture that has a measured one.
 
         Args:
             photo: the picture.
             q: (N, 3) vertices [m].
             corrections: (9,) of the camera.
+
+        Returns:
+            The simulated outline, weights (P,) of its points: the length that each stands for [px], less where a clamp
+            hides it, and weights (Q,) of the measured points.
 
         Raises:
             InputError: a part of the body is behind the camera, or none is in the picture outside of the clamps.
@@ -314,12 +305,7 @@ class SeenPose:
                 f"{photo.name} does not show the simulated body where it is drawn: check the mask, the lens, and "
                 "world_to_camera, which takes m in the axes of the mesh to those of the camera."
             )
-        return SeenOutline(rim, simulated, measured)
-
-    def cloud_distances(self, photo: Photo, q: torch.Tensor, corrections: torch.Tensor) -> CloudDistances:
-        """Returns the distances of a picture's cloud from the body (N, 3) [m]."""
-        assert photo.cloud is not None
-        return distances_of(photo.cloud, photo.camera, corrections, self.surface.triangles, q)
+        return rim, simulated, measured
 
     def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> Difference:
         """Returns how far a simulated picture is from a measured one.
@@ -333,11 +319,10 @@ class SeenPose:
         result = Difference()
         if photo.outline is not None:
             depth = photo.camera.seen_from(q, corrections)[:, 2]
-            seen = self.outlines(photo, q, corrections)
-            there = np.abs(photo.outline.signed(seen.silhouette.pixels)[0])
-            back = np.abs(seen.silhouette.closest(photo.outline.points)[1])
-            both = [np.average(there, weights=seen.of_simulated), np.average(back, weights=seen.of_measured)]
-            pixels = float(np.mean(both))
+            rim, of_simulated, of_measured = self.outlines(photo, q, corrections)
+            there = np.average(np.abs(photo.outline.signed(rim.pixels)[0]), weights=of_simulated)
+            back = np.average(np.abs(rim.closest(photo.outline.points)[1]), weights=of_measured)
+            pixels = float(0.5 * (there + back))
             millimetres = pixels * float(depth.mean()) * photo.camera.millimetres(corrections)
             drawn = photo.camera.pixels(q, corrections).numpy()
             hidden = shapely.union_all([shapely.convex_hull(shapely.multipoints(drawn[own])) for own in self.clamps])
@@ -345,7 +330,7 @@ class SeenPose:
             overlap = shapely.intersection(body, mask).area / shapely.union(body, mask).area
             result = replace(result, outline_mm=millimetres, outline_px=pixels, overlap=overlap)
         if photo.cloud is not None:
-            distances = np.abs(self.cloud_distances(photo, q, corrections).distances)
+            distances = np.abs(photo.cloud.distances(photo.camera, corrections, self.surface.triangles, q).distances)
             result = replace(result, cloud_mm=_MILLI * float(np.minimum(distances, photo.cloud.reach).mean()))
         if photo.tracked is not None and self.points is not None:
             places = self.points(q[None])[0]

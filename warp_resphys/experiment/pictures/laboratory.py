@@ -41,7 +41,7 @@ def play_camera(context: StageContext) -> None:
     assert played is not None
     material = settings.simulation.changed(**{**settings.simulation.constants, **played.material})
     body = build_body(settings)
-    surface = ClosedSurface.of_mesh(body.mesh)
+    surface = ClosedSurface.of(body.mesh)
     centre = torch.as_tensor(body.mesh.vertices[body.fixed_vertices].mean(0))
     corrections = PlacedCamera.corrections(played.corrections)
     for number, (name, pose) in enumerate(data.poses.items()):

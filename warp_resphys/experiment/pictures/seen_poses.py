@@ -2,11 +2,10 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -32,10 +31,10 @@ from ...pictures.reading import (
     read_depth,
     read_mask,
     read_picture,
+    read_scan,
     read_scene,
     read_tracked,
 )
-from ...pictures.scans import read_scan
 from ...pictures.seen import Photo, SeenPose
 from ...pictures.tags import Tag
 from ...settings.body import MaterialSettings
@@ -48,7 +47,6 @@ log = logging.getLogger(__name__)
 PICTURES: Final = "pictures.h5"
 SCENE: Final = "camera.json"
 _KIND: Final = "pictures"
-_OF_FRAMES: Final = ("masks", "depths")
 _ALIKE: Final = 1e-9  # of two cameras
 _MOVED: Final = 0.05  # m: a tag that can be seen in two ways keeps its place
 
@@ -130,6 +128,8 @@ def released_force(name: str, pose: PoseSettings, mesh: Mesh) -> ReleasedForce |
 def import_pictures(context: StageContext) -> None:
     """Writes pictures.h5: of every pose the masks, depths, cameras, tracked points and the scan.
 
+    Copies of earlier pictures are left out, as they would count as often as there are copies.
+
     Raises:
         DataFileError: a picture cannot be read, or does not show the body.
     """
@@ -137,21 +137,41 @@ def import_pictures(context: StageContext) -> None:
     data = settings.data
     with atomic_hdf5(context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}) as file:
         for name, pose in data.poses.items():
-            scene = scene_of(data, pose, context.run_dir)
-            frames = _different(name, scene.frames)
+            scene, different = scene_of(data, pose, context.run_dir), dict[str, Frame]()
+            for frame in scene.frames:
+                different.setdefault(digest(frame.files[0]), frame)
+            frames = [*different.values()]
+            if len(frames) < len(scene.frames):
+                log.warning(
+                    "import: %d of the %d pictures of %s are copies of others, and are left out",
+                    *(len(scene.frames) - len(frames), len(scene.frames), name),
+                )
             if pose.release is not None:
                 check_times(replace(scene, frames=tuple(frames)), pose.release.time)
-            colours = pose.mask or data.mask
-            chosen = None if colours is None else Colours(**dict(colours))
-            masks = dict[int, NDArray[np.bool_]]()
+            chosen = pose.mask or data.mask
+            colours, shares, drawn = None if chosen is None else Colours(**dict(chosen)), list[float](), False
             for frame in frames:
-                with_depth = pose.depth and frame.depth is not None
-                coloured = chosen is not None and frame.image != frame.depth
-                if pose.outline or (with_depth and (frame.mask is not None or coloured)):
-                    masks[frame.number] = _mask(frame, chosen)
-                    create(file, f"{name}/masks/{frame.number}", masks[frame.number])
-                if with_depth:
-                    create(file, f"{name}/depths/{frame.number}", _depth(frame, masks.get(frame.number), data), "m")
+                with_depth, pictured = pose.depth and frame.depth is not None, frame.image != frame.depth
+                mask = None
+                if pose.outline or (with_depth and (frame.mask is not None or (colours is not None and pictured))):
+                    mask = read_mask(frame, colours)
+                    create(file, f"{name}/masks/{frame.number}", mask)
+                    if frame.mask is not None:
+                        _check_size(frame.mask, mask, frame.image, read_picture(frame.image))
+                    if pictured and not drawn:  # A picture in which everything but the body is dark.
+                        image, drawn = read_picture(frame.image), True
+                        with atomic_path(context.run_dir / "masks" / f"{name}.png") as partial:
+                            Image.fromarray(np.where(mask[..., None], image, image // 4)).save(partial, format="png")
+                    shares.append(100.0 * mask.mean())
+                if pose.depth and frame.depth is not None:
+                    depth = read_depth(frame.depth, data.cloud.depth_unit)
+                    if mask is not None:
+                        _check_size(frame.depth, depth, frame.mask or frame.image, mask)
+                    if pictured:
+                        _check_size(frame.depth, depth, frame.image, read_picture(frame.image))
+                    seen = np.isfinite(depth) & (True if mask is None else mask)
+                    shown = np.where(seen, depth, 0.0).astype(np.float32)  # zero where there is nothing of the body
+                    create(file, f"{name}/depths/{frame.number}", shown, "m")
             numbers = [frame.number for frame in frames]
             if pose.points is not None:
                 path = scene.path.parent / pose.points
@@ -167,115 +187,47 @@ def import_pictures(context: StageContext) -> None:
                 log.info("import: %s has a scan of %d points", name, len(points))
             create(file, f"{name}/world_to_camera", _cameras(scene.path, frames, data), "1, m")
             create(file, f"{name}/frames", numbers)
-            shares = [100.0 * mask.mean() for mask in masks.values()]
             covers = f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %" if shares else ""
             if frames:
                 log.info("import: %s has %d picture%s%s", name, len(frames), "s"[: len(frames) != 1], covers)
-            shown = next((frame for frame in frames if frame.number in masks and frame.image != frame.depth), None)
-            if shown is not None:
-                image = read_picture(shown.image)
-                _show_mask(context.run_dir / "masks" / f"{name}.png", image, masks[shown.number])
 
 
-def _depth(frame: Frame, mask: NDArray[np.bool_] | None, data: PictureData) -> NDArray[np.float32]:
-    """A depth image (H, W), zero where the mask does not show the body [m]."""
-    assert frame.depth is not None
-    depth = read_depth(frame.depth, data.cloud.depth_unit)
-    others = {} if mask is None else {"mask": mask.shape}
-    if frame.image != frame.depth:
-        others["picture"] = read_picture(frame.image).shape[:2]
-    for other, shape in others.items():
-        if shape != depth.shape:
-            raise DataFileError(
-                f"{frame.depth} has {depth.shape[1]} x {depth.shape[0]} pixels, and its {other} {shape[1]} x "
-                f"{shape[0]}: register the depths to the picture."
-            )
-    return np.where(np.isfinite(depth) & (True if mask is None else mask), depth, 0.0).astype(np.float32)
-
-
-def _show_mask(path: Path, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
-    """Writes a picture in which everything but the body is dark."""
-    with atomic_path(path) as partial:
-        Image.fromarray(np.where(mask[..., None], image, image // 4)).save(partial, format="png")
-
-
-def _mask(frame: Frame, colours: Colours | None) -> NDArray[np.bool_]:
-    """The mask of a picture, of the same size as that."""
-    mask = read_mask(frame, colours)
-    if frame.mask is not None and (size := read_picture(frame.image).shape[:2]) != mask.shape:
+def _check_size(path: Path, one: NDArray[Any], picture: Path, other: NDArray[Any]) -> None:
+    if one.shape[:2] != other.shape[:2]:
+        (height, width), (rows, columns) = one.shape[:2], other.shape[:2]
         raise DataFileError(
-            f"{frame.mask} has {mask.shape[1]} x {mask.shape[0]} pixels, and {frame.image.name} {size[1]} x {size[0]}."
+            f"{path} has {width} x {height} pixels, and {picture.name} {columns} x {rows}: bring both to one size, "
+            "depths registered to their picture."
         )
-    return mask
 
 
 def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> NDArray[np.float64]:
-    """(F, 2, 4, 4) the given cameras of frames, or the two that a tag in each allows."""
+    """(F, 2, 4, 4) the given cameras of frames, or the two that a tag in each allows.
+
+    Refused if a standing one sees the origin of the mesh at different places.
+    """
     if data.tag is None:
         if missing := [frame.image.name for frame in frames if frame.pose is None]:
             raise DataFileError(f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag.")
-        given = [np.stack([frame.pose, frame.pose]) for frame in frames if frame.pose is not None]
-        return _of_standing(path, frames, np.array(given).reshape(-1, 2, 4, 4), data)
-    tag, lenses = Tag(**dict(data.tag)), read_lenses(data)
-    tagged = [tag.poses(read_picture(frame.image), lenses[frame.lens]) for frame in frames]
-    if hidden := [frame.image for frame, own in zip(frames, tagged, strict=True) if not own]:
+        poses = [[frame.pose] for frame in frames if frame.pose is not None]
+    else:
+        tag, lenses = Tag(**dict(data.tag)), read_lenses(data)
+        poses = [[*tag.poses(read_picture(frame.image), lenses[frame.lens])] for frame in frames]
+        if hidden := [frame.image for frame, own in zip(frames, poses, strict=True) if not own]:
+            raise DataFileError(
+                f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame "
+                "out, or give its world_to_camera."
+            )
+    cameras = np.array([[own[0], own[-1]] for own in poses]).reshape(-1, 2, 4, 4)
+    places = cameras[:, 0, :3, 3]
+    first = {frame.lens: place for frame, place in reversed([*zip(frames, places, strict=True)])}
+    moved = [float(np.linalg.norm(place - first[f.lens])) for f, place in zip(frames, places, strict=True)]
+    if data.stands and max(moved, default=0.0) > _MOVED:
         raise DataFileError(
-            f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame out, "
-            "or give its world_to_camera."
-        )
-    both = np.array([np.stack([own[0], own[-1]]) for own in tagged]).reshape(-1, 2, 4, 4)
-    return _of_standing(path, frames, both, data)
-
-
-def _of_standing(
-    path: Path, frames: Sequence[Frame], cameras: NDArray[np.float64], data: PictureData
-) -> NDArray[np.float64]:
-    """The cameras (F, 2, 4, 4), refused if a standing one sees the origin of the mesh at different places."""
-    first: dict[str, NDArray[np.float64]] = {}
-    places = [(first.setdefault(f.lens, own[0, :3, 3]), own[0, :3, 3]) for f, own in zip(frames, cameras, strict=True)]
-    apart = max((float(np.linalg.norm(there - here)) for here, there in places), default=0.0)
-    if data.stands and apart > _MOVED:
-        raise DataFileError(
-            f"{path}: between its frames the camera moves by {100.0 * apart:.0f} cm against the origin of the mesh: "
-            "set data.stands=false if it does, or name several in data.lens; world_to_camera is in m."
+            f"{path}: between its frames the camera moves by {100.0 * max(moved):.0f} cm against the origin of the "
+            "mesh: set data.stands=false if it does, or name several in data.lens; world_to_camera is in m."
         )
     return cameras
-
-
-def _different(name: str, frames: Sequence[Frame]) -> list[Frame]:
-    """Frames without copies of earlier pictures, which would count as often as there are copies."""
-    first: dict[str, Frame] = {}
-    for frame in frames:
-        first.setdefault(digest(frame.files[0]), frame)
-    if len(first) < len(frames):
-        log.warning(
-            "import: %d of the %d pictures of %s are copies of others, and are left out",
-            *(len(frames) - len(first), len(frames), name),
-        )
-    return [*first.values()]
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A pose as it was read."""
-
-    masks: dict[int, NDArray[np.bool_]]  # (H, W) by number of the frame
-    depths: dict[int, NDArray[np.float64]]  # (H, W) by number of the frame [m]
-    cameras: NDArray[np.float64]  # (F, 2, 4, 4) world_to_camera: two that a tag allows, or the given one twice
-    tracked: NDArray[np.float64] | None  # (F, M, 2) [px]
-    frames: tuple[int, ...]
-    scan: NDArray[np.float64] | None = None  # (P, 3) [m]
-    normals: NDArray[np.float64] | None = None  # (P, 3) of these points
-
-
-def _loaded(file: h5py.Group) -> Loaded:
-    """A pose of pictures.h5."""
-    masks, depths = ({int(own): read_array(file, f"{key}/{own}") for own in file.get(key, ())} for key in _OF_FRAMES)
-    tracked, scan, normals = (
-        read_array(file, key) if key in file else None for key in ("tracked", "scan", "scan_normals")
-    )
-    frames = tuple(read_array(file, "frames").tolist())
-    return Loaded(masks, depths, read_array(file, "world_to_camera"), tracked, frames, scan, normals)
 
 
 class SeenPoses:
@@ -293,8 +245,12 @@ class SeenPoses:
     def __init__(self, settings: PictureStage, run_dir: Path) -> None:
         self.settings, self.data, self.run_dir = settings, settings.data, run_dir
         self.lenses, self._poses = read_lenses(self.data), dict[str, SeenPose]()
+        self._loaded: dict[str, dict[str, NDArray[Any]]] = {}  # arrays of each pose in pictures.h5, by name
         with read_hdf5(run_dir / PICTURES, _KIND) as file:
-            self.loaded = {name: _loaded(file[name]) for name in self.data.poses}
+            for name in self.data.poses:
+                keys = list[str]()
+                file[name].visititems(lambda key, item, keys=keys: keys.append(key) if hasattr(item, "shape") else None)
+                self._loaded[name] = {key: read_array(file[name], key) for key in keys}
 
     def picture(self, name: str, number: int) -> NDArray[np.uint8]:
         """Returns a picture (H, W, 3) of a pose, by its number among those that are used.
@@ -306,13 +262,13 @@ class SeenPoses:
 
     def _frames(self, name: str) -> list[Frame]:
         """The frames of a pose that are used."""
-        used = self.loaded[name].frames
+        used = self._loaded[name]["frames"]
         return [f for f in scene_of(self.data, self.data.poses[name], self.run_dir).frames if f.number in used]
 
     def cameras_of(self, name: str, lens: str) -> list[torch.Tensor]:
         """Returns the different cameras (4, 4) of a pose's frames by a lens, from which a standing one is chosen."""
         different, mine = list[torch.Tensor](), [frame.lens == lens for frame in self._frames(name)]
-        for camera in torch.as_tensor(self.loaded[name].cameras[mine].reshape(-1, 4, 4)):
+        for camera in torch.as_tensor(self._loaded[name]["world_to_camera"][mine].reshape(-1, 4, 4)):
             if all((camera - other).abs().max() > _ALIKE for other in different):
                 different.append(camera)
         return different
@@ -325,12 +281,9 @@ class SeenPoses:
 
     def pose(self, name: str) -> SeenPose:
         """Returns a pose by its name, with a camera for each frame; of a tag, the one that fits better."""
-        if name not in self._poses:
-            self._poses[name] = self._made(name)
-        return self._poses[name]
-
-    def _made(self, name: str) -> SeenPose:
-        settings, own, loaded = self.settings, self.data.poses[name], self.loaded[name]
+        if name in self._poses:
+            return self._poses[name]
+        settings, own, loaded = self.settings, self.data.poses[name], self._loaded[name]
         mesh, clamps = self._mesh(name)
         fixed = np.unique(np.concatenate(clamps))
         material = self.material(name)
@@ -341,24 +294,28 @@ class SeenPoses:
         if own.points is not None:
             points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
-        scene, photos, surface = scene_of(self.data, own, self.run_dir), list[Photo](), ClosedSurface.of_mesh(mesh)
+        scene, photos, surface = scene_of(self.data, own, self.run_dir), list[Photo](), ClosedSurface.of(mesh)
         for number, frame in enumerate(self._frames(name)):
-            camera = PlacedCamera(self.lenses[frame.lens], torch.as_tensor(loaded.cameras[number, 0]), centre)
-            outline = Outline.of_mask(loaded.masks[frame.number]) if own.outline else None
-            tracked = None if loaded.tracked is None else loaded.tracked[number]
-            cloud, depth = None, loaded.depths.get(frame.number)
+            camera = PlacedCamera(
+                self.lenses[frame.lens], torch.as_tensor(loaded["world_to_camera"][number, 0]), centre
+            )
+            outline = Outline.of_mask(loaded[f"masks/{frame.number}"]) if own.outline else None
+            tracked = loaded["tracked"][number] if "tracked" in loaded else None
+            cloud, depth = None, loaded.get(f"depths/{frame.number}")
             if depth is not None:
                 cloud = self._cloud(frame.files[0], Cloud.of_depth(depth), camera, mesh, fixed)
             row_time = self.data.lenses[frame.lens].row_time
             title, time = f"{own.folder}/{frame.image.name}", frame.time or 0.0
             photos.append(Photo(title, camera, outline, tracked, cloud, frame.lens, time, row_time))
-        if loaded.scan is not None:
+        if (scan := loaded.get("scan")) is not None:
             camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
-            outside = None if loaded.normals is None else loaded.scan + loaded.normals
-            cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(loaded.scan, outside), camera, mesh, fixed)
+            outside = scan + loaded["scan_normals"] if "scan_normals" in loaded else None
+            cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(scan, outside), camera, mesh, fixed)
             photos.append(Photo(f"{own.folder}/{own.cloud}", camera, cloud=cloud))
         release, material_name = released_force(name, own, mesh), own.material or ""
-        return SeenPose(name, simulator, surface, clamps, tuple(photos), material_name, points, release=release)
+        pose = SeenPose(name, simulator, surface, clamps, tuple(photos), material_name, points, release=release)
+        self._poses[name] = pose
+        return pose
 
     def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: NDArray[np.int64]) -> Cloud:
         """The points that may be of a body, as many as configured."""

@@ -323,13 +323,13 @@ def compare_pictures(context: StageContext) -> None:
                     rows.append({**row, **asdict(pose.difference(photo, q, own)), "values": own})
                     corrections = PlacedCamera.corrections(own)
                     if photo.outline is not None:
-                        seen = pose.outlines(photo, q, corrections)
-                        create(file, f"{name}/{number}/{model}", seen.silhouette.pixels, "px")
-                        create(file, f"{name}/{number}/{model}_weight", seen.of_simulated, "px")
+                        rim, weights, _ = pose.outlines(photo, q, corrections)
+                        create(file, f"{name}/{number}/{model}", rim.pixels, "px")
+                        create(file, f"{name}/{number}/{model}_weight", weights, "px")
                         if model == MODELS[0]:
                             create(file, f"{name}/{number}/measured", photo.outline.points, "px")
                     if photo.cloud is not None:
-                        closest = pose.cloud_distances(photo, q, corrections)
+                        closest = photo.cloud.distances(photo.camera, corrections, pose.surface.triangles, q)
                         distances = np.abs(closest.distances)
                         content = {"places": closest.places, "distances": distances, "surface": q.numpy()}
                         for key, array in content.items():

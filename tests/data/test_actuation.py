@@ -3,17 +3,19 @@
 import numpy as np
 import pytest
 
-from warp_resphys.data.actuation import InputSequences, check_inputs
+from warp_resphys.data.actuation import check_inputs, draw_inputs
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.settings.trials import SequenceSettings
 
 STEP = 0.01
 
 
-def drawn(count=40, steps=150, chambers=2, **settings):
-    sequences = InputSequences(**settings)
-    return np.stack([sequences.draw(steps, STEP, chambers, np.random.default_rng(i)) for i in range(count)])
+def drawn(count=40, steps=150, chambers=2, limit=20e3, **settings):
+    sequences = SequenceSettings(**settings)
+    random = [np.random.default_rng(number) for number in range(count)]
+    return np.stack([draw_inputs(sequences, limit, steps, STEP, chambers, own) for own in random])
 
 
 def test_sequences_start_and_end_at_rest_and_stay_within_the_limit():
@@ -49,7 +51,7 @@ def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
 )
 def test_bad_sequences(settings, message):
     with pytest.raises(InputError, match=message):
-        InputSequences(**settings).draw(300, STEP, 3, np.random.default_rng(0))
+        drawn(1, 300, 3, **settings)
 
 
 def test_recorded_pressures_are_checked():

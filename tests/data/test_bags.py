@@ -9,9 +9,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from warp_resphys.data.base_motion import since_first
-from warp_resphys.data.recordings.bag import Bag
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.settings.trials import BagSettings
 
 RATE, FRAMES = 50.0, 41
 TIMES = np.arange(FRAMES) / RATE
@@ -74,6 +74,10 @@ class Messages:
         return self.of("std_msgs/msg/Float64MultiArray")(layout, np.array(values, dtype=np.float64))
 
 
+def of_tip(source, *inputs):
+    return BagSettings(markers={"tip": source}, inputs=inputs)
+
+
 def written(path, kind="sqlite3", left_out=(), late=0.0):
     """A bag with two markers, a rigid body, two inputs and an image topic."""
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
@@ -111,7 +115,7 @@ def written(path, kind="sqlite3", left_out=(), late=0.0):
 def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
     """Also where the clock of the computer that recorded is not that of the headers, which numbers lack."""
     path = written(tmp_path / ("trial.bag" if kind == "bag" else "trial"), kind, late=late)
-    read = read_recording(path / file, bag=Bag(MARKERS, INPUTS))
+    read = read_recording(path / file, bag=BagSettings(markers=MARKERS, inputs=INPUTS))
     assert read.rate == RATE
     assert read.labels == ("tip", "plate", "second", "plate +x", "plate +y", "plate +z")
     times = 0.3 / RATE + np.arange(len(read.positions)) / RATE  # from the first message of the rigid body on
@@ -126,16 +130,16 @@ def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
 
 def test_a_pose_is_the_motion_of_the_base(tmp_path):
     path = written(tmp_path / "trial")
-    read = read_recording(path, bag=Bag({"tip": "/mocap/tip"}, base="/tf#plate"))
+    read = read_recording(path, bag=BagSettings(markers={"tip": "/mocap/tip"}, base="/tf#plate"))
     times = np.maximum(TIMES, 0.3 / RATE)  # before its first message, the base is where that has it
     quaternions = turn(times).as_quat()[:, [3, 0, 1, 2]]
     np.testing.assert_allclose(read.base, since_first(place(1, times), quaternions, path), atol=2e-4)
 
 
 def test_a_gap_is_not_bridged(tmp_path):
-    read = read_recording(written(tmp_path / "trial", left_out=range(10, 15)), bag=Bag({"tip": "/mocap/tip"}))
+    read = read_recording(written(tmp_path / "trial", left_out=range(10, 15)), bag=of_tip("/mocap/tip"))
     np.testing.assert_array_equal(np.flatnonzero(~read.seen[:, 0]), range(10, 15))
-    single = read_recording(written(tmp_path / "other", left_out=[10]), bag=Bag({"tip": "/mocap/tip"}))
+    single = read_recording(written(tmp_path / "other", left_out=[10]), bag=of_tip("/mocap/tip"))
     assert single.seen.all()
     np.testing.assert_allclose(single.positions[:, 0], place(0, TIMES), atol=4e-5)
 
@@ -143,15 +147,19 @@ def test_a_gap_is_not_bridged(tmp_path):
 @pytest.mark.parametrize(
     ("bag", "error", "words"),
     [
-        (Bag({"tip": "/mocap/tup"}), DataFileError, "no topic /mocap/tup, did you mean '/mocap/tip'"),
-        (Bag({"tip": "/tf#tip"}), DataFileError, "/tf has no message of tip"),
-        (Bag({"tip": "/pressure#1"}), DataFileError, "which hold no place"),
-        (Bag({"tip": "/cloud"}), InputError, "say which entry"),
-        (Bag({"tip": "/mocap/tip"}, ["/pressure#3 [mbar]"]), DataFileError, "has 2 entries"),
-        (Bag({"tip": "/mocap/tip"}, ["/pressure#1 [psi]"]), InputError, "whose unit is unknown"),
-        (Bag({"tip": "/mocap/tip"}, ["/joint_states#winch"]), InputError, "name the joint and its position"),
-        (Bag({"tip": "mocap tip"}), InputError, "write a topic"),
-        (Bag({}), InputError, "data.bag.markers is empty"),
+        (of_tip("/mocap/tup"), DataFileError, "no topic /mocap/tup, did you mean '/mocap/tip'"),
+        (of_tip("/tf#tip"), DataFileError, "/tf has no message of tip"),
+        (of_tip("/pressure#1"), DataFileError, "which hold no place"),
+        (of_tip("/cloud"), InputError, "say which entry"),
+        (of_tip("/mocap/tip", "/pressure#3 [mbar]"), DataFileError, "has 2 entries"),
+        (of_tip("/mocap/tip", "/pressure#1 [psi]"), InputError, "whose unit is unknown"),
+        (
+            of_tip("/mocap/tip", "/joint_states#winch"),
+            InputError,
+            "name the joint and its position",
+        ),
+        (of_tip("mocap tip"), InputError, "write a topic"),
+        (BagSettings(markers={}), InputError, "data.bag.markers is empty"),
         (None, InputError, "name topics in data.bag .* /pressure .std_msgs/msg/Float64MultiArray"),
     ],
 )
@@ -162,7 +170,7 @@ def test_what_cannot_be_read_is_said(bag, error, words, tmp_path):
 
 def test_files_that_are_no_bags_are_said(tmp_path):
     with pytest.raises(DataFileError, match="there is no such file or folder"):
-        read_recording(tmp_path / "trial.bag", bag=Bag(MARKERS))
+        read_recording(tmp_path / "trial.bag", bag=BagSettings(markers=MARKERS))
     whole = (written(tmp_path / "trial", "mcap") / "trial.mcap").read_bytes()
     contents = {
         "a.bag": b"#ROSBAG V2.0\n" + bytes(100),
@@ -174,4 +182,4 @@ def test_files_that_are_no_bags_are_said(tmp_path):
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataFileError, match=rf"{name} is damaged, or no bag of ROS .*: record it with ROS again"):
-            read_recording(tmp_path / name, bag=Bag(MARKERS))
+            read_recording(tmp_path / name, bag=BagSettings(markers=MARKERS))

@@ -6,8 +6,8 @@ import pytest
 from support.bags import write_points
 from support.command_line import outcome, refusal
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.text import Table
 from warp_resphys.io.errors import DataFileError
+from warp_resphys.settings.trials import TableSettings
 
 TIMES = 100.0 + np.arange(30) / 50.0
 TIP = np.stack([0.02 * np.sin(5.0 * TIMES), 0.1 + 0.0 * TIMES, 0.01 * TIMES], -1)
@@ -64,14 +64,14 @@ def test_columns_are_chosen_by_the_names_of_the_file(tmp_path):
     times = [f"{time - 100.0:.3f}" for time in TIMES]
     lines = ["recorded on a Monday", "t\tX (mm)\tY (mm)\tZ (mm)\tpump"]
     path = table(tmp_path / "a.tsv", lines, times, "\t")
-    read = read_recording(path, table=Table(names={**NAMES, "pump": "pump [kPa]"}, header_lines=1))
+    read = read_recording(path, table=TableSettings(names={**NAMES, "pump": "pump [kPa]"}, header_lines=1))
     np.testing.assert_allclose(read.positions[:, 0], TIP, atol=1e-9)
     np.testing.assert_allclose(read.actuation, 12.5e3)
-    assert read_recording(path, table=Table(names=NAMES, header_lines=1)).actuation is None
+    assert read_recording(path, table=TableSettings(names=NAMES, header_lines=1)).actuation is None
     with pytest.raises(
         DataFileError, match=r"line 2: data\.table\.names has 'X', which 0 columns are named; it has 't'"
     ):
-        read_recording(path, table=Table(names={**NAMES, "X": "a.x"}, header_lines=1))
+        read_recording(path, table=TableSettings(names={**NAMES, "X": "a.x"}, header_lines=1))
 
 
 def vicon(path, cut=0, subject="Arm:"):

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from warp_resphys.data.recordings.reading import read_recording, write_recording
-from warp_resphys.data.recordings.text import Table
 from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.settings.trials import TableSettings
 
 
 @pytest.fixture
@@ -60,7 +60,9 @@ def test_a_table_without_a_header(tmp_path, positions):
     rows = [[1000.0 + 10.0 * k, 7.0, *(1e3 * positions[k].ravel()), wound[k]] for k in range(40)]
     path.write_text("a log\n" + "\n".join(";".join(f"{x:.6f}" for x in row) for row in rows) + "\n")
     axes = [f"{label}.{axis} [mm]" for label in "abc" for axis in "xyz"]
-    recording = read_recording(path, table=Table(["time [ms]", None, *axes, "tendon [mm]"], header_lines=1))
+    recording = read_recording(
+        path, table=TableSettings(columns=["time [ms]", None, *axes, "tendon [mm]"], header_lines=1)
+    )
     assert (recording.labels, recording.rate, recording.start) == (("a", "b", "c"), 100.0, 1.0)
     np.testing.assert_allclose(recording.positions, positions, atol=1e-8)
     np.testing.assert_allclose(recording.actuation[:, 0], 1e-3 * wound, atol=1e-8)
@@ -70,7 +72,7 @@ class TestALogThatBeganBeforeItsWinch:
     """Missing first values equal the first known one, the recording ends with the last one; notes are ignored."""
 
     COLUMNS = ("frame", *(f"{label}.{axis}" for label in "abc" for axis in "xyz"), "winch [mm]", "valve [Pa]")
-    TABLE = Table(COLUMNS, header_lines=1)
+    TABLE = TableSettings(columns=COLUMNS, header_lines=1)
     GONE = float("nan")
 
     def write(self, path, positions, winch, valve, ends=",,"):
@@ -129,9 +131,9 @@ def test_wrong_descriptions_of_tables(tmp_path, columns, lines, message):
     path = tmp_path / "swing.csv"
     np.savetxt(path, np.arange(40.0).reshape(10, 4), delimiter=",")
     with pytest.raises(DataFileError, match=message):
-        read_recording(path, units="mm", rate=60.0, table=Table(columns, lines))
+        read_recording(path, units="mm", rate=60.0, table=TableSettings(columns=columns, header_lines=lines))
     with pytest.raises(DataFileError, match=r"data\.table"):
-        read_recording(tmp_path / "swing.npz", table=Table(columns, lines))
+        read_recording(tmp_path / "swing.npz", table=TableSettings(columns=columns, header_lines=lines))
 
 
 def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):

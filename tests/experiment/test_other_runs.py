@@ -8,7 +8,7 @@ from support.configured import settings
 from support.main_job import finish, run
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
-from warp_resphys.data.actuation import InputWaves
+from warp_resphys.data.actuation import wave_inputs
 from warp_resphys.data.base_motion import prescribed
 from warp_resphys.data.marker_view import MarkerView
 from warp_resphys.experiment.build import bound_markers, build_simulator
@@ -154,7 +154,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     assert ways["faster"] > 4.0  # mm
     assert ways["back"] < -2.0
     for row, name in enumerate(dataset.names):
-        waves = InputWaves(limit=1e4, **dict(configured.laboratory.trials[name].waves)).series(100, 0.01)
+        waves = wave_inputs(configured.laboratory.trials[name].waves, 1e4, 100, 0.01)
         np.testing.assert_allclose(dataset.inputs["muscle_stress"][row], waves[1:], rtol=1e-9)
     identified, errors = metrics["parameters"]["sysid"], means(metrics)
     assert identified["youngs_modulus"] == pytest.approx(7.5e4, rel=0.01)

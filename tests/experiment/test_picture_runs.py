@@ -367,12 +367,12 @@ class TestRelease:
         ("change", "sentence"),
         [
             (lambda _, frames: frames[5].pop("time"), "frame 5 has no 'time', and its body is released: give it"),
-            (lambda _, frames: frames[5].update(time="late"), "frame 5 has the 'time' 'late': give a number, in s"),
+            (lambda _, frames: frames[5].update(time="late"), "frames[5].time is 'late': it must be a number, or null"),
             (
                 lambda _, frames: frames[5].update(time=0.02),
                 "has the time 0.02 s, and frame 4 before it 0.0666667",
             ),
-            (lambda scene, _: scene.update(frame_rate=0), "'frame_rate' is 0: give a positive number, in Hz"),
+            (lambda scene, _: scene.update(frame_rate=0), "frame_rate is 0: it must be a positive number, or null"),
             (lambda scene, frames: scene.update(frames=frames[:6]), "fewer than 3 different frames after the release"),
         ],
     )

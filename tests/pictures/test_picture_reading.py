@@ -9,7 +9,6 @@ from PIL import Image
 
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.pictures.reading import (
-    Colours,
     read_depth,
     read_mask,
     read_picture,
@@ -17,6 +16,7 @@ from warp_resphys.pictures.reading import (
     read_scene,
     read_tracked,
 )
+from warp_resphys.settings.pictures import ColourSettings
 
 FRAME = {"image": "00.png", "time": 0.5, "world_to_camera": np.eye(4).tolist()}
 
@@ -43,7 +43,7 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
     scene = read_scene(write(tmp_path / "camera.json", content))
     assert [clamp.tolist() for clamp in scene.clamps] == [[3, 1], [7]]
     assert [frame.number for frame in scene.frames] == [0, 1]
-    red = read_mask(scene.frames[0], Colours((340.0, 10.0), 0.5, 0.3))
+    red = read_mask(scene.frames[0], ColourSettings(hue=(340.0, 10.0), saturation=0.5, value=0.3))
     assert red.sum() == 900  # with its hole, without the speck
     assert red[10:40, 10:40].all()
     given = np.zeros((60, 80), dtype=np.uint8)
@@ -55,7 +55,7 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
     Image.fromarray(clear).save(tmp_path / "mask.png")
     assert read_mask(scene.frames[1], None).sum() == 16
     with pytest.raises(InputError, match=r"00.png: no part has a hue from 100 to 140 degrees"):
-        read_mask(scene.frames[0], Colours((100.0, 140.0), 0.5, 0.3))
+        read_mask(scene.frames[0], ColourSettings(hue=(100.0, 140.0)))
     with pytest.raises(DataFileError, match=r"has no mask: name one in camera.json"):
         read_mask(scene.frames[0], None)
 

@@ -7,7 +7,8 @@ import torch
 from support.tags import draw_tag
 from warp_resphys.data.camera import Lens
 from warp_resphys.io.errors import InputError
-from warp_resphys.pictures.tags import Tag
+from warp_resphys.pictures.tags import tag_poses
+from warp_resphys.settings.pictures import TagSettings
 from warp_resphys.stepping.rotations import rotations
 
 MATRIX = np.array([[900.0, 0.0, 330.0], [0.0, 900.0, 250.0], [0.0, 0.0, 1.0]])
@@ -30,11 +31,14 @@ def picture(camera):
     return draw_tag(np.full((500, 660, 3), 60, dtype=np.uint8), camera, MATRIX, PLACE, RIGHT, UP, SIZE, 7)
 
 
+def tag(number=7, dictionary="4x4_50", up=UP):
+    return TagSettings(dictionary=dictionary, number=number, size=SIZE, centre=[*PLACE], right=[*RIGHT], up=[*up])
+
+
 @pytest.mark.parametrize("turn", [(0.0, 0.6, 0.0), (0.5, -0.2, 0.1)])
 def test_one_of_the_poses_of_a_tag_is_that_of_the_camera(turn):
     camera = pose(turn)
-    tag = Tag("4x4_50", 7, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))
-    poses = tag.poses(picture(camera), LENS)
+    poses = tag_poses(tag(), picture(camera), LENS)
     away = [np.abs(own - camera).max(0) for own in poses]
     best = min(away, key=lambda own: own[:3].max())
     assert best[:3].max() < 0.03
@@ -45,12 +49,11 @@ def test_one_of_the_poses_of_a_tag_is_that_of_the_camera(turn):
 
 
 def test_a_tag_that_is_not_seen_has_no_pose():
-    tag = Tag("4x4_50", 3, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))
-    assert tag.poses(picture(pose((0.0, 0.3, 0.0))), LENS) == []
+    assert tag_poses(tag(3), picture(pose((0.0, 0.3, 0.0))), LENS) == []
 
 
 def test_a_tag_is_one_of_opencvs_with_two_edges():
     with pytest.raises(InputError, match="OpenCV has no tags '9x9_1'"):
-        Tag("9x9_1", 0, SIZE, tuple(PLACE), tuple(RIGHT), tuple(UP))
+        tag_poses(tag(dictionary="9x9_1"), np.zeros((9, 9, 3)), LENS)
     with pytest.raises(InputError, match="must be perpendicular"):
-        Tag("4x4_50", 0, SIZE, tuple(PLACE), tuple(RIGHT), tuple(RIGHT))
+        tag_poses(tag(up=RIGHT), np.zeros((9, 9, 3)), LENS)

@@ -9,7 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
-from ..data.actuation import InputSequences
+from ..data.actuation import draw_inputs
 from ..data.input_response import SLOPES, InputResponse, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
@@ -18,6 +18,7 @@ from ..io.errors import InputError
 from ..robot.inputs import RobotInput
 from ..robot.robot import Robot
 from ..robot.state import RobotState
+from ..settings.trials import SequenceSettings
 from ..stepping.state import State
 from .world import FloatArray
 
@@ -279,8 +280,9 @@ class Source:
         for number in range(batch):
             fastest = _FASTEST if number < sampling.motions else _FAST
             time = float(np.exp(random.uniform(np.log(fastest), np.log(_SLOWEST))))
-            source = InputSequences(_MEAN, _DEVIATION, time, limit=1.0, rest=2.0 * robot.time_step)
-            drawn.append(source.draw(steps, robot.time_step, self.parts, random)[1:])
+            rest = 2.0 * robot.time_step
+            source = SequenceSettings(mean=_MEAN, deviation=_DEVIATION, correlation_time=time, rest=rest)
+            drawn.append(draw_inputs(source, 1.0, steps, robot.time_step, self.parts, random)[1:])
         commands = self.commands(np.stack(drawn, axis=1))
         every = max(steps // sampling.tenths, 1)
 

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..data.actuation import InputSequences, InputWaves
+from ..data.actuation import draw_inputs, wave_inputs
 from ..data.base_motion import in_frame, rigid
 from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
@@ -225,11 +225,10 @@ def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simul
     return build_simulator(simulated, settings.laboratory.material, payload_at=settings.payload_at)
 
 
-def input_sequences(settings: PlayedSettings) -> InputSequences:
-    """Distribution of the laboratory's random inputs, so that recorded ones stay within the limit with any zero."""
+def largest_input(settings: PlayedSettings) -> float:
+    """Largest random or periodic input, in its unit, so that recorded ones stay within the limit with any zero."""
     assert settings.data.input_limit is not None
-    largest = settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
-    return InputSequences(limit=largest, **dict(settings.laboratory.sequences))
+    return settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
 
 
 def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
@@ -238,11 +237,11 @@ def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
     assert settings.data.steps is not None
     before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
     steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
-    sequences = input_sequences(settings)
+    limit = largest_input(settings)
     if trial.waves is not None:
-        drawn = InputWaves(limit=sequences.limit, **dict(trial.waves)).series(steps, settings.time_step)
+        drawn = wave_inputs(trial.waves, limit, steps, settings.time_step)
     else:
-        drawn = sequences.draw(steps, settings.time_step, parts, draw)
+        drawn = draw_inputs(settings.laboratory.sequences, limit, steps, settings.time_step, parts, draw)
     drawn = drawn[before:]
     if trial.is_released:
         drawn = np.zeros_like(drawn)

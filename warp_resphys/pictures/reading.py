@@ -28,6 +28,7 @@ from ..data.camera import PlacedCamera
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_arrays
 from ..io.settings import Count, Many, Positive, Settings, Some, Word, parse
+from ..settings.pictures import ColourSettings
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,33 +41,25 @@ _SAMPLED = 20_000  # points on the triangles of a scanned surface
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
-@dataclass(frozen=True)
-class Colours:
-    """The colours of a body: an interval of hues, which may pass 360, and the least saturation and value."""
+def colour_mask(image: NDArray[np.uint8], colours: ColourSettings) -> Mask:
+    """Returns the largest connected part of a picture (H, W, 3) with the colours of a body, its holes filled.
 
-    hue: tuple[float, float]  # [degrees]
-    saturation: float  # 0 to 1
-    value: float  # 0 to 1
-
-    def mask(self, image: NDArray[np.uint8]) -> Mask:
-        """Returns the largest connected part of a picture (H, W, 3) with these colours, its holes filled.
-
-        Raises:
-            InputError: no part has these colours.
-        """
-        hue, saturation, value = np.moveaxis(rgb_to_hsv(image[..., :3] / 255.0), -1, 0)
-        first, last = self.hue
-        right = (360.0 * hue - first) % 360.0 <= ((last - first) % 360.0 if last - first < 360.0 else 360.0)
-        right &= (saturation >= self.saturation) & (value >= self.value)
-        parts, count = scipy.ndimage.label(scipy.ndimage.binary_opening(right, iterations=_SPECKS))
-        if not count:
-            raise InputError(
-                f"no part has a hue from {first:g} to {last:g} degrees, a saturation of {self.saturation:g} and a "
-                f"value of {self.value:g}: widen the colours of the mask."
-            )
-        largest = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
-        whole = scipy.ndimage.binary_dilation(largest, iterations=_SPECKS, mask=right)  # with its corners
-        return np.asarray(scipy.ndimage.binary_fill_holes(whole))
+    Raises:
+        InputError: no part has these colours.
+    """
+    hue, saturation, value = np.moveaxis(rgb_to_hsv(image[..., :3] / 255.0), -1, 0)
+    first, last = colours.hue
+    right = (360.0 * hue - first) % 360.0 <= ((last - first) % 360.0 if last - first < 360.0 else 360.0)
+    right &= (saturation >= colours.saturation) & (value >= colours.value)
+    parts, count = scipy.ndimage.label(scipy.ndimage.binary_opening(right, iterations=_SPECKS))
+    if not count:
+        raise InputError(
+            f"no part has a hue from {first:g} to {last:g} degrees, a saturation of {colours.saturation:g} and a "
+            f"value of {colours.value:g}: widen the colours of the mask."
+        )
+    largest = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
+    whole = scipy.ndimage.binary_dilation(largest, iterations=_SPECKS, mask=right)  # with its corners
+    return np.asarray(scipy.ndimage.binary_fill_holes(whole))
 
 
 _Row = Annotated[tuple[float, float, float, float], Strict(False)]
@@ -213,7 +206,7 @@ def read_picture(path: Path, mode: str = "RGB") -> NDArray[np.uint8]:
         raise DataFileError(f"cannot read the picture {path} ({error}).") from error
 
 
-def read_mask(frame: Frame, colours: Colours | None) -> Mask:
+def read_mask(frame: Frame, colours: ColourSettings | None) -> Mask:
     """Returns where a picture shows the body (H, W): of its mask, or by colours.
 
     Raises:
@@ -229,7 +222,7 @@ def read_mask(frame: Frame, colours: Colours | None) -> Mask:
             f"{frame.image} has no mask: name one in camera.json, or give the colours of the body in data.mask."
         )
     try:
-        return colours.mask(read_picture(frame.image))
+        return colour_mask(read_picture(frame.image), colours)
     except InputError as error:
         raise InputError(f"{frame.image}: {error}") from None
 

@@ -4,95 +4,58 @@ The picture of one small tag has two poses that fit nearly as well (Collins and 
 better one first.
 """
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..data.camera import Lens
 from ..io.errors import InputError
+from ..settings.pictures import TagSettings
 
 FloatArray = NDArray[np.float64]
 
 _CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])  # in the order of OpenCV
 
 
-@dataclass(frozen=True)
-class Tag:
-    """A tag on the clamp.
-
-    Attributes:
-        dictionary: of OpenCV, such as ``6x6_250`` or ``apriltag_36h11``.
-        number: of the tag.
-        size: of its black square [m].
-        centre: (3,) in the axes of the scene [m].
-        right: (3,) direction of its upper edge, seen from the front.
-        up: (3,) direction of its left edge, upwards.
+def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[FloatArray]:
+    """Returns the one or two world_to_camera (4, 4) that a picture (H, W, 3) allows; none without the tag.
 
     Raises:
-        InputError: OpenCV is not installed, or has no such dictionary; or the directions are not perpendicular.
-    """
-
-    dictionary: str
-    number: int
-    size: float
-    centre: tuple[float, float, float]
-    right: tuple[float, float, float]
-    up: tuple[float, float, float]
-
-    def __post_init__(self) -> None:
-        """Checks the dictionary and the directions."""
-        if not hasattr(_opencv().aruco, self._constant):
-            raise InputError(f"OpenCV has no tags {self.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11.")
-        right, up = np.array(self.right), np.array(self.up)
-        if not abs(right @ up) <= 1e-3 * np.linalg.norm(right) * np.linalg.norm(up) or not (right.any() and up.any()):
-            raise InputError("right and up of a tag are directions of two of its edges: they must be perpendicular.")
-
-    @property
-    def _constant(self) -> str:
-        return f"DICT_{self.dictionary.upper()}"
-
-    def poses(self, image: NDArray[np.uint8], lens: Lens) -> list[FloatArray]:
-        """Returns the one or two world_to_camera (4, 4) that a picture (H, W, 3) allows; none without the tag."""
-        cv2 = _opencv()
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self._constant))
-        corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(
-            np.ascontiguousarray(image[..., ::-1])
-        )
-        seen = [] if numbers is None else zip(corners, numbers.ravel(), strict=True)
-        found = [own[0] for own, number in seen if number == self.number]
-        if not found:
-            return []
-        distortion = None if lens.distortion is None else lens.distortion.numpy()
-        _, turns, shifts, _ = cv2.solvePnPGeneric(
-            0.5 * self.size * _CORNERS,
-            found[0].astype(np.float64),
-            lens.matrix.numpy(),
-            distortion,
-            flags=cv2.SOLVEPNP_IPPE_SQUARE,
-        )
-        right, up = (np.array(own) / np.linalg.norm(own) for own in (self.right, self.up))
-        axes = np.stack([right, up, np.cross(right, up)])  # from the scene to the tag
-        poses = []
-        for turn, shift in zip(turns, shifts, strict=True):
-            rotation = cv2.Rodrigues(turn)[0] @ axes
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = rotation, shift.ravel() - rotation @ np.array(self.centre)
-            poses.append(pose)
-        return poses
-
-
-def _opencv() -> Any:
-    """OpenCV.
-
-    Raises:
-        InputError: it is not installed.
+        InputError: OpenCV is not installed, or has no such dictionary; or the edges are not perpendicular.
     """
     try:
         import cv2
     except ModuleNotFoundError:
         raise InputError("data.tag needs a package that is not installed: pip install 'warp-resphys[tags]'.") from None
-    return cv2
+    constant = getattr(cv2.aruco, f"DICT_{tag.dictionary.upper()}", None)
+    if constant is None:
+        raise InputError(f"OpenCV has no tags {tag.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11.")
+    right, up = np.array(tag.right), np.array(tag.up)
+    if not abs(right @ up) <= 1e-3 * np.linalg.norm(right) * np.linalg.norm(up) or not (right.any() and up.any()):
+        raise InputError("right and up of a tag are directions of two of its edges: they must be perpendicular.")
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(constant)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(
+        np.ascontiguousarray(image[..., ::-1])
+    )
+    seen = [] if numbers is None else zip(corners, numbers.ravel(), strict=True)
+    found = [own[0] for own, number in seen if number == tag.number]
+    if not found:
+        return []
+    distortion = None if lens.distortion is None else lens.distortion.numpy()
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        0.5 * tag.size * _CORNERS,
+        found[0].astype(np.float64),
+        lens.matrix.numpy(),
+        distortion,
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )
+    right, up = (own / np.linalg.norm(own) for own in (right, up))
+    axes = np.stack([right, up, np.cross(right, up)])  # from the scene to the tag
+    poses = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        rotation = cv2.Rodrigues(turn)[0] @ axes
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, shift.ravel() - rotation @ np.array(tag.centre)
+        poses.append(pose)
+    return poses

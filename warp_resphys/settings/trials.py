@@ -63,7 +63,7 @@ class MotionSettings(Settings):
 
 
 class WaveSettings(Settings):
-    """Periodic inputs, `data.actuation.InputWaves`."""
+    """Periodic inputs, `data.actuation.wave_inputs`."""
 
     frequency: Positive = setting(unit="Hz")
     phases: Some[float] = setting(description="initial phases, one per chamber, tendon or muscle", unit="rad")
@@ -263,10 +263,7 @@ class TableSettings(Settings):
 
 
 class BagSettings(Settings):
-    """Topics of bags, with a member after # where a message has several: /tf#tip, /joint_states#finger.effort.
-
-    A member of a message in JSON is a path of keys: /robot#state.tips.2.
-    """
+    """Topics of bags, with a member after # where a message has several: /tf#tip, /joint_states#finger.effort."""
 
     markers: dict[str, Word] = setting(description="topics by name of the marker; poses are rigid bodies")
     inputs: Many[Word] = setting((), "topics with units: '/pressure#1 [mbar]'")
@@ -443,7 +440,7 @@ class MarkerSettings(BindingSettings):
 
 
 class SequenceSettings(Settings):
-    """Random inputs of a laboratory, `data.actuation.InputSequences`."""
+    """Random inputs of a laboratory, `data.actuation.draw_inputs`."""
 
     mean: float = setting(8e3, "mean, in the unit of the input")
     deviation: Positive = setting(9e3, "standard deviation, in the unit of the input")

@@ -14,7 +14,6 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from ..data.recordings.bag import Bag
 from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.quality import (
     QUALITY_COLUMNS,
@@ -27,7 +26,6 @@ from ..data.recordings.quality import (
 )
 from ..data.recordings.reading import read_recording
 from ..data.recordings.recording import Recording
-from ..data.recordings.text import Table
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_json
@@ -58,8 +56,7 @@ class RecordingFile(Settings):
 
     def arguments(self) -> tuple[Any, ...]:
         """Returns the arguments of `read_recording` after the path."""
-        table = None if self.table is None else Table(**self.table.plain())
-        return self.units, self.rate, self.labels, table, None if self.bag is None else Bag(**self.bag.plain())
+        return self.units, self.rate, self.labels, self.table, self.bag
 
 
 class RecordingInspection(Settings):

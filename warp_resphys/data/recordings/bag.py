@@ -3,12 +3,15 @@
 Every topic has messages at its own times: those of its headers or, without headers, those at which it was recorded, on
 the clock of the headers. Markers and inputs are brought to common frames: markers by linear interpolation, rotations by
 the shortest turn, and inputs keep their last value.
+
+A source is a topic, with a member after # where a message has several: the child frame of a transform (``/tf#tip``), the
+number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a joint
+(``/joint_states#finger.effort``). Those of inputs have their unit in brackets (``/pressure#1 [mbar]``).
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ...io.errors import DataFileError, InputError, ResphysError, did_you_mean
+from ...settings.trials import BagSettings
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -23,27 +27,6 @@ _GAP = 2.5  # frames: a marker without messages for longer is not seen
 _SOURCE = re.compile(r"(?P<topic>[^#\s]+)(?:#(?P<member>\S+))?(?:\s*\[(?P<unit>[^\]]+)\])?")
 _CLOUD_TYPES = {7: "f4", 8: "f8"}  # of the fields of a PointCloud2
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-
-
-@dataclass(frozen=True)
-class Bag:
-    """Topics of a bag.
-
-    A source is a topic, with a member after # where a message has several: the child frame of a transform
-    (``/tf#tip``), the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a
-    joint (``/joint_states#finger.effort``).
-
-    Attributes:
-        markers: sources by the name of the marker; those with a rotation are rigid bodies.
-        inputs: sources of the channels of the actuation, with their unit in brackets (``/pressure#1 [mbar]``).
-        base: source of the pose of the base, or None.
-        rate: frames a second [Hz]; None for that of the first marker.
-    """
-
-    markers: Mapping[str, str]
-    inputs: Sequence[str] = ()
-    base: str | None = None
-    rate: float | None = None
 
 
 def is_bag(path: Path) -> bool:
@@ -57,7 +40,7 @@ def topics_of(path: Path) -> str:
         return ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in reader.connections)) or "no topic"
 
 
-def read_raw_bag(path: Path, bag: Bag) -> RawRecording:
+def read_raw_bag(path: Path, bag: BagSettings) -> RawRecording:
     """Reads the named topics of a bag.
 
     Args:

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from ...io.decoding import Arrays, DecodingError, decode
 from ...io.errors import DataFileError, InputError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
-from .bag import SUFFIXES, Bag, is_bag, read_raw_bag, topics_of
+from ...settings.trials import BagSettings, TableSettings
+from .bag import SUFFIXES, is_bag, read_raw_bag, topics_of
 from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording, to_recording
-from .text import Table, read_raw_text
+from .text import read_raw_text
 
 _KIND = "recording"
 _UNITS = {"positions": "units", "actuation": "actuation_units"}
@@ -27,8 +28,8 @@ def read_recording(
     units: str | None = None,
     rate: float | None = None,
     labels: Sequence[str] | None = None,
-    table: Table | None = None,
-    bag: Bag | None = None,
+    table: TableSettings | None = None,
+    bag: BagSettings | None = None,
 ) -> Recording:
     """Reads a recording in the format of its file name extension. docs/recordings.md describes the layouts.
 

@@ -9,7 +9,7 @@ import io
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import datetime
 from itertools import takewhile
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...io.errors import DataFileError, did_you_mean, listed
+from ...settings.trials import TableSettings
 from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
 
 log = logging.getLogger(__name__)
@@ -42,22 +43,7 @@ _LEAST_FRAMES = 2  # of a recording
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 
-@dataclass(frozen=True)
-class Table:
-    """Description of a table without a known header, such as a log of another program.
-
-    Attributes:
-        columns: the header in the known format, one cell for every column; None for a column that is not read.
-        header_lines: number of lines before the numbers, or with ``names`` before the header.
-        names: in place of ``columns``, cells in the known format by cells of the file's header; others are not read.
-    """
-
-    columns: Sequence[str | None] = ()
-    header_lines: int = 0
-    names: Mapping[str, str] = field(default_factory=dict)
-
-
-def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
+def read_raw_text(path: Path, table: TableSettings | None = None) -> RawRecording:
     """Reads a table, a Qualisys TSV, a Motive or a Vicon CSV, detected from its first line.
 
     Args:
@@ -101,7 +87,7 @@ def read_raw_text(path: Path, table: Table | None = None) -> RawRecording:
     return _read_table(rows, 1, dict(enumerate(columns)), _CHANNEL_UNITS, len(columns), path)
 
 
-def _read_described(rows: Rows, table: Table, path: Path) -> RawRecording:
+def _read_described(rows: Rows, table: TableSettings, path: Path) -> RawRecording:
     """Reads a table with described columns; a column in a length that is not of a marker is a channel."""
     first, width = table.header_lines, len(table.columns)
     header = rows[first] if len(rows) > first else []

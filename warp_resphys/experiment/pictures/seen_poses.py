@@ -24,7 +24,6 @@ from ...pictures.clouds import Cloud
 from ...pictures.motion import ReleasedForce
 from ...pictures.outlines import ClosedSurface, Outline
 from ...pictures.reading import (
-    Colours,
     Frame,
     SceneFile,
     check_times,
@@ -36,7 +35,7 @@ from ...pictures.reading import (
     read_tracked,
 )
 from ...pictures.seen import Photo, SeenPose
-from ...pictures.tags import Tag
+from ...pictures.tags import tag_poses
 from ...settings.body import MaterialSettings
 from ...settings.pictures import PictureData, PoseSettings
 from ...settings.stages import PictureStage
@@ -148,8 +147,8 @@ def import_pictures(context: StageContext) -> None:
                 )
             if pose.release is not None:
                 check_times(replace(scene, frames=tuple(frames)), pose.release.time)
-            chosen = pose.mask or data.mask
-            colours, shares, drawn = None if chosen is None else Colours(**dict(chosen)), list[float](), False
+            colours = pose.mask or data.mask
+            shares, drawn = list[float](), False
             for frame in frames:
                 with_depth, pictured = pose.depth and frame.depth is not None, frame.image != frame.depth
                 mask = None
@@ -211,8 +210,8 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> NDArray[
             raise DataFileError(f"{path}: {missing[0]} has no 'world_to_camera': give it, or the tag of data.tag.")
         poses = [[frame.pose] for frame in frames if frame.pose is not None]
     else:
-        tag, lenses = Tag(**dict(data.tag)), read_lenses(data)
-        poses = [[*tag.poses(read_picture(frame.image), lenses[frame.lens])] for frame in frames]
+        tag, lenses = data.tag, read_lenses(data)
+        poses = [tag_poses(tag, read_picture(frame.image), lenses[frame.lens]) for frame in frames]
         if hidden := [frame.image for frame, own in zip(frames, poses, strict=True) if not own]:
             raise DataFileError(
                 f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame "

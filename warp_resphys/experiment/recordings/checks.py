@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...data.actuation import draw_inputs
 from ...data.markers import follow_vertices
 from ...data.registration import axes_rotation
 from ...data.rigid_bodies import owners
@@ -16,7 +17,7 @@ from ...settings.trials import MarkerSettings, RecordedData, Trial
 from ..actuators import Drive, drive_of
 from ..build import build_material, marker_view_of, mounted_on
 from ..files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
-from ..laboratory import input_sequences
+from ..laboratory import largest_input
 from ..simulate import substeps_of
 from ..trials import all_trials, folds_of, split_of, trials_of
 from .reading import standing_enough
@@ -185,4 +186,5 @@ def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Tri
         substeps_of(run.time_step, laboratory, "laboratory")
         if drive is not None:
             random = np.random.default_rng(0)
-            input_sequences(played).draw(data.steps, run.time_step, len(drive.parts), random)
+            parts, sequences = len(drive.parts), laboratory.sequences
+            draw_inputs(sequences, largest_input(played), data.steps, run.time_step, parts, random)

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from ...data.marker_view import MarkerView
 from ...data.obstacle_motion import recorded
-from ...data.recordings.bag import Bag
 from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording
-from ...data.recordings.text import Table
 from ...data.registration import assign, axes_rotation
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ...io.errors import DataFileError, InputError, listed
@@ -157,9 +155,7 @@ class Reader:
             recording = read_recording(self._run_dir / trial.recording)
         else:
             assert trial.file is not None
-            table = None if data.table is None else Table(**data.table.plain())
-            bag = None if data.bag is None else Bag(**data.bag.plain())
-            recording = read_recording(trial.file, data.units, data.rate, trial.labels, table, bag)
+            recording = read_recording(trial.file, data.units, data.rate, trial.labels, data.table, data.bag)
         lengths = {name: body.length for name, body in self.markers.rigid_bodies.items() if trial.has(name)}
         recording = with_corners(recording, lengths)
         seconds = _HELD_SECONDS if trial.is_released else data.rest_seconds

@@ -4,8 +4,8 @@ Every topic has messages at its own times: those of its headers or, without head
 the clock of the headers. Markers and inputs are brought to common frames: markers by linear interpolation, rotations by
 the shortest turn, and inputs keep their last value.
 
-A source is a topic, with a member after # where a message has several: the child frame of a transform (``/tf#tip``), the
-number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a joint
+A source is a topic, with a member after # where a message has several: the child frame of a transform (``/tf#tip``),
+the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a joint
 (``/joint_states#finger.effort``). Those of inputs have their unit in brackets (``/pressure#1 [mbar]``).
 """
 

@@ -7,7 +7,6 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 from omegaconf import OmegaConf
 
-from warp_resphys.data.marker_view import FRAMES
 from warp_resphys.data.markers import KINDS
 from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
@@ -52,7 +51,6 @@ def test_choices_in_the_settings_are_those_in_the_code():
         (PhysicsSettings, "mass", MASS_MODES),
         (PhysicsSettings, "volume_integration", VOLUME_INTEGRATIONS),
         (MarkerSettings, "bind", KINDS),
-        (MarkerSettings, "frame", FRAMES),
         (NetworkSettings, "activation", ACTIVATIONS),
     ]
     for settings, key, words in pairs:

@@ -11,11 +11,12 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import box_hexahedra
 
 NOMINAL = np.array([[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.036], [0.004, 0.0, 0.063]])
+PLACES = torch.as_tensor(NOMINAL)
 VIEWS = {
-    "plane": MarkerView.of(NOMINAL, plane=["x", "z"]),
-    "own": MarkerView.of(NOMINAL, frame="own"),
-    "own plane": MarkerView.of(NOMINAL, ["x", "z"], "own"),
-    "own plane, turned": MarkerView.of(NOMINAL, ["z", "y"], "own"),
+    "plane": MarkerView(PLACES, "xz"),
+    "own": MarkerView(PLACES, own=True),
+    "own plane": MarkerView(PLACES, "xz", own=True),
+    "own plane, turned": MarkerView(PLACES, "zy", own=True),
 }
 
 
@@ -96,7 +97,7 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     mesh = box_hexahedra(divisions=(5, 2, 2))
     places = np.array([[0.01, 0.0, 0.033], [0.05, 0.002, 0.033], [0.09, 0.03, 0.033]])
     markers = bind_markers(mesh, places, ["a", "b", "c"], kind="frame")
-    seen = ViewedMarkers.of(markers, MarkerView.of(places, frame="own"))
+    seen = ViewedMarkers.of(markers, MarkerView(torch.as_tensor(places), own=True))
     at = torch.as_tensor(moved(mesh.vertices, 1.0, [0.0, 0.6, 0.8], 0.5))[None]
     np.testing.assert_allclose(seen(at)[0], places, atol=1e-12)
     bent = at.clone()
@@ -111,26 +112,25 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     single = seen.to(torch.zeros(1, dtype=torch.float32))(bent.float())
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single.numpy(), seen(bent).numpy(), atol=1e-6)
-    assert ViewedMarkers.of(markers, MarkerView.of(places)) is markers
+    assert ViewedMarkers.of(markers, MarkerView(torch.as_tensor(places))) is markers
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((NOMINAL, ["x", "x"]), r"markers\.plane"),
-        ((NOMINAL, ["x", "y", "z"]), "name two of the body's axes"),
-        ((NOMINAL, None, "free"), "markers.frame"),
-        ((NOMINAL * [0, 0, 1], None, "own"), "the 4 markers that are seen together lie on one line"),
-        ((NOMINAL[:1], ["x", "z"], "own"), "the 1 markers that are seen together are at one place"),
+        ((PLACES, "xx"), r"markers\.plane"),
+        ((PLACES, "xyz"), "name two of the body's axes"),
+        ((PLACES * torch.tensor([0, 0, 1]), None, True), "the 4 markers that are seen together lie on one line"),
+        ((PLACES[:1], "xz", True), "the 1 markers that are seen together are at one place"),
     ],
 )
 def test_degenerate_markers_are_refused(arguments, said):
     with pytest.raises(InputError, match=said):
-        MarkerView.of(*arguments)
+        MarkerView(*arguments)
 
 
 def test_sets_that_share_markers_are_refused():
     with pytest.raises(InputError, match="two trials have some markers in common, and not all"):
-        MarkerView.of(NOMINAL, frame="own", sets=((0, 1, 2), (1, 2, 3)))
+        MarkerView(PLACES, own=True, sets=((0, 1, 2), (1, 2, 3)))
     with pytest.raises(InputError, match="the 2 markers that are seen together lie on one line"):
-        MarkerView.of(NOMINAL, frame="own", sets=((0, 1), (2, 3)))
+        MarkerView(PLACES, own=True, sets=((0, 1), (2, 3)))

@@ -308,7 +308,8 @@ def test_limbs_that_swim_are_identified_by_their_shape(folder):
         row = dataset.names.index(name)
         pulled = dataset.inputs["tendon_contraction"][row, :, 0]
         np.testing.assert_allclose(pulled, commanded[1 : STEPS + 1], atol=1e-6)
-        shapes = MarkerView.of([*tracked[name].values()], ["x", "z"], "own").of_arrays(markers[: STEPS + 1])
+        nominal = torch.tensor([*tracked[name].values()], dtype=torch.float64)
+        shapes = MarkerView(nominal, "xz", own=True).of_arrays(markers[: STEPS + 1])
         columns = [dataset.labels.index(label) for label in tracked[name]]
         shapes[HIDDEN[name]] = np.nan
         np.testing.assert_allclose(dataset.observed[row][:, columns], shapes, atol=3e-4)

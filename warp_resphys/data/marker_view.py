@@ -19,7 +19,6 @@ from typing_extensions import override
 from ..io.errors import InputError
 from .markers import Markers, closest_rotation
 
-FRAMES = ("body", "own")
 _AXES = "xyz"
 _LINE = 1e-3  # m: markers closer to a line do not determine the rotation about it
 
@@ -40,27 +39,9 @@ class MarkerView:
     """
 
     nominal: torch.Tensor
-    plane: tuple[str, ...] | None = None
+    plane: Sequence[str] | None = None
     own: bool = False
     sets: tuple[tuple[int, ...], ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        nominal: ArrayLike,
-        plane: Sequence[str] | None = None,
-        frame: str = "body",
-        sets: tuple[tuple[int, ...], ...] = (),
-    ) -> "MarkerView":
-        """Returns the view of a configuration.
-
-        Raises:
-            InputError: see the class; or a ``frame`` that is none of `FRAMES`.
-        """
-        if frame not in FRAMES:
-            raise InputError(f"markers.frame is {frame!r}: choose {' or '.join(FRAMES)}.")
-        chosen = None if plane is None else tuple(map(str, plane))
-        return cls(torch.as_tensor(np.asarray(nominal, dtype=np.float64)), chosen, frame == "own", sets)
 
     def __post_init__(self) -> None:
         """Checks the plane and the frame."""

@@ -326,8 +326,8 @@ def marker_view_of(
         InputError: see `MarkerView`.
     """
     # Rigid bodies are seen in all coordinates, where nominal positions do not matter.
-    nominal = [settings.tracked.get(label, (0.0, 0.0, 0.0)) for label in labels]
-    return MarkerView.of(nominal, settings.plane, settings.frame, sets)
+    nominal = torch.tensor([settings.tracked.get(label, (0.0, 0.0, 0.0)) for label in labels], dtype=torch.float64)
+    return MarkerView(nominal, settings.plane, settings.frame == "own", sets)
 
 
 def build_simulator(

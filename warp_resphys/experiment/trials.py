@@ -1,10 +1,9 @@
 """Trials of an experiment: their names, how they begin, and their split into training, validation and test."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -27,29 +26,11 @@ OTHERS: Final = "others"
 _SUFFIXES = (".h5", ".hdf5", ".npz", ".c3d", ".tsv", ".csv")
 
 
-@dataclass(frozen=True)
-class Variation:
-    """The parameter that differs between the trials of a simulated experiment.
-
-    Attributes:
-        key: key under ``data``, with one list of values per split.
-        unit: unit of the configured values.
-        factor: conversion factor to SI units.
-    """
-
-    key: str
-    unit: str
-    factor: float
-
-    def name(self, value: float) -> str:
-        """Name of the trial with a configured value."""
-        return f"{value:g}{'' if self.unit == '°' else ' '}{self.unit}"
-
-
-VARIATIONS: Final = {
-    "release_from_load": Variation("weights_g", "g", 1e-3),
-    "release_from_twist": Variation("angles_deg", "°", np.pi / 180.0),
-    "moving_base": Variation("amplitudes", "times", 1.0),
+# Key with a list of values per split, unit of these and factor to SI units, of what differs between simulated trials.
+_VARIATIONS: Final = {
+    "release_from_load": ("weights_g", " g", 1e-3),
+    "release_from_twist": ("angles_deg", "°", np.pi / 180.0),
+    "moving_base": ("amplitudes", " times", 1.0),
 }
 
 
@@ -58,41 +39,34 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
 
     Raises:
         DataFileError: the folder of recordings does not exist or has no recordings.
+        InputError: a trial has no file.
     """
-    data = run.trial_data
+    data, trials = run.trial_data, dict[str, Trial]()
     if not isinstance(data, RecordedData):
-        variation = VARIATIONS[data.kind]
-        values = (*data.amounts.train, *data.amounts.validation, *data.amounts.test)
-        amounts = {variation.name(value): variation.factor * value for value in values}
-        trials = {name: Trial(name=name, begins="given", amount=amount) for name, amount in amounts.items()}
+        _, unit, factor = _VARIATIONS[data.kind]
+        for value in (*data.amounts.train, *data.amounts.validation, *data.amounts.test):
+            name = f"{value:g}{unit}"
+            trials[name] = Trial(name=name, begins="given", amount=factor * value)
         others = data.others.items() if isinstance(data, ReleaseFromLoad) else ()
         return trials | {name: Trial(name=name, begins="given", load=held) for name, held in others}
+
+    def trial(name: str, own: TrialSettings, **given: Any) -> Trial:
+        return Trial(**{**dict(own), "name": name, "begins": own.begins or data.begins, "file": None, **given})
+
     if data.folder is not None:
         folder = Path(data.folder).expanduser()
-        entries = data.trials or _recordings(folder)
-        return {
-            name: _trial(name, entry, data.begins, file=_in_folder(folder, name, entry))
-            for name, entry in entries.items()
-        }
+        for name, own in (data.trials or _recordings(folder)).items():
+            if own.file is None:
+                raise InputError(f"data.trials.{name}.file is missing: give the name of a file in data.folder.")
+            trials[name] = trial(name, own, file=str(folder / own.file))
+        return trials
     assert run.laboratory is not None
     drawn = {f"t{number:03d}": number for number in range(data.sequences)}
     trials = {name: Trial(name=name, begins=data.begins, sequence=number) for name, number in drawn.items()}
     for name, own in run.laboratory.trials.items():
         new = len(trials) if data.sequences else None
-        sequence = trials[name].sequence if name in trials else new
-        trials[name] = _trial(name, own, data.begins, sequence=sequence)
+        trials[name] = trial(name, own, sequence=trials[name].sequence if name in trials else new)
     return trials
-
-
-def _trial(name: str, own: TrialSettings, begins: str, file: str | None = None, sequence: int | None = None) -> Trial:
-    """A trial from its entry in the configuration."""
-    return Trial(**{**dict(own), "name": name, "begins": own.begins or begins, "file": file, "sequence": sequence})
-
-
-def _in_folder(folder: Path, name: str, own: TrialSettings) -> str:
-    if own.file is None:
-        raise InputError(f"data.trials.{name}.file is missing: give the name of a file in data.folder.")
-    return str(folder / own.file)
 
 
 def _recordings(folder: Path) -> dict[str, TrialSettings]:
@@ -100,11 +74,8 @@ def _recordings(folder: Path) -> dict[str, TrialSettings]:
     if not folder.is_dir():
         raise DataFileError(f"{folder} is not a folder: set data.folder to your recordings.")
     files: dict[str, str] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in _SUFFIXES:
-            continue
-        other = files.setdefault(path.stem, path.name)
-        if other != path.name:
+    for path in sorted(own for own in folder.iterdir() if own.suffix.lower() in _SUFFIXES):
+        if (other := files.setdefault(path.stem, path.name)) != path.name:
             raise DataFileError(
                 f"{folder} has two recordings of one name, {other} and {path.name}: list the trials in data.trials."
             )
@@ -136,19 +107,16 @@ def split_of(run: RunSettings) -> Split:
 
 def _valued(data: SimulatedData) -> dict[str, list[str]]:
     """Names of the trials in each split of a simulated experiment, from the configured values."""
-    kind = VARIATIONS[data.kind]
-    values = {name: getattr(data.amounts, name) for name in SPLITS}
-    for name, row in values.items():
-        if not row:
-            raise InputError(f"data.{kind.key}.{name} is empty: give the split at least one value, in {kind.unit}.")
-    everything = [x for row in values.values() for x in row]
-    twice = sorted({x for x in everything if everything.count(x) > 1})
-    if twice:
-        raise InputError(f"data.{kind.key} names {twice[0]:g} {kind.unit} twice: a trial belongs to one split only.")
-    named = {name: [kind.name(x) for x in row] for name, row in values.items()}
+    key, unit, _ = _VARIATIONS[data.kind]
+    named = {name: [f"{value:g}{unit}" for value in getattr(data.amounts, name)] for name in SPLITS}
+    if empty := [name for name, row in named.items() if not row]:
+        raise InputError(f"data.{key}.{empty[0]} is empty: give the split at least one value, in {unit.strip()}.")
+    names = [name for row in named.values() for name in row]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"data.{key} names {twice[0]} twice: a trial belongs to one split only.")
     if isinstance(data, ReleaseFromLoad):
-        if double := [name for name in data.others if any(name in row for row in named.values())]:
-            raise InputError(f"data.others names '{double[0]}', which is a trial of data.{kind.key}: rename it.")
+        if double := [name for name in data.others if name in names]:
+            raise InputError(f"data.others names '{double[0]}', which is a trial of data.{key}: rename it.")
         named["test"] += data.others
     return named
 

@@ -283,7 +283,7 @@ def vertical(up: str | Sequence[float] | None) -> FloatArray | None:
 def central_places(positions: FloatArray, centre: Callable[..., Any]) -> FloatArray:
     """(M, 3) mean or median of positions (T, M, 3) of each marker [m], NaN for a marker that is never seen."""
     places = np.full(positions.shape[1:], np.nan)
-    for column, frames in enumerate(np.isfinite(positions).all(-1).T):
+    for column, frames in enumerate(np.asarray(np.isfinite(positions).all(-1)).T):
         if frames.any():
             places[column] = centre(positions[frames, column], axis=0)
     return places

@@ -15,7 +15,7 @@ from warp_resphys.control.reduced_force import Evaluator
 from warp_resphys.control.reference import Path
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import build_model
-from warp_resphys.learning.predictors import Range
+from warp_resphys.learning.rollout import Range
 from warp_resphys.settings.learning import NetworkSettings
 
 SHAPES = ["circle", "eight", *"AQRX"]  # lines, a letter of several strokes, and round ones

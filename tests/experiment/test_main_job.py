@@ -44,8 +44,8 @@ from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.stages import fingerprint, package_versions
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.networks import ResidualForce
-from warp_resphys.learning.predictors import LearnedPredictor
 from warp_resphys.learning.reconstruction import LBFGSB
+from warp_resphys.learning.rollout import LearnedPredictor
 from warp_resphys.learning.training import EpochTrainer
 
 LEARNED_FILES = (("", "safetensors"), ("training_", "json"))

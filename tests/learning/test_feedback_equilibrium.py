@@ -5,7 +5,7 @@ import torch
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, select_vertices
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.learning.feedback_equilibrium import equilibrium_under_feedback
+from warp_resphys.learning.rollout import equilibrium_under_feedback
 from warp_resphys.mesh.mesh import box_hexahedra
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))

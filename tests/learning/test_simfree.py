@@ -6,8 +6,7 @@ import torch
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.learning.networks import build_next_state
-from warp_resphys.learning.predictors import LearnedPredictor
-from warp_resphys.learning.rollout import DIVERGENCE_DISTANCE, Rollout, closed_loop
+from warp_resphys.learning.rollout import DIVERGENCE_DISTANCE, LearnedPredictor, Rollout, closed_loop
 from warp_resphys.settings.learning import NetworkSettings
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))

@@ -15,7 +15,7 @@ from torch import nn
 
 from ..data.input_response import with_means
 from ..learning.networks import SkipMLP, StateMap
-from ..learning.predictors import Range
+from ..learning.rollout import Range
 from .polynomials import Monomials, Polynomial
 from .world import FloatArray
 

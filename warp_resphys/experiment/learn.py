@@ -15,8 +15,8 @@ from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
-from ..learning.predictors import Range
 from ..learning.replay import Replay, Windows
+from ..learning.rollout import Range
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
 from ..settings.stages import NetworkStage, TrainStage

@@ -16,9 +16,8 @@ from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
-from ..learning.predictors import LearnedPredictor, Range
 from ..learning.replay import Start
-from ..learning.rollout import Rollout
+from ..learning.rollout import LearnedPredictor, Range, Rollout
 from ..settings.stages import TestStage
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment

@@ -24,8 +24,8 @@ from ..dynamics.frames import BaseFrame, VertexFrames
 from ..io.errors import ConvergenceError
 from ..settings.learning import InTheLoopSettings
 from .networks import OwnNetwork, ResidualForce
-from .predictors import LearnedPredictor
 from .replay import Replay, Start, Windows
+from .rollout import LearnedPredictor
 from .training import EpochTrainer
 
 _EVALUATIONS = 12  # of the loss, at most, in one epoch

@@ -29,10 +29,9 @@ from .identification import Identification, ParameterSearch
 from .misfit import Misfit
 from .networks import ResidualForce, build_model
 from .parameters import Bounds, configured_parameters
-from .predictors import LearnedPredictor
 from .reconstruction import follow, make_reconstructor, without_ringing
 from .replay import Replay, Start
-from .rollout import Predictor, Rollout, closed_loop
+from .rollout import LearnedPredictor, Predictor, Rollout, closed_loop
 from .training import Samples, Trainer
 
 

@@ -21,8 +21,8 @@ from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .feedback_equilibrium import equilibrium_under_feedback
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
+from .rollout import equilibrium_under_feedback
 
 log = logging.getLogger(__name__)
 

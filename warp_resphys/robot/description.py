@@ -24,7 +24,7 @@ from ..io.stages import finished_record, planned_settings
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
-from ..learning.predictors import Range
+from ..learning.rollout import Range
 from ..mesh.mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings

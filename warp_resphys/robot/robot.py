@@ -16,12 +16,10 @@ from ..energies.materials import MASS_DAMPING
 from ..experiment.experiment import COROTATED
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError, number_of
-from ..learning.feedback_equilibrium import equilibrium_under_feedback
 from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
-from ..learning.predictors import LearnedPredictor
-from ..learning.rollout import DIVERGENCE_DISTANCE, Rollout
+from ..learning.rollout import DIVERGENCE_DISTANCE, LearnedPredictor, Rollout, equilibrium_under_feedback
 from ..mesh.mesh import Mesh
 from ..stepping.inputs import Inputs
 from ..stepping.state import State

@@ -108,7 +108,7 @@ def search_from_markers(errors, guess=None, lost=()):
     search._refine = refine
     law = SimpleNamespace(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
     search.settings = SimpleNamespace(law=law)
-    search.trials = SimpleNamespace(guess={"c10": 50e3, "bulk_1": 60e3, **(guess or {})}, shear=SHEAR)
+    search.guess, search.shear = {"c10": 50e3, "bulk_1": 60e3, **(guess or {})}, SHEAR
     vertices = np.array([[0.0, 0.0, 0.0], [0.01, 0.2, 0.01]])
     search.experiment = SimpleNamespace(body=SimpleNamespace(mesh=SimpleNamespace(vertices=vertices)))
     return [own.law.groups for own in search._from_markers()], began

@@ -31,7 +31,7 @@ from ..settings.stages import IdentifyLawStage
 from .experiment import LAW, Experiment
 from .files import LAW_FILE
 from .identify import Checkpoint, Found, IsLast, refined_searches, search_parameters
-from .law_trials import LawTrials, Score, branches_of, is_refined, stretches_of, strong_names
+from .law_trials import LawTrials, Score, branches_of, is_refined, strong_names
 from .trials import evenly
 
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
@@ -69,38 +69,37 @@ class _Refined:
     score: Score  # on the validation trials
 
 
-class _LawSearch:
+class _LawSearch(LawTrials):
     """Search for a law in an experiment."""
 
     def __init__(self, context: StageContext, experiment: Experiment) -> None:
-        self.context, self.experiment, self.trials = context, experiment, LawTrials(experiment)
-        self.kept = Checkpoint(context)
-        self.settings: IdentifyLawStage = context.settings
+        super().__init__(experiment)
+        self.context, self.kept = context, Checkpoint(context)
         self.released = any(experiment.begins(name) == "released" for name in self.settings.split.train)
 
     def _names(self, whole: bool) -> tuple[str, ...]:
         """Names of the trials of a search."""
-        own, most = self.settings.split.train if whole else self.trials.learned, self.settings.law.trials
+        own, most = self.settings.split.train if whole else self.learned, self.settings.law.trials
         return own if most is None else tuple(evenly(own, most))
 
     def run(self) -> dict[str, Any]:
         """Identifies a law; returns the content of law.json."""
-        if self.trials.states:
+        if self.states:
             fitted = self.kept.once("classes", lambda: [asdict(own) for own in self._from_states()])
             classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in fitted]
-            scores = [score.error for score in self.trials.scores([law.constants for law in classes])]
+            scores = [score.error for score in self.scores([law.constants for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
             refined = self._from_markers()
             classes, scores = [own.law for own in refined], [own.score.error for own in refined]
             best = refined[-1]
-        if self.trials.holds_out:
+        if self.holds_out:
             again = self._refine(best.law, whole=True)
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
-        mass = {name: best.others.get(name, value) for name, value in self.trials.mass.items()}
+        mass = {name: best.others.get(name, value) for name, value in self.mass.items()}
         constants = mass | best.law.constants
-        below, deviation = self.trials.score_below(), _deviation(best.found)
+        below, deviation = self.score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
             "format": LAW_FORMAT,
@@ -113,9 +112,9 @@ class _LawSearch:
             "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
             "at_bounds": [name for name, old in best.names.items() if old in best.found["at_bounds"]],
             "loss": best.found["loss"],
-            "validation": self.trials.validation(best.score, below),
+            "validation": self.validation(best.score, below),
             "classes": tried,
-            "stretches": self._stretches(best),
+            "stretches": self.stretches(best.law.constants, best.others, self._names(whole=True)),
             "data": {"name": self.settings.name, "trials": list(self._names(whole=True))},
             "versions": package_versions(),
         }
@@ -123,14 +122,14 @@ class _LawSearch:
     def given(self, file: str) -> dict[str, Any]:
         """Identifies the parameters beside a law of another run; returns the content of law.json."""
         content = read_law(file)
-        content["constants"] |= self.trials.mass  # density and damping by mass are those of this body
-        simulator = self.trials.simulator(content["constants"], content["model"])
+        content["constants"] |= self.mass  # density and damping by mass are those of this body
+        simulator = self.simulator(content["constants"], content["model"])
         others, found = dict[str, float](), Found()
-        if bounds := self.trials.bounds_of_others(simulator):
+        if bounds := self.bounds_of_others(simulator):
             found = self._search("given", simulator, bounds, {})
             others = found["parameters"]
         values = {name: simulator.tensor([value]) for name, value in others.items()}
-        score = self.trials.errors(simulator, values, 1)[0]
+        score = self.errors(simulator, values, 1)[0]
         return {
             **content,
             "accepted": True,
@@ -139,7 +138,7 @@ class _LawSearch:
             "parameters": others,
             "deviation": content.get("deviation", {}) | _deviation(found),
             "at_bounds": [*content.get("at_bounds", ()), *found.get("at_bounds", ())],
-            "validation": self.trials.validation(score, self.trials.score_below()),
+            "validation": self.validation(score, self.score_below()),
         }
 
     def _enlarged(self, best: "_Refined", classes: Sequence[LawClass]) -> "_Refined":
@@ -152,19 +151,13 @@ class _LawSearch:
                     best, residual = larger, law.residual
         return best
 
-    def _stretches(self, best: "_Refined") -> list[float]:
-        """Returns the least and the largest principal stretch in the training trials."""
-        simulator = self.trials.simulator(best.law.constants)
-        values = {name: simulator.tensor([value]) for name, value in best.others.items()}
-        return stretches_of(self.experiment, self.trials.replays(simulator, self._names(whole=True)), values)
-
     def _from_states(self) -> list[LawClass]:
         """Returns the classes of the weak form."""
         wanted, forms = self.settings.law, []
         times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
         zero = dict.fromkeys((*wanted.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
         zero |= branches_of([0.0], [0.1]) | _family(0.0)
-        simulator, guess = self.trials.simulator(zero), self.trials.guess
+        simulator, guess = self.simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         for names in (self.settings.split.train, self.settings.split.validation):
             motions = [self._motion(simulator, own) for own in self.experiment.batches(names)] if names else []
@@ -175,7 +168,7 @@ class _LawSearch:
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         trials = self.experiment.trials(names, simulator)
         start = self.experiment.start(Replay(simulator, self.experiment.observe, trials))
-        _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self.trials.others(simulator))
+        _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self.others(simulator))
         return KnownMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
 
     def _from_markers(self) -> list["_Refined"]:
@@ -184,7 +177,7 @@ class _LawSearch:
         The search begins with all groups of terms, and takes away those without which validation trials are as close:
         a class that lacks a group makes up for it with others, from where the group no longer helps.
         """
-        guess, wanted = dict(self.trials.guess), self.settings.law
+        guess, wanted = dict(self.guess), self.settings.law
         own = {name: value for name, value in guess.items() if name.startswith("prony")}
         known = [value for name, value in own.items() if name.startswith("prony_time")]
         shortest, longest = wanted.relaxation_times
@@ -192,11 +185,11 @@ class _LawSearch:
         times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
         groups = {
             "elastic": dict.fromkeys(wanted.terms, 0.0),
-            "branches": branches_of([0.1 * self.trials.shear] * len(times), times, len(known) + 1),
-            "fibres": _family(0.3 * self.trials.shear, self._longest_side()) if wanted.families else {},
+            "branches": branches_of([0.1 * self.shear] * len(times), times, len(known) + 1),
+            "fibres": _family(0.3 * self.shear, self._longest_side()) if wanted.families else {},
         }
         groups = {name: added for name, added in groups.items() if added}
-        guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.trials.shear)
+        guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.shear)
         whole = {name: value for added in groups.values() for name, value in added.items()}
         best = self._refine(LawClass(tuple(groups), guess | whole, math.nan))
         tried = [best]
@@ -229,22 +222,22 @@ class _LawSearch:
         """
         guess = dict(law.constants)
         guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
-        simulator = self.trials.simulator(guess)
-        others = self.trials.bounds_of_others(simulator)
-        bounds = {name: self.trials.bounds(name, value) for name, value in guess.items() if is_refined(name)} | others
+        simulator = self.simulator(guess)
+        others = self.bounds_of_others(simulator)
+        bounds = {name: self.bounds(name, value) for name, value in guess.items() if is_refined(name)} | others
         key = " ".join([*law.groups, *(["whole"] if whole else [])])
 
         def searched(number: int, before: Found | None, is_last: IsLast) -> Found:
             first = {} if before is None else before["parameters"]
             own = guess | {name: value for name, value in first.items() if name in guess}
-            return self._search(f"{key} {number}", self.trials.simulator(own), bounds, first | own, is_last)
+            return self._search(f"{key} {number}", self.simulator(own), bounds, first | own, is_last)
 
         found = refined_searches(searched, self.released)[-1]  # A release is estimated with a law.
         after = found["parameters"]
         refined = {name: after.get(name, value) for name, value in guess.items()}
-        names = strong_names(refined, self.trials.shear)
+        names = strong_names(refined, self.shear)
         kept, beside = {n: refined[old] for n, old in names.items()}, {n: after[n] for n in others}
-        score = self.trials.scores([kept], beside)[0]
+        score = self.scores([kept], beside)[0]
         return _Refined(replace(law, constants=kept), beside, {**names, **{n: n for n in others}}, found, score)
 
     def _search(
@@ -266,16 +259,16 @@ class _LawSearch:
         """
         wanted, whole, given = self.settings.law, "whole" in key, key == "given"
         limits = (
-            self.trials.seconds,
+            self.seconds,
             None if whole else wanted.seconds,
-            None if whole or given else self.trials.early,
+            None if whole or given else self.early,
         )
 
         def work() -> Found:
             seconds = min((limit for limit in limits if limit is not None), default=None)
-            replays = self.trials.replays(simulator, self._names(whole or given))
+            replays = self.replays(simulator, self._names(whole or given))
             misfit = Misfit(replays, bounds, seconds, shares=independent(self.experiment.dataset.labels))
-            first = {name: {**self.trials.sysid, **guess}[name] for name in bounds}
+            first = {name: {**self.sysid, **guess}[name] for name in bounds}
             with Progress(self.context.name, wanted.max_evaluations, "evaluations at most") as progress:
                 return search_parameters(ParameterSearch(misfit), first, wanted, progress, is_last)
 

@@ -182,6 +182,29 @@ class LawTrials:
         shared = {name: simulator.tensor([value]) for name, value in self.sysid.items()}  # as laws have them
         return self.errors(simulator, shared, 1)[0]
 
+    def stretches(
+        self, constants: Mapping[str, float], others: Mapping[str, float], names: Sequence[str]
+    ) -> list[float]:
+        """Returns the least and the largest principal stretch in trials, simulated where markers are seen.
+
+        Args:
+            constants: of a law.
+            others: values of the other identified parameters.
+            names: names of the trials.
+        """
+        dataset, mesh, simulator = self.experiment.dataset, self.experiment.body.mesh, self.simulator(constants)
+        if dataset.bound is None:
+            bodies = [dataset.observed[dataset.rows(names)]]
+        else:
+            values = {name: simulator.tensor([value]) for name, value in others.items()}
+            with torch.no_grad():
+                bodies = [
+                    Replay(simulator, WHOLE_STATE, replay.trials)(replace(start, shift=None), values).cpu().numpy()
+                    for replay, start in self.replays(simulator, names)
+                ]
+        parts = [principal_stretches(mesh, own.reshape(-1, *mesh.vertices.shape)) for own in bodies]
+        return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
+
     def validation(self, law: Score, below: Score) -> dict[str, Any]:
         """Returns the errors of a law and of the simulator below it on the trials that laws are tested on."""
         split = "training" if self.holds_out else "validation"
@@ -242,28 +265,6 @@ class LawTrials:
             return None
         share = self.guess["c10"] / self.sysid["youngs_modulus"]
         return Prior(share * wanted.prior.mean, share * wanted.prior.deviation)
-
-
-def stretches_of(
-    experiment: Experiment, replays: Replays, values: Mapping[str, torch.Tensor] | None = None
-) -> list[float]:
-    """Returns the least and the largest principal stretch in trials, simulated where markers are seen.
-
-    Args:
-        experiment: the experiment.
-        replays: of the trials, with a law's simulator.
-        values: (1,) values of other parameters.
-    """
-    dataset, mesh, parts = experiment.dataset, experiment.body.mesh, []
-    with torch.no_grad():
-        for replay, start in replays:
-            if dataset.bound is None:
-                bodies = dataset.observed[dataset.rows(replay.trials.names)].reshape(-1, *mesh.vertices.shape)
-            else:
-                whole = Replay(replay.simulator, WHOLE_STATE, replay.trials)
-                bodies = whole(replace(start, shift=None), values).flatten(0, 2).cpu().numpy()
-            parts.append(principal_stretches(mesh, bodies))
-    return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
 
 
 def is_shape(name: str) -> bool:

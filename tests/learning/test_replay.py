@@ -204,17 +204,6 @@ def test_a_held_body_has_its_markers_where_they_were_and_is_at_rest():
     assert bool(bent.isfinite().all())
 
 
-def test_without_hold_modes_a_body_rests_under_gravity_and_its_weight():
-    sim = simulator()
-    replay = Replay(sim, MARKERS, blank())
-    q = hold(replay, 0)
-    for r, mass in enumerate(MASSES):
-        alone = simulator(masses=(mass,)).static_equilibrium()
-        torch.testing.assert_close(q[r], alone.q[0], rtol=0.0, atol=1e-7)
-    still = replay(Start(State(q, torch.zeros_like(q)), torch.zeros(2, dtype=torch.float64)))[0]
-    assert float((still - still[:, :1]).abs().max()) < 1e-7
-
-
 def test_the_delay_of_a_release_is_recovered_in_any_basis(monkeypatch):
     """The beam is square: any rotation of its first two vibrations is as good a basis."""
     angle = 0.6

@@ -116,10 +116,6 @@ def hold(replay: Replay, modes: int, parameters: Parameters | None = None) -> to
     Raises:
         ConvergenceError: no equilibrium was found.
     """
-    if modes == 0:
-        with torch.no_grad():
-            constants, _, resting = replay.prepare(parameters)
-            return replay.simulator.static_equilibrium(resting, constants, batch=len(replay.trials.names)).q
     problem = _HoldProblem(replay, modes, parameters)
     return minimise(problem, problem.straight, _HOLD_TOLERANCE, _HOLD_ITERATIONS).point.kept[0]
 

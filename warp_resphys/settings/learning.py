@@ -273,7 +273,7 @@ class ActuationSettings(Settings):
 class ReleaseSettings(Settings):
     """Estimation of the start of a motion: the state at a release, from the held markers, or the delay of inputs."""
 
-    hold_modes: Count = setting(6, "vibration modes that hold it; 0: equilibrium under gravity and payload")
+    hold_modes: Natural = setting(6, "vibration modes that hold it")
     window: Positive = setting(
         0.13, "duration after the release for estimating delay and sideways displacement: about a period", "s"
     )

@@ -1,10 +1,22 @@
-"""The file of a dataset."""
+"""The file of a dataset; what drives its trials at their frames, and since when that has not changed."""
 
 import numpy as np
 import pytest
 
-from warp_resphys.experiment.files import Dataset, read_dataset
+from warp_resphys.experiment.files import Dataset, driving, read_dataset, since_change
 from warp_resphys.io.files import read_hdf5
+
+TIMES = 0.1 * np.arange(6)
+
+
+def dataset(begins, names="abc", resting=None, **inputs):
+    """Trials of one marker at rest at six frames, of two steps each."""
+    rows = len(begins)
+    times, observed = np.broadcast_to(TIMES, (rows, 6)), np.zeros((rows, 6, 1, 3))
+    channels = {name: ("left", "right")[: values.shape[2]] for name, values in inputs.items()}
+    fields = {"inputs": inputs, "channels": channels, "resting": resting or {}}
+    about = (times, observed, observed[:, 0], np.zeros(rows), np.zeros(3), 0.05)
+    return Dataset(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), **fields)
 
 
 @pytest.mark.parametrize(
@@ -18,29 +30,40 @@ from warp_resphys.io.files import read_hdf5
     ],
 )
 def test_inputs_have_the_unit_of_their_quantity(tmp_path, name, unit):
-    observed, values = np.zeros((1, 3, 2, 3)), np.arange(4.0).reshape(1, 2, 2)
-    words = ("a",), ("tip", "middle"), ("rest",)
-    arrays = np.zeros((1, 3)), observed, observed[:, 0], np.zeros(1), np.zeros(3)
-    dataset = Dataset(*words, *arrays, time_step=0.01, inputs={name: values}, channels={name: ("left", "right")})
-    dataset.write(tmp_path / "dataset.h5")
+    values = np.arange(24.0).reshape(1, 12, 2)
+    own = dataset(("rest",), **{name: values})
+    own.write(tmp_path / "dataset.h5")
     with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
         assert file[name].attrs["units"] == unit
     again = read_dataset(tmp_path / "dataset.h5")
-    assert again.channels == dataset.channels
+    assert again.channels == own.channels
     np.testing.assert_array_equal(again.inputs[name], values)
 
 
 def test_inputs_before_the_trials_are_kept_and_joined_with_trials_at_rest(tmp_path):
-    observed, values = np.zeros((1, 3, 2, 3)), np.arange(4.0).reshape(1, 2, 2)
-
-    def dataset(name, begins, resting):
-        arrays = np.zeros((1, 3)), observed, observed[:, 0], np.zeros(1), np.zeros(3)
-        fields = {"inputs": {"pressure": values}, "channels": {"pressure": ("left", "right")}, "resting": resting}
-        return Dataset((name,), ("tip", "middle"), (begins,), *arrays, time_step=0.01, **fields)
-
-    driven, rest = dataset("a", "driven", {"pressure": np.array([[3.0, 5.0]])}), dataset("b", "rest", {})
+    values = np.arange(24.0).reshape(1, 12, 2)
+    driven = dataset(("driven",), resting={"pressure": np.array([[3.0, 5.0]])}, pressure=values)
+    rest = dataset(("rest",), "b", pressure=values)
     driven.write(tmp_path / "dataset.h5")
     np.testing.assert_array_equal(read_dataset(tmp_path / "dataset.h5").resting["pressure"], [[3.0, 5.0]])
     np.testing.assert_array_equal(driven.joined(rest).resting["pressure"], [[3.0, 5.0], [0.0, 0.0]])
     np.testing.assert_array_equal(rest.joined(driven).resting["pressure"], [[0.0, 0.0], [3.0, 5.0]])
     assert rest.joined(rest).resting == {}
+
+
+def test_inputs_are_those_of_the_step_that_begins_with_a_frame():
+    steps = np.arange(12.0)[None, :, None] * np.array([1.0, 2.0])[:, None, None]
+    acting = driving(dataset(("rest", "static"), pressure=steps), ["b", "a"])["pressure"]
+    np.testing.assert_array_equal(acting[1, :, 0], [0.0, 2.0, 4.0, 6.0, 8.0, 10.0])
+    np.testing.assert_array_equal(acting[0, :, 0], 22.0)  # A pose has the last input.
+
+
+def test_the_time_since_a_change_counts_all_inputs_of_a_trial():
+    valve = np.zeros((3, 12, 1))
+    valve[0, 4:] = 1.0
+    other = np.zeros((3, 12, 2))
+    other[0, 8:, 1] = 5.0
+    since = since_change(dataset(("rest", "released", "static"), pressure=valve, tension=other), ["a", "b", "c"])
+    np.testing.assert_allclose(since[0], [0.0, 0.1, 0.0, 0.1, 0.0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(since[1], TIMES)  # Since its release.
+    assert np.isinf(since[2]).all()

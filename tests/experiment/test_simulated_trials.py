@@ -1,20 +1,22 @@
-"""The simulation that plays the real body: its settings, its own mesh, steps and actuators, and what is refused."""
+"""The simulation that plays the real body: its own mesh, steps and actuators, and the trials that a budget picks."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from support.configured import check, composed, settings
 from warp_resphys import Body, Simulator, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.data.base_motion import rigid
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.muscles import Muscle, Muscles
-from warp_resphys.experiment.ablation import MOTION, generate_motion, read_motion
+from warp_resphys.experiment.ablation import generate_motion, read_motion
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET, read_dataset
 from warp_resphys.experiment.simulate import simulate, vertices_in
+from warp_resphys.experiment.trials import split_of, trials_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext
@@ -93,7 +95,7 @@ def by_hand(weight, steps):
     return mesh, moved.q[:, 0].numpy(), moved.v[:, 0].numpy()
 
 
-def test_the_dataset_is_the_motion_of_the_target_at_the_simulators_vertices_and_steps(tmp_path):
+def test_the_data_are_the_motion_of_the_target_at_the_simulators_vertices_and_steps(tmp_path):
     weights = "data.weights_g={train:[100],validation:[150],test:[200]}"
     dataset, run = simulated(tmp_path, *COARSE, *OWN, weights)
     mesh, q, v = by_hand(0.2, 6)
@@ -103,6 +105,12 @@ def test_the_dataset_is_the_motion_of_the_target_at_the_simulators_vertices_and_
     np.testing.assert_allclose(dataset.velocity[2], v[::2, at], atol=1e-5)
     assert np.abs(np.diff(dataset.observed[2], axis=0)).max(axis=(1, 2)).min() > 1e-3
     assert (dataset.time_step, dataset.times[2, -1]) == (0.01, pytest.approx(0.03))
+    run = settings("experiment=marker_ablation", *COARSE, *OWN, "data.weights_g.observed=[200]", "ablation.counts=[4]")
+    own = AblationStage.of(run, files={}, counts=(), draws=1, modes=None)
+    generate_motion(StageContext("generate", tmp_path, "fingerprint", own))
+    seen, uncorrected = read_motion(tmp_path)
+    np.testing.assert_allclose(seen, q[::2, at], atol=1e-8)
+    np.testing.assert_allclose(uncorrected[0], seen[0], atol=1e-15)
 
 
 def test_the_base_moves_in_the_steps_of_the_target(tmp_path):
@@ -118,21 +126,6 @@ def test_the_base_moves_in_the_steps_of_the_target(tmp_path):
     assert np.abs(dataset.base[2, 1:]).max() > 1e-3
 
 
-def test_the_marker_ablation_follows_its_target(tmp_path):
-    run = settings("experiment=marker_ablation", *COARSE, *OWN, "data.weights_g.observed=[200]", "ablation.counts=[4]")
-    generate_motion(
-        StageContext(
-            "generate", tmp_path, "fingerprint", AblationStage.of(run, files={}, counts=(), draws=1, modes=None)
-        )
-    )
-    assert (tmp_path / MOTION).is_file()
-    seen, uncorrected = read_motion(tmp_path)
-    mesh, q, _ = by_hand(0.2, 6)
-    at = [int(np.argmin(np.linalg.norm(mesh.vertices - x, axis=1))) for x in build_body(run).mesh.vertices]
-    np.testing.assert_allclose(seen, q[::2, at], atol=1e-8)
-    np.testing.assert_allclose(uncorrected[0], seen[0], atol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("key", "value"), [("time_step", -1.0), ("mesh", {"kind": "rod"}), ("muscles", {"bundle": {}})]
 )
@@ -141,3 +134,56 @@ def test_a_wrong_value_of_the_simulator_is_not_blamed_on_its_target(key, value):
     plain["target"] = plain["target"]["material"]
     with pytest.raises(InputError, match=f"^(unknown key ')?{key}"):
         parse(RunSettings, {**plain, key: value})
+
+
+ANGLES = {"train": (40, 80, 120, 160), "validation": (100,), "test": (60, 140)}  # degrees
+TWISTED = [
+    "experiment=beam_twist",
+    "mesh.divisions=[4,2,2]",
+    "data.steps=12",
+    *(f"data.angles_deg.{split}={list(angles)}".replace(" ", "") for split, angles in ANGLES.items()),
+]
+
+
+def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured_angles(tmp_path):
+    rest = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2)).vertices
+    dataset, _ = simulated(tmp_path, *TWISTED)
+    q = dataset.observed
+    angles = [angle for split in ANGLES.values() for angle in split]
+    assert list(dataset.names) == [f"{angle}°" for angle in angles]
+    assert not dataset.velocity[:, 0].any()
+    centre = np.array([0.0, 0.015, 0.015])
+    for angle, start in zip(angles, q[:, 0], strict=True):
+        for x in np.unique(rest[:, 0]):
+            section = rest[:, 0] == x
+            turn = Rotation.from_rotvec([angle * x / 0.1, 0.0, 0.0], degrees=True)  # right-handed about x
+            np.testing.assert_allclose(start[section], centre + turn.apply(rest[section] - centre), atol=1e-15)
+    clamp = rest[:, 0] == 0.0
+    np.testing.assert_array_equal(q[:, :, clamp], np.broadcast_to(rest[clamp], q[:, :, clamp].shape))
+    assert np.abs(q[:, -1] - q[:, 0]).max((1, 2)).min() > 1e-3  # every beam swings back
+
+
+@pytest.mark.parametrize(
+    ("experiment", "unit", "factor"),
+    [("beam_twist", "°", np.pi / 180.0), ("beam_oscillation", " g", 1e-3)],
+)
+def test_the_quick_budget_picks_evenly(experiment, unit, factor):
+    runs = [settings(f"experiment={experiment}", f"budget={budget}") for budget in ("full", "quick")]
+    full, quick = (run.data for run in runs)
+    assert full.limit is None
+    assert quick.amounts == full.amounts
+    assert quick.steps < full.steps
+    whole, split = map(split_of, runs)
+    amounts = {trial.name: trial.amount for trial in trials_of(runs[1])}
+    assert tuple(amounts) == split.names
+    for name, limit in dict(quick.limit).items():
+        row, picked = [f"{x:g}{unit}" for x in getattr(full.amounts, name)], list(getattr(split, name))
+        assert list(getattr(whole, name)) == row
+        places = [row.index(name) for name in picked]
+        assert len(picked) == limit < len(row)
+        if limit > 1:
+            assert (places[0], places[-1]) == (0, len(row) - 1)
+            assert np.ptp(np.diff(places)) <= 1  # strides differ by one at most
+            assert np.diff(places).min() >= 1
+        chosen = np.array([getattr(full.amounts, name)[place] for place in places])
+        np.testing.assert_allclose([amounts[name] for name in picked], factor * chosen)

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 import warp as wp
 from rich.console import Console
-from rich.table import Table
 
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
@@ -67,10 +66,8 @@ from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
 from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
-from .report.data import trial_errors
-from .report.page import PageTable, number_text, ratio_text
-from .report.sections import horizon_table, scale_table, shapes_table
-from .report.verdict import known_errors, standings, verdict
+from .report.sections import errors_table, horizon_table, scale_table, shapes_table
+from .report.verdict import verdict
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
 from .settings.run import RunSettings
@@ -383,36 +380,17 @@ def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     """Prints the errors, by model and in the tables of the report, and the conclusions."""
-    what = "vertices" if run.markers is None else "markers"
-    places = standings(known_errors(trial_errors(metrics)))
-    table = Table("model", "mean, mm", "90 % interval", "vs. best other", "diverged")
-    table.title = f"Error of the {what} in the test trials"
-    for model, summary in metrics["errors_mm"].items():
-        interval, ratio = places.get(model, (None, None))
-        shown = (
-            "" if interval is None else " to ".join(map(number_text, interval)),
-            "" if ratio is None else ratio_text(ratio),
-        )
-        table.add_row(model, number_text(summary["mean"]), *shown, str(summary["diverged"]))
     console = Console()
-    console.print(table)
     tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
-    for further in (
+    for table in (
+        errors_table(metrics, run),
         horizon_table(metrics, {}),
         scale_table(metrics.get("scales", {})),
         tracking_table(tracking) if tracking else None,
         shapes_table(shapes) if shapes else None,
     ):
-        if further is not None:
-            console.print(_in_terminal(further))
+        if table is not None:
+            console.print(table)
     for sentence in verdict(metrics, run):
         console.print(sentence, soft_wrap=True)
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
-
-
-def _in_terminal(page: PageTable) -> Table:
-    """A table of a page."""
-    table = Table(page.head, *page.columns)
-    for row in page.rows:
-        table.add_row(row.head, *(" ".join(filter(None, cell)) for cell in row.cells))
-    return table

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
@@ -21,7 +20,6 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, wr
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.mesh import surface_vertices
-from ..report.page import number_text
 from ..settings.run import RunSettings
 from ..settings.stages import AblationStage, ReportStage
 from ..stepping.state import State
@@ -59,12 +57,10 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
     metrics = _metrics(folder, run)
     write_json(folder / METRICS, metrics)
-    table = Table("markers", "median [mm]", "quartiles [mm]", title="Error of the reconstructed motion, all vertices")
-    for row in metrics["by_markers"]:
-        quartiles = f"{number_text(row['lower_quartile_mm'])} to {number_text(row['upper_quartile_mm'])}"
-        table.add_row(str(row["markers"]), number_text(row["median_mm"]), quartiles)
+    from ..report.ablation_page import ablation_table  # matplotlib
+
     console = Console()
-    console.print(table)
+    console.print(ablation_table(metrics["by_markers"]))
     console.print(f"Report: {folder / REPORT}", soft_wrap=True)
 
 

@@ -69,14 +69,13 @@ def write_ablation_report(
     how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
     medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
     alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
-    body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
     with canvas_beside(path) as canvas:
         boxes = marker_boxes({row["markers"]: np.array(row["errors_mm"]) for row in rows}, uncorrected)
         figure = canvas.figure("marker_ablation", boxes, alt, caption)
     write_page(
         path,
         [
-            Part("", [figure, PageTable("Markers", [*_COLUMNS.values()], body, note)]),
+            Part("", [figure, ablation_table(rows, note)]),
             Part("How it was reconstructed", [Text(how)]),
         ],
         settings,
@@ -109,6 +108,12 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure
     axes.grid(visible=False, axis="x")
     axes.set(xlabel="number of markers", ylabel="mean vertex error [mm]")
     return figure
+
+
+def ablation_table(rows: Sequence[Mapping[str, Any]], note: str = "") -> PageTable:
+    """Return the errors by number of markers."""
+    body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
+    return PageTable("Markers", [*_COLUMNS.values()], body, note)
 
 
 def _how_reconstructed(modes: int | None, regularisation: float) -> str:

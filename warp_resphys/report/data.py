@@ -164,14 +164,9 @@ class RunReport:
     pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
 
     @property
-    def experiment(self) -> str:
-        """Name of the experiment."""
-        return self.settings.name
-
-    @property
     def published(self) -> Mapping[str, PublishedError]:
         """Published errors of this experiment by model; may be empty."""
-        return published_errors(self.experiment)
+        return published_errors(self.settings.name)
 
     def obstacles_at(self, trial: str, times: FloatArray) -> ObstacleSurface:
         """Returns the obstacles at times (T,) [s] of a test trial."""
@@ -192,11 +187,6 @@ class RunReport:
     def others(self) -> tuple[str, ...]:
         """Names of the test trials outside of the training loads."""
         return other_trials(self.settings)
-
-    @property
-    def models(self) -> list[str]:
-        """Models with errors, in the order of the tables."""
-        return [model for model in MODELS if model in self.metrics["errors_mm"]]
 
 
 def other_trials(settings: RunSettings) -> tuple[str, ...]:

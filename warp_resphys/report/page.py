@@ -25,6 +25,7 @@ from ..settings.run import RunSettings
 from .render import DrawingError, Renderer
 
 if TYPE_CHECKING:
+    import rich.table
     from matplotlib.figure import Figure as Drawing
 
 _LOG = logging.getLogger(__name__)
@@ -41,6 +42,11 @@ class Cell(NamedTuple):
     text: str
     small: str = ""  # In small print below it.
     beside: str = ""  # Beside it, such as a deviation.
+
+    @classmethod
+    def of(cls, parts: tuple[str, str]) -> "Cell":
+        """Returns a text and its deviation."""
+        return cls(parts[0], beside=parts[1])
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,19 @@ class PageTable:
     note: str = ""  # Below the table.
     summary: str = ""  # Title of a table that can be folded; empty for one that cannot.
     unfolded: bool = False  # Whether it is unfolded at first.
+
+    def __rich__(self) -> "rich.table.Table":
+        """Returns the table for a terminal."""
+        import rich.table
+        import rich.text
+
+        table = rich.table.Table()
+        for column in (self.head, *self.columns):
+            table.add_column(rich.text.Text(column))
+        for row in self.rows:
+            cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
+            table.add_row(*map(rich.text.Text, (row.head, *cells)), style="bold" if row.answer else None)
+        return table
 
 
 @dataclass(frozen=True)

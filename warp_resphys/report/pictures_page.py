@@ -159,7 +159,7 @@ def write_pictures_report(
     write_page(
         path,
         [
-            Part("", [*drawn, _distances(results)]),
+            Part("", [*drawn, distance_table(results)]),
             Part("Identification", [parameters]),
             Part("How it is compared", [Text(_HOW)]),
         ],
@@ -178,8 +178,8 @@ _HOW: Final = (
 )
 
 
-def _distances(results: Sequence[PictureResult]) -> PageTable:
-    """Table of the distances, with a row for each pose."""
+def distance_table(results: Sequence[PictureResult]) -> PageTable:
+    """Return the distances, with a row for each pose."""
     others = {"Overlap": "overlap", "Cloud [mm]": "cloud_mm", "Tracked points [mm]": "points_mm"}
     others = {
         name: key
@@ -192,7 +192,10 @@ def _distances(results: Sequence[PictureResult]) -> PageTable:
         cells += [Cell(_text(getattr(result, key)["sysid"])) for key in others.values()]
         small = f"{result.material}{', ' * bool(result.material)}{'kept back' if result.tested else 'training'}"
         rows.append(Row(result.pose, cells, answer=result.tested, small=small))
-    return PageTable("Pose", [*(f"{name} [mm]" for name in _MODELS.values()), *others], rows)
+    kinds = dict.fromkeys(result.compared for result in results)
+    return PageTable(
+        f"Pose; distance of {' or '.join(kinds)}", [*(f"{name} [mm]" for name in _MODELS.values()), *others], rows
+    )
 
 
 def _text(value: float | None) -> str:

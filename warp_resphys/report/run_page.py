@@ -10,13 +10,12 @@ from markupsafe import Markup
 from ..io.errors import number_of
 from .body_section import body_section, paths_section
 from .control_section import control_section
-from .data import MODELS, OUTSIDE, RunReport, errors_by_load, folds_in, trial_errors, untrained
+from .data import MODELS, OUTSIDE, RunReport, folds_in, trial_errors
 from .error_section import error_section
 from .identification_section import identification_section
 from .law_section import law_section
 from .motion_section import motion_section, start_drawing
 from .page import (
-    NONE,
     Canvas,
     Cell,
     Items,
@@ -26,15 +25,12 @@ from .page import (
     Text,
     canvas_beside,
     duration_text,
-    error_parts,
     mm_text,
-    number_text,
-    published_parts,
-    ratio_text,
     unbroken,
     write_page,
 )
 from .sections import (
+    errors_table,
     horizons_section,
     quality_section,
     registration_section,
@@ -43,9 +39,8 @@ from .sections import (
     trials_section,
 )
 from .training_section import training_section
-from .verdict import LEAST_TRIALS, known_errors, recommended, standings, verdict
+from .verdict import LEAST_TRIALS, verdict
 
-_PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
 _TIMED: Final = {
     "simulation": "Uncorrected simulation",
     "target": "Simulation with the true parameters",
@@ -100,58 +95,15 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
     """Return the errors of the models and the published ones."""
     synthetic = "laboratory" in data.settings.targets
     blocks: list[Any] = [Text(_WITHOUT_RECORDINGS, "synthetic")] if synthetic else []
-    blocks += [_errors_table(data), Text(_what_is_measured(data), "what", note=True)]
+    blocks += [errors_table(data.metrics, data.settings), Text(_what_is_measured(data), "what", note=True)]
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
         blocks.append(Text("Roll-outs outside the training range", heading=True))
         blocks.append(Items(ranges, "ranges"))
     return Part("", blocks)
 
 
-def _errors_table(data: RunReport) -> PageTable:
-    errors, models = data.metrics["errors_mm"], data.models
-    idle, by_trial = untrained(data.metrics), trial_errors(data.metrics)
-    chosen, places = recommended(known_errors(by_trial, idle)), standings(known_errors(by_trial))
-    published = published_beside(data.published, models)
-    by_load = errors_by_load(data.metrics, data.others)
-    with_intervals = any(interval for interval, _ in places.values())
-    columns = ["Mean error", *(["90 % interval"] if with_intervals else []), "Against the best other", *by_load]
-    reconstructed = data.metrics.get("errors_vs_reconstruction_mm", {})
-    columns += [*(["Against the reconstruction"] if reconstructed else []), *(["Published"] if published else [])]
-    rows: list[Row] = []
-    for model, (name, meaning) in MODELS.items():
-        if model not in errors and model not in published:
-            continue
-        if model in idle:
-            meaning = "no force: no epoch of its training was kept"
-        elif model == "resphys" and "law" in errors:
-            meaning = "the learned force on the simulator with the identified law"
-        elif model == "resphys" and "sysid" in errors:
-            meaning = "the learned force on the identified simulator"
-        interval, ratio = places.get(model, (None, None))
-        cells = [_pair(error_parts(errors[model])) if model in errors else Cell(NONE)]
-        ends = NONE if interval is None else " to ".join(map(number_text, interval))
-        cells += [Cell(ends)] if with_intervals else []
-        cells.append(Cell(NONE if ratio is None else ratio_text(ratio)))
-        cells += [_pair(error_parts(own[model])) if model in own else Cell(NONE) for own in by_load.values()]
-        if reconstructed:
-            cells.append(_pair(error_parts(reconstructed[model])) if model in reconstructed else Cell(NONE))
-        cells += [_pair(published[model]) if model in published else Cell(NONE)] if published else []
-        rows.append(Row(name, cells, model == chosen, meaning))
-    return PageTable(f"Error of the {_observed(data)} [mm]", columns, rows)
-
-
 def _observed(data: RunReport) -> str:
     return "markers" if data.sees_markers else "vertices"
-
-
-def _pair(parts: tuple[str, str]) -> Cell:
-    return Cell(parts[0], beside=parts[1])
-
-
-def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the published errors by our model with which they are compared."""
-    renamed = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
-    return {renamed.get(model, model): published_parts(error) for model, error in published.items()}
 
 
 def _what_is_measured(data: RunReport) -> str:

@@ -8,9 +8,20 @@ from typing import Any, Final
 
 from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, published_errors
+from ..settings.run import RunSettings
 from ..stepping.quantity import Quantity
-from .data import MODELS, OUTSIDE, RunReport, folds_in, models_in_figures
+from .data import (
+    MODELS,
+    OUTSIDE,
+    RunReport,
+    errors_by_load,
+    folds_in,
+    models_in_figures,
+    other_trials,
+    trial_errors,
+    untrained,
+)
 from .page import (
     MINUS,
     NONE,
@@ -27,13 +38,56 @@ from .page import (
     number_text,
     percent_text,
     published_parts,
+    ratio_text,
     unbroken,
 )
+from .verdict import known_errors, recommended, standings
 
 BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
+_PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
 _MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
 _CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the one before.
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
+
+
+def errors_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
+    """Return the errors of the models in the test trials, beside the published ones."""
+    errors = metrics["errors_mm"]
+    idle, by_trial = untrained(metrics), trial_errors(metrics)
+    chosen, places = recommended(known_errors(by_trial, idle)), standings(known_errors(by_trial))
+    published = published_beside(published_errors(settings.name), list(errors))
+    by_load = errors_by_load(metrics, other_trials(settings))
+    with_intervals = any(interval for interval, _ in places.values())
+    columns = ["Mean error", *(["90 % interval"] if with_intervals else []), "Against the best other", *by_load]
+    reconstructed = metrics.get("errors_vs_reconstruction_mm", {})
+    columns += [*(["Against the reconstruction"] if reconstructed else []), *(["Published"] if published else [])]
+    rows: list[Row] = []
+    for model, (name, meaning) in MODELS.items():
+        if model not in errors and model not in published:
+            continue
+        if model in idle:
+            meaning = "no force: no epoch of its training was kept"
+        elif model == "resphys" and "law" in errors:
+            meaning = "the learned force on the simulator with the identified law"
+        elif model == "resphys" and "sysid" in errors:
+            meaning = "the learned force on the identified simulator"
+        interval, ratio = places.get(model, (None, None))
+        cells = [Cell.of(error_parts(errors[model])) if model in errors else Cell(NONE)]
+        ends = NONE if interval is None else " to ".join(map(number_text, interval))
+        cells += [Cell(ends)] if with_intervals else []
+        cells.append(Cell(NONE if ratio is None else ratio_text(ratio)))
+        cells += [Cell.of(error_parts(own[model])) if model in own else Cell(NONE) for own in by_load.values()]
+        if reconstructed:
+            cells.append(Cell.of(error_parts(reconstructed[model])) if model in reconstructed else Cell(NONE))
+        cells += [Cell.of(published[model]) if model in published else Cell(NONE)] if published else []
+        rows.append(Row(name, cells, model == chosen, meaning))
+    return PageTable(f"Error of the {'vertices' if settings.markers is None else 'markers'} [mm]", columns, rows)
+
+
+def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return the published errors by our model with which they are compared."""
+    renamed = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
+    return {renamed.get(model, model): published_parts(error) for model, error in published.items()}
 
 
 def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
@@ -141,7 +195,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], quantity: Quanti
 
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Return the errors by length of the roll-out."""
-    table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.experiment, {}))
+    table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.settings.name, {}))
     title = "Longer than the training" if data.settings.train_fraction < 1.0 else "By length of the roll-out"
     return None if table is None else Part(title, [table])
 

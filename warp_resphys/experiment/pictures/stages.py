@@ -16,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from ...data.camera import CORRECTIONS, PlacedCamera
 from ...energies.catalogue import LAW_FORMAT, unit_of
@@ -30,8 +29,7 @@ from ...pictures.misfit import PictureMisfit, values_of
 from ...pictures.motion import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
 from ...report.identification_section import parameter_rows
-from ...report.page import NONE, number_text
-from ...report.pictures_page import PictureResult, picture_verdict, write_pictures_report
+from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
 from ...settings.pictures import PictureData, PoseSettings
 from ...settings.run import RunSettings
 from ...settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
@@ -410,17 +408,8 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     metrics = picture_metrics(folder, run)
     write_json(folder / METRICS, metrics)
     results = [PictureResult(**row) for row in metrics["poses"]]
-    by_outline = any(result.outline_mm["sysid"] is not None for result in results)
-    kinds = list(dict.fromkeys(result.compared for result in results))
-    title = f"Distance of {' or '.join(kinds)} [mm]"
-    heads = ["undeformed", "uncorrected", "identified", *["overlap"] * by_outline]
-    table = Table("pose", *heads, title=title)
-    for result in results:
-        cells = [number_text(result.distance(model)) for model in MODELS]
-        cells += [NONE if (share := result.overlap["sysid"]) is None else number_text(share)] * by_outline
-        table.add_row(f"{result.pose} (test)" if result.tested else result.pose, *cells)
     console = Console()
-    console.print(table)
+    console.print(distance_table(results))
     identified = read_json(folder / IDENTIFICATION)["sysid"]
     material = {name: v for name, v in identified["parameters"].items() if split_name(name)[0] not in _PLACED}
     for row in parameter_rows({**identified, "parameters": material}, {}, {}):

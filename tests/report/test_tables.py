@@ -17,10 +17,11 @@ from warp_resphys.report.error_section import largest_filtered
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell, duration_text, error_parts, number_text
 from warp_resphys.report.render import axes_from_below, motion_axes
-from warp_resphys.report.run_page import published_beside, range_texts
+from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.sections import (
     against,
     horizon_table,
+    published_beside,
     published_growth,
     residual_table,
     scale_table,

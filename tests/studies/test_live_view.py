@@ -173,10 +173,10 @@ def test_a_browser_drives_and_pulls_it(finished):
                 hand = webdriver.ActionChains(browser)
                 hand.move_to_element_with_offset(canvas, 0, 0).click_and_hold().move_by_offset(0, -40)
                 hand.move_by_offset(0, -60).perform()
-                until(lambda: live.is_pulled, PATIENCE)
+                until(lambda: live.held is not None, PATIENCE)
                 observed["pulled"] = True
                 webdriver.ActionChains(browser).release().perform()
-                until(lambda: not live.is_pulled, PATIENCE)
+                until(lambda: live.held is None, PATIENCE)
                 severe = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
                 observed["severe"] = [entry for entry in severe if "passive event listener" not in entry]  # viser's own
                 browser.find_element(By.XPATH, "//button[.='Pause']").click()

@@ -4,7 +4,6 @@ Functions that read a file raise a DataFileError if the file is missing or damag
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +83,8 @@ def make_report(context: StageContext) -> None:
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
+    dataset = read_dataset(common_folder(folder) / DATASET)
+    moved = dataset.contact_at(trials.names, body, dataset.time_step)  # (K + 1, R, O) inputs, by name
     assert run.tip is not None
     names = {name for model in identification.values() for name in model.get("parameters", {})}
     simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
@@ -97,7 +98,7 @@ def make_report(context: StageContext) -> None:
         chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
         tendons=_routes(body),
         obstacles=ObstacleSurface.of(body, identification.get("sysid", {}).get("parameters")),
-        moved=read_moved(folder, body, trials.names),
+        moved={name: {key: values[:, row] for key, values in moved.items()} for row, name in enumerate(trials.names)},
         trials=trials,
         film=film,
         driven=driven,
@@ -221,6 +222,8 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
         spread = (*shape[:2], len(owners(dataset.labels)))
         spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in models if f"{m}_spread" in file}
+    markers = run.markers
+    unseen = None if markers is None else marker_view_of(markers, dataset.labels, dataset.sets).unseen
     rows = dataset.rows(test)
     times, target = dataset.times[rows], dataset.observed[rows]
     begins = tuple(dataset.begins[row] for row in rows)
@@ -242,7 +245,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         time_step=dataset.time_step,
         since=since_change(dataset, test)[:, :length],
         spreads={model: values[:, :length] for model, values in spreads.items()},
-        **_seen(run, dataset),
+        axes=tuple(axis for axis in range(3) if axis != unseen),
     )
 
 
@@ -267,15 +270,6 @@ def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | 
     return {"stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained}, "outside": outside}
 
 
-def _seen(run: RunSettings, dataset: Dataset) -> dict[str, Any]:
-    """View of the markers, for the figures."""
-    labels = dataset.labels
-    if run.markers is None:
-        return {}
-    view = marker_view_of(run.markers, labels, dataset.sets)
-    return {"axes": tuple(axis for axis in range(3) if axis != view.unseen)}
-
-
 def _read_scaled(folder: Path) -> Dataset | None:
     """Dataset of the trials with scaled inputs, if there are any."""
     path = common_folder(folder) / SCALED_DATASET
@@ -291,22 +285,16 @@ def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
         models = [model for model in MODELS if f"{model}_film" in file]
         shape = (len(steps), None, 3)
         bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
-        film = Film(str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps, bodies)
-    return _as_seen(film, read_dataset(common_folder(folder) / DATASET), run, mesh)
-
-
-def _as_seen(film: Film, dataset: Dataset, run: RunSettings, mesh: Mesh) -> Film:
-    """Moves the bodies of a film to where their markers are seen, if markers have their own frame."""
-    if dataset.bound is None or run.markers is None:
-        return film
-    view = marker_view_of(run.markers, dataset.labels, dataset.sets)
-    if not view.own:
-        return film
-    has = np.flatnonzero(dataset.present[dataset.names.index(film.trial)]).tolist()
-    markers = bound_markers(run.markers, mesh, dataset.bound, dataset.labels)
-    view = view.select(has)
-    at = {model: torch.from_numpy(positions) for model, positions in film.positions.items()}
-    return replace(film, positions={model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()})
+        trial, times = str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps
+    dataset = read_dataset(common_folder(folder) / DATASET)
+    if dataset.bound is not None and run.markers is not None:
+        view = marker_view_of(run.markers, dataset.labels, dataset.sets)
+        if view.own:
+            has = np.flatnonzero(dataset.present[dataset.names.index(trial)]).tolist()
+            markers, view = bound_markers(run.markers, mesh, dataset.bound, dataset.labels), view.select(has)
+            at = {model: torch.from_numpy(positions) for model, positions in bodies.items()}
+            bodies = {model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()}
+    return Film(trial, times, bodies)
 
 
 def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
@@ -323,13 +311,6 @@ def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
             by_name = dict(zip(controllers, points, strict=True))
             followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
     return followed
-
-
-def read_moved(folder: Path, body: Body, names: Sequence[str]) -> dict[str, dict[str, FloatArray]]:
-    """(K + 1, O) inputs of contact by name that move obstacles, in trials by name."""
-    dataset = read_dataset(common_folder(folder) / DATASET)
-    moved = dataset.contact_at(names, body, dataset.time_step)
-    return {name: {key: values[:, row] for key, values in moved.items()} for row, name in enumerate(names)}
 
 
 def read_driven(folder: Path, run: RunSettings) -> Driven | None:

@@ -73,7 +73,9 @@ def error_over_time(
     every = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)
     for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
         for model, own in errors.items():
-            mean, line = mean_of_trials(own[rows]), figures.model_line(model)
+            held, line = ~np.isnan(own[rows]), figures.model_line(model)
+            count = held.sum(axis=0)
+            mean = np.where(count > 0, np.where(held, own[rows], 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
             shown = figures.positive(mean)
             if window is not None:
                 axes.plot(times, shown, color=line["color"], linewidth=0.6, alpha=0.45)
@@ -93,14 +95,6 @@ def error_over_time(
     every[0, 0].set_ylabel(f"mean {of} error [mm]")
     figures.legend_above(figure, every[0, 0])
     return figure
-
-
-def mean_of_trials(rows: FloatArray) -> FloatArray:
-    """Return the mean (T,) over trials (R, T), without NaN; infinite where one diverged, NaN where all are NaN."""
-    held = ~np.isnan(rows)
-    count = held.sum(axis=0)
-    mean: FloatArray = np.where(count > 0, np.where(held, rows, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
-    return mean
 
 
 def _error_caption(data: RunReport, window: float | None) -> str:

@@ -38,6 +38,7 @@ from .uniaxial import (
 )
 from .verdict import model_name
 
+_NOT_FACTORS: Final = ("ms", "%", "°")  # Units of constants that multiply no term: times, slacks, directions.
 _NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
 _POINTS: Final = 81  # Of the curve of the stress.
 _LEAST: Final = 0.02  # Least range of strains that is drawn, on either side of rest.
@@ -273,7 +274,9 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
         chosen = chosen or answer
         words = in_a_row([_GROUPS.get(group, group) for group in own["groups"]])
         head = f"With {words}" if words else "Shape and volume alone (neo-Hookean)"
-        cells = [Cell(str(sum(_is_coefficient(name) for name, value in own["constants"].items() if value)))]
+        cells = [
+            Cell(str(sum(wording(name)[0][1] not in _NOT_FACTORS for name, value in own["constants"].items() if value)))
+        ]
         cells += [Cell(_share(own.get("residual")))] if weak else []
         rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], answer))
     note = (
@@ -283,11 +286,6 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
     if weak:
         note += ", and refined through the simulator. The force residual is what remains in the balance of forces"
     return [PageTable("Classes of laws", columns, rows, f"{note}.")]
-
-
-def _is_coefficient(name: str) -> bool:
-    """Whether a constant multiplies a term, unlike a relaxation time, a direction, a slack or a toe."""
-    return wording(name)[0][1] not in ("ms", "%", "°")
 
 
 def _share(value: float | None) -> str:

@@ -102,13 +102,9 @@ def results_section(data: RunReport, canvas: Canvas) -> Part:
     return Part("", blocks)
 
 
-def _observed(data: RunReport) -> str:
-    return "markers" if data.sees_markers else "vertices"
-
-
 def _what_is_measured(data: RunReport) -> str:
     """Definition of the errors, with notes on their contributions."""
-    trials, span = data.trials, ""
+    trials, span, of = data.trials, "", "markers" if data.sees_markers else "vertices"
     if data.settings.trial_seconds is not None:
         span = f", the frames of the first {data.settings.trial_seconds:g} s after the release,"
     if trials is None:
@@ -142,17 +138,18 @@ def _what_is_measured(data: RunReport) -> str:
             "in test trials."
         )
     reconstructed = data.metrics.get("reconstruction", {})
-    learned = [_reconstruction_text(model, result, _observed(data)) for model, result in reconstructed.items()]
-    learned += [_PUBLISHED_FOR[_kind(data)]] if data.published else []
+    learned = [
+        f"The reconstruction for {MODELS[model][0]} leaves the {of} of the training trials at a mean distance of "
+        f"{mm_text(result['mean_mm'])} from the observed ones, {mm_text(result['max_mm'])} at most."
+        for model, result in reconstructed.items()
+    ]
+    kind = "arm" if data.settings.chambers is not None else "beam" if data.sees_markers else "vertices"
+    learned += [_PUBLISHED_FOR[kind]] if data.published else []
     if data.others:
         learned.append(f"{OUTSIDE}: {', '.join(data.others)}. No training trial was held like that.")
     many = len(next(iter(trial_errors(data.metrics).values()), ())) >= LEAST_TRIALS
     text += " Interval: of the mean, over draws of the trials." if many else ""
     return unbroken(" ".join([text, *_contributions(data.metrics), *learned]))
-
-
-def _kind(data: RunReport) -> str:
-    return "arm" if data.settings.chambers is not None else "beam" if data.sees_markers else "vertices"
 
 
 def _contributions(metrics: Mapping[str, Any]) -> list[str]:
@@ -177,13 +174,6 @@ def _contributions(metrics: Mapping[str, Any]) -> list[str]:
             f"{where} the markers of {model} move by {mm_text(check['moved_mm'])}; its error is {after}, not {before}."
         )
     return notes
-
-
-def _reconstruction_text(model: str, reconstructed: Mapping[str, Any], of: str) -> str:
-    return (
-        f"The reconstruction for {MODELS[model][0]} leaves the {of} of the training trials at a mean distance of "
-        f"{mm_text(reconstructed['mean_mm'])} from the observed ones, {mm_text(reconstructed['max_mm'])} at most."
-    )
 
 
 def when_text(first: Mapping[str, float]) -> str:

@@ -43,6 +43,7 @@ class LiveRobot:
         inputs: (C,) commanded values by name.
         limits: lowest and highest values (C,) of the parts of each input.
         parameters: quantities and original values of the parameters that may be changed, by name.
+        held: weights (N,) of the vertices that are pulled, and the point (3,) to which they are [m]; None if none is.
         moved: (O,) inputs that moved obstacles in the last step, by name.
         time: since the start of the motion [s].
         failure: why the simulation stopped; empty while it runs.
@@ -59,7 +60,7 @@ class LiveRobot:
         mass = float(robot.constants.mass.sum())
         weight = mass * float(np.linalg.norm(robot.simulator.gravity)) or mass
         self._stiffness = min(_PULL * weight / self.size, _STIFFEST * mass / robot.time_step**2)  # [N/m]
-        self._held: tuple[FloatArray, FloatArray] | None = None  # (N,) weights of held vertices, (3,) target [m]
+        self.held: tuple[FloatArray, FloatArray] | None = None
         self._on_body = _markers_on_body(robot)
         self.moved: dict[str, FloatArray] = {}
         self.state: RobotState
@@ -130,11 +131,6 @@ class LiveRobot:
         return bool(self.state.left[0])
 
     @property
-    def is_pulled(self) -> bool:
-        """Whether the body is grabbed."""
-        return self._held is not None
-
-    @property
     def target(self) -> FloatArray | None:
         """Measured positions (N, 3) of the vertices [m], where every one is observed."""
         return None if self.robot.labels else self.measured
@@ -163,16 +159,16 @@ class LiveRobot:
         near = np.exp(-0.5 * ((away - away.min()) / (_PATCH * self.size)) ** 2)
         weights = np.zeros(len(q))
         weights[self.surface] = near / near.sum()
-        self._held = weights, np.asarray(point, dtype=np.float64)
+        self.held = weights, np.asarray(point, dtype=np.float64)
 
     def drag(self, target: FloatArray) -> None:
         """Sets the point (3,) [m] towards which the grabbed patch is pulled."""
-        if self._held is not None:
-            self._held = self._held[0], np.asarray(target, dtype=np.float64)
+        if self.held is not None:
+            self.held = self.held[0], np.asarray(target, dtype=np.float64)
 
     def let_go(self) -> None:
         """Releases the grabbed patch."""
-        self._held = None
+        self.held = None
 
     def play_trial(self, name: str | None) -> None:
         """Starts a recorded trial from its initial state; None ends the trial.
@@ -186,7 +182,7 @@ class LiveRobot:
 
     def reset(self) -> None:
         """Restarts from the initial state of the trial, or from rest without inputs."""
-        self.time, self.failure, self._held, self.moved = 0.0, "", None, {}
+        self.time, self.failure, self.held, self.moved = 0.0, "", None, {}
         for values in self.inputs.values():
             values[:] = 0.0
         with torch.no_grad():
@@ -203,8 +199,8 @@ class LiveRobot:
         if self.failure or (self.trial is not None and self.time >= self.trial.times[-1] - _ROUNDING):
             return False
         acting = dict[str, torch.Tensor | FloatArray](self._commanded())
-        if self._held is not None:
-            weights, target = self._held
+        if self.held is not None:
+            weights, target = self.held
             acting["external_force"] = weights[:, None] * (self._stiffness * (target - weights @ self.positions))
         wanted = {name: np.asarray(acting.pop(name)) for name in [q.name for q in MOTION] if name in acting}
         placed = self._obstacles(wanted)

@@ -82,7 +82,7 @@ def test_second_view_is_from_below():
 @pytest.mark.usefixtures("can_draw")
 def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
     arm = shipped_arm("arm_hexahedra_500")
-    body = MeshSummary(arm, 1070.0, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
+    body = MeshSummary(arm, np.flatnonzero(arm.vertices[:, 2] == 0.0), find_chambers(arm))
     near = [np.flatnonzero(np.abs(arm.vertices[:, 2] - z) < 0.01) for z in (-0.05, -0.1, -0.15, -0.2)]
     nearest = [some[(arm.vertices[some] @ body_picture.TOWARDS_VIEWER).argmax()] for some in near]
     places = arm.vertices[nearest]

@@ -16,7 +16,6 @@ from ..io.atomic import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
 from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
-from ..mesh.quality import cell_volumes
 from ..mesh.surface import closest_points
 from .bodies import face_edges, obstacle_layers, sharp_edges, stems
 from .data import Recordings
@@ -59,20 +58,14 @@ NOMINAL: Final = "#0072b2"  # Blue of Okabe and Ito (2008).
 
 @dataclass(frozen=True, eq=False)
 class MeshSummary:
-    """A mesh with its material, its clamped vertices, and its chambers or tendons."""
+    """A mesh with its clamped vertices, and its chambers or tendons."""
 
     mesh: Mesh
-    density: float  # Of its material [kg/m^3].
     fixed: IntArray  # (P,) clamped vertices.
     chambers: tuple[Chamber, ...]  # Closed chambers.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
     inside: str = "Chambers"  # Title of the coloured parts.
     obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # That the body touches.
-
-    @property
-    def volume(self) -> float:
-        """Volume of the cells [m^3]."""
-        return float(cell_volumes(self.mesh).sum())
 
     def chamber_volume(self, chamber: Chamber) -> float:
         """Return the volume of a chamber [m^3], by the divergence theorem."""

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -50,10 +49,8 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     def body(path: Path) -> Drawn:
         from .body_picture import MeshSummary, draw_mesh
 
-        constants = data.settings.simulation.parameters
-        density = fmean(value for name, value in constants.items() if name.endswith("density"))
         coloured = f"{quantity.per}s".capitalize()
-        summary = MeshSummary(data.mesh, density, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
+        summary = MeshSummary(data.mesh, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
         draw_mesh(path, summary, trials.bound if trials.labels else None, canvas.renderer)
         return Drawn.of(path, alt, caption)
 

@@ -52,15 +52,15 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
     axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
     points = np.concatenate([rest, places.reshape(-1, 3)])
     centre, half = frame_of(np.concatenate([points, motion.obstacles.near(points)]), axes)
-    simulated = np.stack(list(motion.markers.values()))  # (B, F, M, 3)
-    means = mean_distance(simulated, np.broadcast_to(motion.measured, simulated.shape))  # (B, F) [mm]
-    away = 1e3 * _distances(simulated, motion.measured)
-    if motion.target is not None:
-        exact = np.stack(
-            [without_diverged(q, motion.mesh.vertices, _DIVERGED * size) for q in motion.positions.values()]
-        )
-        means = mean_distance(exact, np.broadcast_to(motion.target, exact.shape))
-        away = 1e3 * _distances(exact[:, :, surface], motion.target[:, surface])
+    has_markers, rest_of_all, compared = motion.target is None, motion.mesh.vertices, np.arange(len(motion.bound))
+    if motion.target is None:
+        simulated, target = np.stack([*motion.markers.values()]), motion.measured
+    else:
+        whole = [without_diverged(q, rest_of_all, _DIVERGED * size) for q in motion.positions.values()]
+        simulated, target, compared = np.stack(whole), motion.target, surface
+    means = mean_distance(simulated, np.broadcast_to(target, simulated.shape))  # (B, F) [mm]
+    with np.errstate(invalid="ignore", over="ignore"):
+        away = 1e3 * np.linalg.norm(simulated[:, :, compared] - target[:, compared], axis=3)
     drawn = np.isfinite(places.reshape(*places.shape[:2], -1).sum(axis=2))[..., None]  # (B, F, 1)
     away = np.where(drawn, away, np.nan)
     largest = np.where(np.isfinite(away), away, 0.0).max(axis=(1, 2), initial=0.0)
@@ -76,7 +76,6 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
         }
         for model, most, by_frame in zip(motion.positions, largest, means, strict=True)
     ]
-    has_markers = motion.target is None
     data = {
         "times": [float(f"{time:.6g}") for time in motion.times],
         "rest": _encoded(rest, "<f4"),
@@ -110,12 +109,6 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
     return ViewInSpace(
         name, caption, alt, payload, models, len(motion.times), speed, "markers" if has_markers else "vertices"
     )
-
-
-def _distances(positions: FloatArray, target: FloatArray) -> FloatArray:
-    """Distances (B, F, P) of points (B, F, P, 3) from their targets (F, P, 3)."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.asarray(np.linalg.norm(positions - target, axis=3))
 
 
 def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from ..mesh.arm import name_surfaces
 from ..mesh.cavities import open_cavities
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import FloatArray, IntArray, Mesh, Place, boundary_triangles, connected_parts, select_vertices
-from ..mesh.quality import scaled_jacobian
+from ..mesh.quality import cell_volumes, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..mesh.tetrahedra import SURFACE_SUFFIXES
 from ..report.body_picture import MeshSummary, draw_mesh
@@ -112,8 +112,8 @@ def inspect_mesh(
     where = fixed.arguments()
     place = Place(**where) if where.keys() & {"x", "y", "z"} else None
     vertices = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **where)
-    summary = MeshSummary(mesh, density, vertices, find_chambers(mesh))
-    rows += summary_rows(summary)
+    summary = MeshSummary(mesh, vertices, find_chambers(mesh))
+    rows += summary_rows(summary, density)
     if place is not None:
         rows.append(("fixed", f"{place.holds(points).sum()} vertices at {place} m, {len(vertices)} of them used"))
     if isinstance(settings, FileMesh):
@@ -143,9 +143,10 @@ def _millimetres(point: FloatArray) -> str:
     return ", ".join(f"{_MILLI * x:.1f}" for x in point)
 
 
-def summary_rows(summary: MeshSummary) -> list[tuple[str, str]]:
+def summary_rows(summary: MeshSummary, density: float) -> list[tuple[str, str]]:
     """Rows of a table: sizes, mass, quality and chambers of a mesh."""
     mesh, (width, depth, height) = summary.mesh, _MILLI * np.ptp(summary.mesh.vertices, axis=0)
+    volume = float(cell_volumes(mesh).sum())
     body, boundary = (connected_parts(cells).max() + 1 for cells in (mesh.cells, boundary_triangles(mesh)))
     rows = [
         ("vertices", f"{len(mesh.vertices):,} = {mesh.vertices.size:,} degrees of freedom"),
@@ -154,15 +155,15 @@ def summary_rows(summary: MeshSummary) -> list[tuple[str, str]]:
             "bounding box",
             f"{width:.1f} x {depth:.1f} x {height:.1f} mm from ({_millimetres(mesh.vertices.min(axis=0))}) mm",
         ),
-        ("volume", f"{_CUBIC_CENTI * summary.volume:.1f} cm3"),
-        ("mass", f"{1e3 * summary.volume * summary.density:.1f} g at {summary.density:g} kg/m3"),
+        ("volume", f"{_CUBIC_CENTI * volume:.1f} cm3"),
+        ("mass", f"{1e3 * volume * density:.1f} g at {density:g} kg/m3"),
         ("smallest scaled Jacobian", f"{scaled_jacobian(mesh).min():.3f} (1 is ideal, 0 is flat)"),
         ("pieces", f"{body} of the body, {boundary} of its boundary"),
     ]
     for chamber in summary.chambers:
         centre = _millimetres(mesh.vertices[chamber.vertices].mean(axis=0))
-        volume = _CUBIC_CENTI * summary.chamber_volume(chamber)
-        rows.append((chamber.name, f"{len(chamber.faces)} faces, {volume:.2f} cm3, centre ({centre}) mm"))
+        inside = _CUBIC_CENTI * summary.chamber_volume(chamber)
+        rows.append((chamber.name, f"{len(chamber.faces)} faces, {inside:.2f} cm3, centre ({centre}) mm"))
     if not summary.chambers:
         rows.append(("chambers", "none is closed"))
     return rows

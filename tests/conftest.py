@@ -56,24 +56,23 @@ def device(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+def folder_beside_the_repository(name: str, content: str) -> Path:
+    folder = Path(os.environ.get(f"WARP_RESPHYS_{name.upper()}", Path(__file__).parents[2] / "shared" / name))
+    if not folder.is_dir():
+        pytest.skip(f"set WARP_RESPHYS_{name.upper()} to a folder with {content}")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Recordings and meshes that are not part of the repository."""
-    named = os.environ.get("WARP_RESPHYS_DATA")
-    folder = Path(named) if named else Path(__file__).parents[2] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip("no measured data: set WARP_RESPHYS_DATA to a folder with beam_mocap, segment_mocap, sopra_mesh")
-    return folder
+    return folder_beside_the_repository("data", "beam_mocap, segment_mocap, sopra_mesh")
 
 
 @pytest.fixture(scope="session")
 def reference_data() -> Path:
     """Reference trajectories that are not part of the repository."""
-    named = os.environ.get("WARP_RESPHYS_REFERENCE")
-    folder = Path(named) if named else Path(__file__).parents[2] / "shared" / "reference"
-    if not folder.is_dir():
-        pytest.skip("no reference trajectories: set WARP_RESPHYS_REFERENCE to a folder with their .npz files")
-    return folder
+    return folder_beside_the_repository("reference", "the .npz files of reference trajectories")
 
 
 @pytest.fixture(scope="session")

@@ -91,10 +91,7 @@ class Refined:
 def search_from_markers(errors, guess=None, lost=()):
     """Groups of the classes in the order of the search, the best last, and the constants that each began with.
 
-    Args:
-        errors: of the validation trials, by the groups of a class.
-        guess: constants of the identified material.
-        lost: beginnings of the names of constants that a refinement finds to be zero.
+    Errors are those of the validation trials by group; a refinement finds the lost constants to be zero.
     """
     began = []
 

@@ -5,7 +5,6 @@ Here reports read the files, but draw nothing.
 
 import contextlib
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
@@ -14,9 +13,7 @@ from support.configured import settings
 from support.main_job import finish
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
-from warp_resphys.experiment.folds import Fold, run_folds
-from warp_resphys.experiment.trials import folds_of, split_of
-from warp_resphys.io.fan_out import Workers
+from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.stages import StageInterrupted, run_stages
 from warp_resphys.learning.identification import ParameterSearch
@@ -194,20 +191,6 @@ def test_folds(finished, tmp_path, monkeypatch, pages):
     assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in results["folds"].items()}
     assert {f"fold_{trial}" for trial in results["folds"]} <= set(pages)
     assert all((tmp_path / "run" / f"fold_{trial}" / "report.html").is_file() for trial in results["folds"])
-    at_once = tmp_path / "at_once"
-    at_once.mkdir()
-    shutil.copy(tmp_path / "run" / "dataset.h5", at_once)
-    splits = folds_of(settings(*FOLDS))
-    folds = {name: Fold(name, at_once / name, partial(_unreported, split)) for name, split in splits.items()}
-    run_folds(folds, Workers(2))
-    for trial, fold in results["folds"].items():
-        assert read_json(at_once / trial / "errors.json")["errors_mm"] == fold["errors_mm"]
-
-
-def _unreported(split, processes):
-    """The stages of a fold but its report."""
-    wanted = settings(*FOLDS)
-    return learning_stages(wanted, split, "..", "imported", processes)[:-1]
 
 
 def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tmp_path, monkeypatch):

@@ -17,23 +17,15 @@ from warp_resphys.pipeline import acquisition_stages
 
 # The laboratory is the simulator, so that the cap hangs where the import expects it.
 HANGS = [
-    "experiment=beam_regions",
-    "~markers.tracked",
-    "markers.rigid_bodies={plate: {part: cap}}",
-    "mesh.divisions=[10,1,1]",
-    "laboratory.mesh.divisions=[10,1,1]",
+    *("experiment=beam_regions", "~markers.tracked", "markers.rigid_bodies={plate: {part: cap}}"),
+    *("mesh.divisions=[10,1,1]", "laboratory.mesh.divisions=[10,1,1]", "simulation.youngs_modulus=100e3"),
     "laboratory.material={model: corotated, youngs_modulus: 100e3, poissons_ratio: 0.499, density: 1070.0}",
     "laboratory.material.regions={root: {}, tip: {youngs_modulus: 100e3}}",
-    "simulation.youngs_modulus=100e3",
     "simulation.regions={root: {}, tip: {youngs_modulus: 100e3}}",
-    "laboratory.noise=1e-7",
-    "laboratory.placement_noise=0",
-    "laboratory.tilt=0",
+    *("laboratory.noise=1e-7", "laboratory.placement_noise=0", "laboratory.tilt=0", "laboratory.validation=[]"),
     "laboratory.trials={p0: {begins: static}, p30: {begins: static, payload: 0.03}}",
-    "laboratory.validation=[]",
 ]
-
-
+SPLIT = ("laboratory.train=[p0]", "laboratory.test=[p30]")
 BASES = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
 
 
@@ -43,8 +35,12 @@ def imported(folder, *overrides):
     return read_dataset(folder / DATASET)
 
 
+def recorded(folder, train, test):
+    return f"data.folder={folder}", "~data.folds", f"data.train=[{train}]", f"data.test=[{test}]"
+
+
 def test_a_hanging_part_shows_the_mounting(tmp_path):
-    dataset = imported(tmp_path, "laboratory.train=[p0]", "laboratory.test=[p30]")
+    dataset = imported(tmp_path, *SPLIT)
     true = np.array([read_json(tmp_path / TRUTH)["bound"][label] for label in dataset.labels])
     moved = motion_between(true, dataset.observed[0, 0])
     assert np.degrees(Rotation.from_matrix(moved.rotation).magnitude()) > 10.0  # It hangs far down.
@@ -61,7 +57,7 @@ def test_a_mounting_that_no_trial_shows_is_refused(tmp_path):
 @pytest.mark.parametrize(("angle", "train", "test"), [(120.0, "p0", "other"), (5.0, "p0, other", "p30")])
 def test_a_rigid_body_that_was_remounted_is_refused(tmp_path, angle, train, test):
     """By 120 degrees in a test trial; by 5 degrees, 5 mm at its points, between two trials of the training."""
-    imported(tmp_path / "played", "laboratory.train=[p0]", "laboratory.test=[p30]")
+    imported(tmp_path / "played", *SPLIT)
     recording = read_recording(tmp_path / "played" / "recordings" / "p0.h5")
     positions = recording.positions.copy()
     arms = [recording.labels.index(f"plate +{axis}") for axis in "xyz"]
@@ -72,40 +68,20 @@ def test_a_rigid_body_that_was_remounted_is_refused(tmp_path, angle, train, test
     write_recording(tmp_path / "other.h5", replace(recording, positions=positions))
     write_recording(tmp_path / "p30.h5", read_recording(tmp_path / "played" / "recordings" / "p30.h5"))
     trials = "p0: {file: p0.h5, begins: static}, other: {file: other.h5, begins: static}"
-    run = settings(
-        *HANGS,
-        f"data.folder={tmp_path}",
-        f"data.trials={{{trials}, p30: {{file: p30.h5, begins: static, payload: 0.03}}}}",
-        "~data.folds",
-        f"data.train=[{train}]",
-        f"data.test=[{test}]",
-    )
+    given = f"data.trials={{{trials}, p30: {{file: p30.h5, begins: static, payload: 0.03}}}}"
     message = rf"other\.h5: 'plate' is 0\.0 mm and {angle} degrees from its mounting in p0\.h5: where it was remounted"
     with pytest.raises(InputError, match=message):
-        run_stages(acquisition_stages(run), tmp_path)
-
-
-def standing(path, places, frames=20, **arrays):
-    """Writes arrays of markers that stand still, of which 'plate' is a rigid body."""
-    turns = np.where(np.array([*places])[:, None] == "plate", [1.0, 0.0, 0.0, 0.0], np.nan)
-    repeated = (np.repeat(np.array(x)[None], frames, 0) for x in ([*places.values()], turns))
-    named = dict(zip(("positions", "quaternions"), repeated, strict=True))
-    np.savez(path, labels=[*places], rate_hz=100.0, **named, **arrays)
+        imported(tmp_path, given, *recorded(tmp_path, train, test))
 
 
 def test_a_rest_without_an_orientation_is_refused(tmp_path):
+    """Markers that stand still, of which 'plate' is a rigid body."""
     places = {"plate": [0.095, 0.015, 0.015], **BASES}
+    turns = np.where(np.array([*places])[:, None] == "plate", [1.0, 0.0, 0.0, 0.0], np.nan)
+    x, turned = (np.repeat(np.array(own)[None], 20, 0) for own in ([*places.values()], turns))
     for name in "ab":
-        standing(tmp_path / f"{name}.npz", places, rest=[*places.values()])
-    run = settings(
-        *HANGS,
-        f"data.folder={tmp_path}",
-        "data.trials={a: {file: a.npz, begins: released}, b: {file: b.npz, begins: released}}",
-        "data.rest=file",
-        "data.seconds=0.1",
-        "~data.folds",
-        "data.train=[a]",
-        "data.test=[b]",
-    )
+        own = {"positions": x, "quaternions": turned, "rest": x[0]}
+        np.savez(tmp_path / f"{name}.npz", labels=[*places], rate_hz=100.0, **own)
+    trials = "data.trials={a: {file: a.npz, begins: released}, b: {file: b.npz, begins: released}}"
     with pytest.raises(DataFileError, match=r"a\.npz: 'rest' has no orientation of 'plate': set data\.rest to held"):
-        run_stages(acquisition_stages(run), tmp_path)
+        imported(tmp_path, trials, "data.rest=file", "data.seconds=0.1", *recorded(tmp_path, "a", "b"))

@@ -56,14 +56,6 @@ def test_blocks_slide_beyond_the_angle_of_friction_alone(integrator, device):
 
 
 @integrators
-def test_a_block_at_the_angle_of_friction_gains_no_speed(integrator, device):
-    """The slope of PolyFEM: tan a = 0.5, with mu of 0.49 and 0.5."""
-    half, v, _ = slide(np.array([0.49, 0.5]), np.full(2, math.atan(0.5)), integrator, device)
-    slides, sticks = v - half
-    assert sticks < 0.01 * SLIP < SLIP < slides
-
-
-@integrators
 def test_a_sliding_block_stops_after_its_way(integrator, device):
     """From 1 m/s after v^2 / (2 mu g): of first order for implicit Euler; BDF2 is better than the block is rigid."""
     mu, errors = np.array([0.2, 0.5]), []

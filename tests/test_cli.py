@@ -194,6 +194,7 @@ class TestUserErrors:
             ("seed", "unknown command 'seed' (--help lists all)"),
             ("seed=1 inspct", "unknown command 'inspct', did you mean 'inspect'?"),
             ("seed=${nothing}", "Interpolation key 'nothing' not found"),
+            ("material.density=???", "Missing mandatory value: density (at material.density)"),
             ("+seed=1", "Could not append to config. An item is already at 'seed'."),
             ("hydra.run.dir=conf/config.yaml", "cannot write conf/config.yaml (File exists)"),
             ("--config-name other", "Cannot find primary config 'other'."),
@@ -208,28 +209,17 @@ class TestUserErrors:
         assert errors.count("\n") == 1
         assert command.outputs == []
 
-    @pytest.mark.parametrize(
-        ("job", "sentence"),
-        [
+    def test_of_the_job(self, command):
+        for job, sentence in (
             (lambda config: refuse(), "no such body"),
             (lambda config: hydra.utils.instantiate({"_target_": f"{__name__}.refuse"}), "no such body"),
             (lambda config: disk_is_full(), "disk is full while writing picture.png"),
-        ],
-    )
-    def test_of_the_job(self, command, job, sentence):
-        command.job = job
-        code, errors = command()
-        assert code == 2
-        assert errors.startswith(f"error: {sentence}")
-        assert errors.count("\n") == 1
-
-    def test_a_missing_value_is_named(self, command):
-        code, errors = command("material.density=???")
-        assert code == 2
-        assert errors.startswith("error: ")
-        assert errors.count("\n") == 1
-        assert "material.density" in errors
-        assert command.outputs == []
+        ):
+            command.job = job
+            code, errors = command()
+            assert code == 2
+            assert errors.startswith(f"error: {sentence}")
+            assert errors.count("\n") == 1
 
     def test_in_a_sweep_the_other_jobs_run_and_each_error_is_printed_once(self, command):
         def fail(config: dict[str, Any]) -> None:

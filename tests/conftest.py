@@ -4,7 +4,6 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
 
-import shutil
 import weakref
 from collections.abc import Iterator
 from copy import deepcopy
@@ -192,10 +191,3 @@ def finished(tmp_path_factory, kept_renderers):
         first = files()
         assert run(*TINY, IN_RUN)[0] == 0
         return root / "run", first, files()
-
-
-@pytest.fixture
-def copied(finished, folder):
-    """A copy of the complete run, to change."""
-    shutil.copytree(finished[0], "run")
-    return files()

@@ -1,5 +1,4 @@
 # The public names of the package. Type checkers read this file; `__init__.py` imports a name when it is first used.
-from .control.reduced_twin import reduced_twin as reduced_twin
 from .data.camera import CameraMarkers as CameraMarkers
 from .data.camera import Lens as Lens
 from .data.camera import PlacedCamera as PlacedCamera
@@ -90,11 +89,10 @@ from .robot.robot import Robot as Robot
 from .robot.robot_scene import RobotScene as RobotScene
 from .robot.robot_scene import SceneState as SceneState
 from .robot.state import RobotState as RobotState
-from .robot.twin.estimator import TwinNoise as TwinNoise
-from .robot.twin.twin import Twin as Twin
 from .stepping.inputs import Inputs as Inputs
 from .stepping.quantity import Quantity as Quantity
 from .stepping.state import State as State
+from .twin.twin import Twin as Twin
 
 __all__: list[str]
 __version__: str

@@ -14,8 +14,8 @@ from warp_resphys.io.settings import parse
 from warp_resphys.linalg.threads import threads_for
 from warp_resphys.robot.loading import load, trial_names
 from warp_resphys.robot.robot import Robot
-from warp_resphys.robot.twin.twin import Twin
 from warp_resphys.studies.live_twin import TwinSettings, trial_packets
+from warp_resphys.twin.twin import Twin
 
 DEFAULTS: Final[dict[str, Any]] = {
     "horizon": 0.1,  # [s]
@@ -42,11 +42,12 @@ def measure_twin(arguments: argparse.Namespace) -> dict[str, Any]:
     names = arguments.trials or known
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"--trials names {unknown[0]!r}: {arguments.run} has {listed(known)}.")
-    made = settings.twins_of(robot)
+    twin = settings.twin(robot)
     with threads_for(1), Progress("twin", len(names), "trials") as progress:
         rows = []
         for name in names:
-            rows.append(followed(robot, name, made(), settings.planned, arguments.every))
+            twin.reset()
+            rows.append(followed(robot, name, twin, settings.planned, arguments.every))
             progress.advance()
     return {f"twin, {settings.engine}, {settings.horizon:g} s ahead": rows}
 

@@ -16,21 +16,19 @@ from warp_resphys.control import sampling
 from warp_resphys.control.estimate import Estimator, Noise
 from warp_resphys.control.files import plans_file, read_plan, read_reduced, reduced_file
 from warp_resphys.control.laboratory import Laboratory
-from warp_resphys.control.open_loop import Follower
-from warp_resphys.control.plan import Horizon, Limits, Planner
 from warp_resphys.control.polynomials import SquaredPolynomial
-from warp_resphys.control.reduced_twin import ReducedEstimator, reduced_twin
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.replay import driven_settings, replay
-from warp_resphys.control.sampling import Sampling, check_plannable
+from warp_resphys.control.sampling import check_plannable
 from warp_resphys.control.stages import controllers_of
 from warp_resphys.control.task import Task
 from warp_resphys.environments.worlds import ReducedWorld
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5
-from warp_resphys.robot.twin.estimator import TwinNoise
-from warp_resphys.studies.gradient_check import central_difference
+from warp_resphys.settings.control import ReductionSettings
 from warp_resphys.studies.live_twin import TwinSettings
+from warp_resphys.twin.reduced import ReducedEstimator
+from warp_resphys.twin.twin import Twin
 
 CONTROL = [
     "experiment=tendon_rod_control",
@@ -130,8 +128,8 @@ class TestReducedModel:
     def test_of_several_numbers_of_modes_the_best_is_taken(self, folder):
         """Of one, one of a pair of vibrations of a round rod is missing."""
         robot = warp_resphys.load(folder, "sysid")
-        sampling = Sampling((1, 4), equilibria=48, tangents=24, motions=3, seconds=2.0)
-        quality = reduce(robot, sampling).quality
+        samples = ReductionSettings(modes=(1, 4), equilibria=48, tangents=24, motions=3, seconds=2.0)
+        quality = reduce(robot, samples).quality
         assert quality["modes"] == 4
         assert list(quality["tried"]) == ["1", "4"]
         assert quality["window_relative"] == quality["tried"]["4"] < 0.5 * quality["tried"]["1"]
@@ -139,7 +137,7 @@ class TestReducedModel:
     def test_a_material_that_relaxes_keeps_its_branches(self, folder):
         """Small vibrations after a push are those of the full robot, and others without the branches."""
         robot = warp_resphys.load(folder, "sysid").with_parameters(prony_ratio_1=1.5)
-        model = reduce(robot, Sampling((4,), equilibria=20, tangents=20, motions=2, seconds=0.4))
+        model = reduce(robot, ReductionSettings(modes=(4,), equilibria=20, tangents=20, motions=2, seconds=0.4))
         assert model.times == (0.05,)
         start, speed = robot.begin(), 1e-2 * model.basis[:, 0].reshape(1, -1, 3)
         pushed = replace(start, body=replace(start.body, v=robot.simulator.tensor(speed)))
@@ -197,7 +195,7 @@ class TestReducedModel:
 
     def test_a_data_driven_robot_is_refused(self, folder):
         with pytest.raises(InputError, match="no stiffness"):
-            reduce(warp_resphys.load(folder, "simfree"), Sampling())
+            reduce(warp_resphys.load(folder, "simfree"), ReductionSettings())
 
     def test_a_path_out_of_reach_is_named_with_the_nearest_point(self, folder, model, robot):
         far = control_of(folder).changed(centre=[0.0, 0.0, -0.35])
@@ -227,11 +225,8 @@ class TestReducedTwin:
         motion = corrected.rollout(start, 60, tendon_tension=cls.commands).markers[:, 0].numpy()
         return motion + cls.noise * np.random.default_rng(0).standard_normal(motion.shape)
 
-    def twin(self, corrected, **more):
-        return reduced_twin(corrected, noise=TwinNoise(markers=self.noise), **more)
-
     def test_it_looks_ahead(self, corrected, swing):
-        twin = self.twin(corrected, horizon=0.1)
+        twin = Twin(corrected, "reduced", horizon=0.1, noise=self.noise)
         for number, frame in enumerate(swing):
             twin.take(number * corrected.time_step, frame, tendon_tension=self.commands)
             if number > 10:
@@ -251,15 +246,13 @@ class TestReducedTwin:
         settings = TwinSettings(
             horizon=0.1, patience=0.3, align=False, refine={}, noise=2e-4, planned=True, engine="reduced"
         )
-        make = settings.twins_of(warp_resphys.load(folder))
-        twin = make()
+        twin = settings.twin(warp_resphys.load(folder))
         assert isinstance(twin.estimator, ReducedEstimator)
-        assert make().estimator.model is twin.estimator.model
         assert ", resphys, by its reduced model: steps of 10 ms, predictions 0.1 s ahead, no packet yet" in repr(twin)
         with pytest.raises(InputError, match="no youngs_modulus to refine"):
-            settings.changed(refine={"youngs_modulus": 1e3}).twins_of(twin.estimator.robot)
+            settings.changed(refine={"youngs_modulus": 1e3}).twin(twin.estimator.robot)
         with pytest.raises(InputError, match=r"robot is '.*': give the robot of a run, as warp_resphys\.load"):
-            reduced_twin(str(folder))
+            Twin(str(folder), "reduced")
 
 
 @pytest.mark.slow
@@ -276,24 +269,6 @@ class TestPlans:
         errors = read_plan(folder / plans_file("resphys"), "circle_0.4s").errors_mm
         assert len(errors) == 3
         assert errors.min() < 0.7 * errors[0]
-
-    def test_the_gradient_of_the_adjoint_is_a_difference(self, robot, model):
-        tracked = np.eye(18)[-3:]
-        limits = Limits(np.zeros(3), np.full(3, 1.5), np.full(3, 50.0))
-        planner = Planner(model, tracked, limits, Horizon(6, 2))
-        follower = Follower(robot, model, planner, 1, "adjoint")
-        random = np.random.default_rng(2)
-        knots, paths = 0.2 + random.random((1, 3, 3)), np.full((1, 6, 3), 0.01)
-        gradient = follower._play(knots, paths, True, lambda steps: None)[1]
-        way = random.standard_normal(knots.shape)
-
-        def half(x):
-            markers = follower._play(knots + 0.05 * x * way, paths, False, lambda steps: None)[0]
-            points = markers[:, 1:] @ tracked.T
-            return float(0.5 * np.square(points - paths).sum())
-
-        difference, doubt = central_difference(half)
-        assert abs(0.05 * (gradient * way).sum() - difference) < 1e-3 * abs(difference) + 10.0 * doubt
 
 
 @pytest.mark.slow

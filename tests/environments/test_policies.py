@@ -9,10 +9,11 @@ from benchmarks.steps import environments
 
 from support.main_job import end_of
 from warp_resphys import cli
-from warp_resphys.control.sampling import Sampling
+from warp_resphys.control import reduction
 from warp_resphys.environments import making
 from warp_resphys.environments.making import make_vector
 from warp_resphys.environments.policies import ScriptedPolicy, acting, errors_mm, learn
+from warp_resphys.settings.control import ReductionSettings
 from warp_resphys.studies.policy import _text
 
 
@@ -84,8 +85,8 @@ def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
 
     monkeypatch.setattr("warp_resphys.environments.policies.errors_mm", counted)
     monkeypatch.setattr(making, "make_vector", partial(make_vector, seconds=0.2))
-    few = partial(Sampling, (4,), equilibria=24, tangents=12, motions=2, seconds=0.8)
-    monkeypatch.setattr(making, "Sampling", few)
+    few = ReductionSettings(modes=(4,), equilibria=24, tangents=12, motions=2, seconds=0.8)
+    monkeypatch.setattr(reduction, "ReductionSettings", lambda: few)
 
     def commanded(steps, seeds):
         code, err = end_of(cli.main, *arguments, f"steps={steps}", f"seeds={seeds}", "episodes=2", "hydra.run.dir=here")

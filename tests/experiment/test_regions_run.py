@@ -13,7 +13,7 @@ from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.experiment.files import DATASET, REGISTRATION, TRUTH, read_dataset
 from warp_resphys.io.files import read_array, read_hdf5, read_json
 from warp_resphys.robot.description import Description, describe
-from warp_resphys.robot.twin.stream import recorded_packets
+from warp_resphys.twin.stream import recorded_packets
 
 TINY = [
     *("experiment=beam_regions", "budget=quick", "mesh.divisions=[10,1,1]", "laboratory.mesh.divisions=[10,1,1]"),

@@ -9,9 +9,9 @@ import pytest
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load, recorded_trial
-from warp_resphys.robot.twin.stream import Packet
 from warp_resphys.studies.live_twin import LiveTwin, TwinSettings, planned_packets
 from warp_resphys.studies.view import Page
+from warp_resphys.twin.stream import Packet
 
 SETTINGS = TwinSettings(horizon=0.02, patience=0.3, align=False, refine={}, noise=1e-4, planned=False, engine="full")
 

@@ -8,11 +8,13 @@ has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
 
-from ..robot.twin.kalman import conditioned
 from .polynomials import Monomials
 from .reduced import ReducedModel
 from .world import FloatArray
+
+_JITTER = 1e-12  # of a correlation matrix, which is singular where a quantity is known exactly
 
 
 @dataclass(frozen=True)
@@ -78,3 +80,29 @@ class Estimator:
         z, v = self.state.z + change[:r], self.state.v + change[r : 2 * r]
         self.state = replace(self.state, z=z, v=v)
         self.bias = self.bias + change[2 * r :]
+
+
+def conditioned(
+    covariance: FloatArray, slopes: FloatArray, residual: FloatArray, deviation: float
+) -> tuple[FloatArray, FloatArray]:
+    """Conditions n jointly normal errors on m observations with independent noise.
+
+    In the square-root form of Bierman (1977), which stays positive definite, and costs n^3 however many observations.
+
+    Args:
+        covariance: (n, n).
+        slopes: (m, n) of the observations.
+        residual: (m,) observed minus expected.
+        deviation: standard deviation of the noise.
+
+    Returns:
+        The change of the mean (n,), and the covariance (n, n) after it.
+    """
+    size = np.sqrt(np.diag(covariance))
+    size = np.where(size > 0.0, size, 1.0)
+    scaled = covariance / size / size[:, None]
+    root = size[:, None] * np.linalg.cholesky(scaled + _JITTER * np.eye(len(size)))
+    seen = (slopes @ root).T / deviation
+    gained = scipy.linalg.solve(np.eye(len(size)) + seen @ seen.T, root.T, assume_a="pos").T
+    after = gained @ root.T
+    return gained @ (seen @ residual) / deviation, 0.5 * (after + after.T)

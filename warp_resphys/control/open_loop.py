@@ -1,8 +1,7 @@
 """Inputs for whole motions, planned on a reduced model and corrected with the full simulator.
 
-The reduced model plans, the robot's simulator plays the plan, and a Gauss-Newton step reduces the remaining error. Its
-slopes are those of the reduced model (iterative learning control on the simulated robot); its gradient can come from
-the adjoint of the full simulator, which is right where the reduced model is wrong.
+The reduced model plans, the robot's simulator plays the plan, and a Gauss-Newton step with the slopes of the reduced
+model reduces the remaining error (iterative learning control on the simulated robot).
 """
 
 from collections.abc import Callable
@@ -30,14 +29,10 @@ class Follower:
         model: its reduced model.
         planner: for the number of steps of the motions.
         corrections: number of corrections by the robot.
-        gradient: ``reduced`` or ``adjoint``.
     """
 
-    def __init__(
-        self, robot: Robot, model: ReducedModel, planner: Planner, corrections: int, gradient: str = "reduced"
-    ) -> None:
-        self._robot, self._model, self._planner = robot, model, planner
-        self._corrections, self._gradient = corrections, gradient
+    def __init__(self, robot: Robot, model: ReducedModel, planner: Planner, corrections: int) -> None:
+        self._robot, self._model, self._planner, self._corrections = robot, model, planner, corrections
 
     @property
     def rollouts(self) -> int:
@@ -62,16 +57,14 @@ class Follower:
         errors, best = [], np.full(len(paths), np.inf)
         kept, kept_markers = knots.copy(), list[FloatArray](paths)
         steps, shares = np.zeros_like(knots), np.ones(len(paths))
-        for number in range(self.rollouts):
-            adjoint = self._gradient == "adjoint" and number < self._corrections
-            markers, gradients = self._play(knots, paths, adjoint, on_progress)
+        for _ in range(self.rollouts):
+            markers = self._play(planner.lines @ knots, on_progress)
             points = markers[:, 1:] @ planner.tracked.T
             errors.append(1e3 * np.linalg.norm(points - paths, axis=2).mean(1))
             for row, (path, error) in enumerate(zip(paths, errors[-1], strict=True)):
                 if error < best[row]:
                     best[row], kept[row], kept_markers[row], shares[row] = error, knots[row], markers[row], 1.0
-                    slope = None if gradients is None else gradients[row]
-                    steps[row] = planner.corrected(start, knots[row], points[row] - path, slope) - knots[row]
+                    steps[row] = planner.corrected(start, knots[row], points[row] - path) - knots[row]
                 else:
                     shares[row] *= _SHORTER
                 knots[row] = kept[row] + shares[row] * steps[row]
@@ -81,26 +74,11 @@ class Follower:
             for path, knots, markers, mm in rows
         ]
 
-    def _play(
-        self, knots: FloatArray, paths: FloatArray, adjoint: bool, on_progress: OnProgress
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Plays plans on the robot.
-
-        Returns:
-            (B, T + 1, 3 M) markers [m]; and with ``adjoint``, (B, K, n) the gradient of half the sum of squared
-            distances from the paths with respect to the knots.
-        """
-        robot, planner, name = self._robot, self._planner, self._model.name
-        tensor = robot.simulator.tensor
-        chosen = tensor(knots).requires_grad_(adjoint)
-        inputs: dict[str, Any] = {name: torch.einsum("tk,bkn->tbn", tensor(planner.lines), chosen)}
-        with torch.set_grad_enabled(adjoint):
-            start = robot.begin(len(knots), **{name: planner.limits.low})
-            motion = robot.rollout(start, on_step=lambda number: on_progress(1), **inputs)
-            markers = motion.markers.flatten(2).swapaxes(0, 1)
-            if not adjoint:
-                return markers.double().cpu().numpy(), None
-            points = markers[:, 1:] @ tensor(planner.tracked).mT
-            half = 0.5 * (points - torch.as_tensor(paths).to(points)).square().sum()
-            (slope,) = torch.autograd.grad(half, chosen)
-        return markers.detach().double().cpu().numpy(), slope.cpu().double().numpy()
+    @torch.no_grad()
+    def _play(self, inputs: FloatArray, on_progress: OnProgress) -> FloatArray:
+        """Returns the markers (B, T + 1, 3 M) of the robot under inputs (B, T, n) [m]."""
+        robot, name = self._robot, self._model.name
+        start = robot.begin(len(inputs), **{name: self._planner.limits.low})
+        given: dict[str, Any] = {name: robot.simulator.tensor(inputs.swapaxes(0, 1))}
+        motion = robot.rollout(start, on_step=lambda number: on_progress(1), **given)
+        return np.asarray(motion.markers.flatten(2).swapaxes(0, 1).double().cpu().numpy())

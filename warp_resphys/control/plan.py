@@ -181,31 +181,26 @@ class Planner:
         for _ in range(self._horizon.iterations):
             response = self.model.respond(start, self.lines @ knots, self._basis, bias)
             assert response.slopes is not None
-            step = self._step(response.slopes, response.y @ self.tracked.T - goal, knots, None)
+            step = self._step(response.slopes, response.y @ self.tracked.T - goal, knots)
             knots[1:] += limits.range * step.reshape(-1, self.model.parts)
             if np.abs(step).max() < _ENOUGH:
                 break
         return Plan(self.lines @ knots, knots)
 
-    def corrected(
-        self, start: Any, knots: FloatArray, errors: FloatArray, gradient: FloatArray | None = None
-    ) -> FloatArray:
+    def corrected(self, start: Any, knots: FloatArray, errors: FloatArray) -> FloatArray:
         """Returns improved knots (K, n), by one Gauss-Newton step from measured errors.
 
         Args:
             start: state of the model.
             knots: (K, n) that were played.
             errors: (T, d) of the robot's points from the path [m].
-            gradient: (K, n) of half the sum of squared errors with respect to the knots; the model's if omitted.
         """
         slopes = self.model.respond(start, self.lines @ knots, self._basis).slopes
         assert slopes is not None
-        step = self._step(slopes, errors, knots, gradient)
+        step = self._step(slopes, errors, knots)
         return np.concatenate([knots[:1], knots[1:] + self.limits.range * step.reshape(-1, self.model.parts)])
 
-    def _step(
-        self, slopes: FloatArray, errors: FloatArray, knots: FloatArray, gradient: FloatArray | None
-    ) -> FloatArray:
+    def _step(self, slopes: FloatArray, errors: FloatArray, knots: FloatArray) -> FloatArray:
         """Change (P,) of the knots after the first, as shares of the inputs' ranges."""
         count, weights, limits = max(errors.size, 1), self._horizon.weights, self.limits
         first, *others = (knots - limits.low) / limits.range
@@ -213,8 +208,6 @@ class Planner:
         finite = np.isfinite(errors).ravel()
         j = 1e3 * (self.tracked @ slopes).reshape(errors.size, -1) * finite[:, None]
         pull = j.T @ (1e3 * np.where(finite, errors.ravel(), 0.0))
-        if gradient is not None:
-            pull = 1e6 * (gradient[1:] * limits.range).ravel()
         d = self._difference / self._most[:, None]
         start = np.concatenate([first, np.zeros(len(x) - len(first))])
         jump = d @ x - start / self._most

@@ -2,8 +2,11 @@
 
 import hashlib
 import json
+import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -11,18 +14,24 @@ import scipy.linalg
 import torch
 from numpy.typing import ArrayLike
 
-from ..io.errors import ConvergenceError
+from ..io.errors import ConvergenceError, DataFileError
 from ..io.files import to_plain
+from ..io.progress import Progress
 from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..robot.state import RobotState
+from ..settings.control import ReductionSettings
 from ..stepping.state import State
+from .files import read_reduced, reduced_file, write_reduced
 from .polynomials import Polynomial, SquaredPolynomial, best_order, solve_ridge
 from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
-from .sampling import Motions, OnProgress, Sampling, Source, Tangent, check_reducible, driven_input
+from .sampling import Motions, OnProgress, Source, Tangent, check_reducible, driven_input
 from .world import FloatArray
 
+log = logging.getLogger(__name__)
+
+_MUCH: Final = 0.1  # error of a model over the motion, above which a warning is logged
 STATIC_ORDER: Final = 3  # at least, as are those of the tangents
 TANGENT_ORDER: Final = 2
 USUAL_ORDER: Final = 1
@@ -41,13 +50,59 @@ class _Statics(NamedTuple):
     outputs: FloatArray | None  # (S, c) of the network
 
 
-def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda steps: None) -> ReducedModel:
+def reduced_of(robot: Robot) -> ReducedModel:
+    """Returns the reduced model of a robot, from its run's folder; it is computed and kept there the first time.
+
+    That of a robot with other parameters than its run has identified is not kept. A twin and environments use it.
+
+    Raises:
+        InputError: the robot cannot be reduced.
+        ConvergenceError: it has no equilibrium for inputs in the range of its trials.
+    """
+    check_reducible(robot)
+    path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
+    model = _kept(path, robot) or _computed(path, robot)
+    off, moved = model.quality["window_error_mm"], model.quality["window_motion_mm"]
+    if off > _MUCH * moved:
+        log.warning(
+            "The reduced model is %.2g mm off in motions of %.2g mm: compare it with the full simulator.", off, moved
+        )
+    return model
+
+
+def _kept(path: Path | None, robot: Robot) -> ReducedModel | None:
+    """The reduced model in a file; None if that is missing, damaged, of an earlier version, or of another robot."""
+    if path is not None and path.exists():
+        with suppress(DataFileError):
+            model = read_reduced(path, robot.description.learned)
+            if model.robot == fingerprint(robot):
+                return model
+    return None
+
+
+def _computed(path: Path | None, robot: Robot) -> ReducedModel:
+    """The reduced model, kept in a file if the robot has the parameters that its run has identified."""
+    samples = ReductionSettings()
+    with Progress("reduced model", samples.total, "samples") as progress:
+        model = reduce(robot, samples, on_progress=progress.advance)
+    if path is not None and fingerprint(robot) == fingerprint(robot.with_parameters(**robot.description.parameters)):
+        try:
+            write_reduced(path, model)
+        except DataFileError as error:
+            log.warning("The reduced model is not kept for the next time: %s", error)
+    return model
+
+
+def reduce(
+    robot: Robot, samples: ReductionSettings, seed: int = 0, on_progress: OnProgress = lambda steps: None
+) -> ReducedModel:
     """Fits the reduced model of a robot.
 
     Args:
         robot: a simulator, with or without a learned force, driven by one input.
-        sampling: amount of samples.
-        on_progress: called with the number of further samples done, of ``sampling.total``.
+        samples: amount of samples.
+        seed: of the random inputs.
+        on_progress: called with the number of further samples done, of ``samples.total``.
 
     Raises:
         InputError: the robot cannot be reduced, or is not driven by exactly one input.
@@ -55,20 +110,20 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
     """
     check_reducible(robot)
     source = Source(robot, driven_input(robot))
-    motions = source.motions(sampling, on_progress)
-    statics = _equilibria(source, sampling, on_progress)
+    motions = source.motions(samples, seed, on_progress)
+    statics = _equilibria(source, samples.equilibria, seed, on_progress)
     tangents = []
-    for row in range(min(sampling.tangents, len(statics.u))):
+    for row in range(min(samples.tangents, len(statics.u))):
         outputs = None if statics.outputs is None else statics.outputs[row]
-        tangents.append(source.tangent(statics.q[row : row + 1], statics.commands[row], max(sampling.modes), outputs))
+        tangents.append(source.tangent(statics.q[row : row + 1], statics.commands[row], max(samples.modes), outputs))
         on_progress(1)
-    on_progress(sampling.tangents - len(tangents))
-    counts = {"asked": sampling.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
+    on_progress(samples.tangents - len(tangents))
+    counts = {"asked": samples.equilibria, "equilibria": len(statics.u), "tangents": len(tangents)}
     models, failures = [], []
-    for modes in sampling.modes:
+    for modes in samples.modes:
         slowest = [tangent.slowest(modes) for tangent in tangents]
         try:
-            models.append(_fitted(source, slowest, statics, motions, sampling.motions))
+            models.append(_fitted(source, slowest, statics, motions, samples.motions))
         except ConvergenceError as error:
             failures.append(error)
     if not models:
@@ -76,7 +131,7 @@ def reduce(robot: Robot, sampling: Sampling, on_progress: OnProgress = lambda st
     best = min(models, key=lambda model: model.quality["window_error_mm"])
     best = replace(best, robot=fingerprint(robot))
     tried = {str(model.modes): model.quality["window_relative"] for model in models}
-    return replace(best, quality={**best.quality, **counts, "motions": sampling.motions, "tried": tried})
+    return replace(best, quality={**best.quality, **counts, "motions": samples.motions, "tried": tried})
 
 
 def fingerprint(robot: Robot) -> str:
@@ -119,7 +174,7 @@ def _fitted(
     return replace(model, quality={**quality, "modes": model.modes, "frequencies_hz": np.sort(frequency).tolist()})
 
 
-def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> _Statics:
+def _equilibria(source: Source, asked: int, seed: int, on_progress: OnProgress) -> _Statics:
     """Equilibria under a low-discrepancy sequence of inputs, the first of which is zero.
 
     Raises:
@@ -127,8 +182,7 @@ def _equilibria(source: Source, sampling: Sampling, on_progress: OnProgress) -> 
     """
     from scipy.stats import qmc
 
-    asked = sampling.equilibria
-    unit = qmc.Sobol(source.parts, seed=sampling.seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))[:asked]
+    unit = qmc.Sobol(source.parts, seed=seed).random(2 ** int(np.ceil(np.log2(max(asked, 2)))))[:asked]
     commands = source.commands(unit)
     commands[0] = np.clip(0.0, *source.commands(np.array([[0.0], [1.0]])))
     batches = []

@@ -18,6 +18,7 @@ from ..io.errors import InputError
 from ..robot.inputs import RobotInput
 from ..robot.robot import Robot
 from ..robot.state import RobotState
+from ..settings.control import ReductionSettings
 from ..settings.trials import SequenceSettings
 from ..stepping.state import State
 from .world import FloatArray
@@ -30,37 +31,6 @@ _MEAN, _DEVIATION = 0.4, 0.45  # of sampled inputs, as shares of their range
 # Correlation times of the inputs [s]: the shortest in motions for fitting, the shortest in those for the error, and the
 # longest in both.
 _FASTEST, _FAST, _SLOWEST = 0.05, 0.25, 0.45
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Amount of samples.
-
-    Attributes:
-        modes: candidate numbers r of coordinates; the one with the least error is chosen.
-        equilibria: number of equilibria, for z_0 and y_0.
-        tangents: number of equilibria about which vibrations are computed.
-        motions: number of motions for H; as many more measure the error.
-        seconds: of a motion.
-        seed: of the random inputs.
-    """
-
-    modes: tuple[int, ...] = (4, 6, 8)
-    equilibria: int = 192
-    tangents: int = 96
-    motions: int = 6
-    seconds: float = 2.5
-    seed: int = 0
-
-    @property
-    def total(self) -> int:
-        """Units of progress: equilibria, tangents, and tenths of a second of the motions."""
-        return self.equilibria + self.tangents + self.tenths
-
-    @property
-    def tenths(self) -> int:
-        """Tenths of a second of a motion."""
-        return max(round(10 * self.seconds), 4)
 
 
 @dataclass(frozen=True)
@@ -272,27 +242,27 @@ class Source:
         by = encode(conditions + torch.as_tensor(changes).to(conditions)) - base
         return base[0].cpu().numpy(), by.mT.cpu().numpy()
 
-    def motions(self, sampling: Sampling, on_progress: OnProgress) -> Motions:
+    def motions(self, samples: ReductionSettings, seed: int, on_progress: OnProgress) -> Motions:
         """Simulates motions under smooth random inputs; the first half, for fitting, includes faster ones."""
-        robot, steps = self.robot, max(round(sampling.seconds / self.robot.time_step), 20)
-        random, batch = np.random.default_rng(sampling.seed), 2 * sampling.motions
+        robot, steps = self.robot, max(round(samples.seconds / self.robot.time_step), 20)
+        random, batch = np.random.default_rng(seed), 2 * samples.motions
         drawn = []
         for number in range(batch):
-            fastest = _FASTEST if number < sampling.motions else _FAST
+            fastest = _FASTEST if number < samples.motions else _FAST
             time = float(np.exp(random.uniform(np.log(fastest), np.log(_SLOWEST))))
             rest = 2.0 * robot.time_step
             source = SequenceSettings(mean=_MEAN, deviation=_DEVIATION, correlation_time=time, rest=rest)
             drawn.append(draw_inputs(source, 1.0, steps, robot.time_step, self.parts, random)[1:])
         commands = self.commands(np.stack(drawn, axis=1))
-        every = max(steps // sampling.tenths, 1)
+        every = max(steps // samples.tenths, 1)
 
         def on_step(number: int) -> None:
-            if number % every == 0 and number <= every * sampling.tenths:
+            if number % every == 0 and number <= every * samples.tenths:
                 on_progress(1)
 
         with torch.no_grad():
             motion = robot.rollout(robot.begin(batch), on_step=on_step, **self.given(commands))
-        on_progress(max(sampling.tenths - steps // every, 0))
+        on_progress(max(samples.tenths - steps // every, 0))
         y = motion.markers.flatten(2).double().cpu().numpy()
         return Motions(
             motion.q.float(),

@@ -48,7 +48,7 @@ from .files import (
 from .laboratory import Laboratory
 from .open_loop import Follower
 from .reduction import reduce
-from .sampling import Sampling, check_plannable, driven_input
+from .sampling import check_plannable, driven_input
 from .task import Task, motion_name, motions_of
 from .world import FloatArray
 
@@ -64,10 +64,9 @@ def reduce_robot(context: StageContext) -> None:
     """
     settings: ReduceStage = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    sampling = Sampling(**dict(settings.reduction), seed=settings.seed)
     check_plannable(robot)
-    with Progress(context.name, sampling.total, "samples") as progress:
-        reduced = reduce(robot, sampling, progress.advance)
+    with Progress(context.name, settings.reduction.total, "samples") as progress:
+        reduced = reduce(robot, settings.reduction, settings.seed, progress.advance)
     write_reduced(context.run_dir / reduced_file(settings.model), reduced)
 
 
@@ -91,7 +90,7 @@ def plan_motions(context: StageContext) -> None:
     kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
     plans = {} if kept is None else plans_from_plain(*kept)
     followers = {
-        seconds: Follower(robot, reduced, task.planner(reduced, seconds), plan.corrections, plan.gradient)
+        seconds: Follower(robot, reduced, task.planner(reduced, seconds), plan.corrections)
         for seconds in settings.figures.seconds
     }
     work = {seconds: follower.rollouts * task.steps(seconds) for seconds, follower in followers.items()}

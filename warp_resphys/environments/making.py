@@ -1,6 +1,5 @@
 """Makes environments of a run by the name of a task, and registers the tasks in Gymnasium."""
 
-import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -11,15 +10,12 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..control.files import read_reduced, reduced_file
 from ..control.laboratory import Laboratory
 from ..control.plan import tracked_of
-from ..control.reduced import ReducedModel
-from ..control.reduction import reduce
-from ..control.sampling import Sampling, driven_input
+from ..control.reduction import reduced_of
+from ..control.sampling import driven_input
 from ..control.world import FloatArray, World
 from ..io.errors import InputError
-from ..io.progress import Progress
 from ..io.settings import parse
 from ..io.stages import finished_record
 from ..robot.gripper import laboratory_robot
@@ -109,7 +105,7 @@ def make_vector(
         name, mixed = (BASE, along) if swings else (driven_input(robot).name, None)
         bodies = RobotWorld(robot, name, num_envs, spread, mixed, shown)
     elif world == "reduced":
-        bodies = ReducedWorld(_reduced(robot, Path(run).expanduser(), seed), num_envs)
+        bodies = ReducedWorld(reduced_of(robot), num_envs)
     else:
         folder = Path(run).expanduser()
         settings = parse(LaboratoryStage, finished_record(folder, "laboratory")["settings"]).changed(device="cpu")
@@ -183,28 +179,6 @@ def _up(robot: Robot) -> FloatArray:
     """Direction (3,) against gravity; z without gravity."""
     up = -np.asarray(robot.simulator.gravity, dtype=np.float64)
     return up if up.any() else np.array([0.0, 0.0, 1.0])
-
-
-def _reduced(robot: Robot, run: Path, seed: int) -> ReducedModel:
-    """Reads the reduced model of the run, or computes one."""
-    description = robot.description
-    path = run / reduced_file(description.model)
-    if path.is_file():
-        finished_record(run, f"reduce_{description.model}")
-        return read_reduced(path, description.learned)
-    record = run / "stages" / "evaluate.json"
-    written = (record if record.is_file() else run).stat().st_mtime
-    return _new_reduced(str(run), written, description.model, seed)
-
-
-@functools.lru_cache(maxsize=4)
-def _new_reduced(run: str, written: float, model: str, seed: int) -> ReducedModel:
-    """Computes a reduced model, which takes minutes; cached until the run is written again."""
-    del written
-    sampling = Sampling(seed=seed)
-    with Progress("reduced model", sampling.total, "samples") as progress:
-        robot = load(run, model if Path(run).is_dir() else None, "cpu", "count")
-        return reduce(robot, sampling, progress.advance)
 
 
 def _fixed(robot: Robot) -> FloatArray:

@@ -28,10 +28,6 @@ from .description import Description
 from .inputs import Given, InputReader, inputs_of
 from .motion import Motion
 from .state import RobotState
-from .twin.estimator import TwinNoise
-from .twin.full import FullEstimator
-from .twin.kalman import Gate
-from .twin.twin import Twin
 
 SUFFIX: Final = ".safetensors"
 
@@ -393,41 +389,6 @@ class Robot:
             known_inputs=self.inputs,
             final=state,
             obstacles=self.simulator.obstacle_motions([state.body for state in states], self.constants),
-        )
-
-    def twin(
-        self,
-        refine: Mapping[str, float] | None = None,
-        horizon: float = 0.2,
-        patience: float = 0.3,
-        modes: int = 8,
-        noise: TwinNoise | None = None,
-        gate: Gate | None = None,
-        start: RobotState | None = None,
-        **inputs: Given,
-    ) -> Twin:
-        """Returns a twin: this robot, which follows the real one by its markers and looks ahead.
-
-        Corrections excite vibrations that the midpoint rule would keep, so that BDF2 steps in its place.
-
-        Args:
-            refine: standard deviations of parameters that are refined on the way, by name, in their units.
-            horizon: of predictions [s].
-            patience: how late packets may come [s].
-            modes: vibrations in which the state is corrected.
-            noise: of markers and simulator.
-            gate: for markers that jump.
-            start: state at the first packet, one environment; the equilibrium under its commands if omitted.
-            inputs: commands before the first packet, as for `step`.
-
-        Raises:
-            InputError: an unknown input or parameter, or a network in place of the simulator.
-            ConvergenceError: there is no equilibrium.
-        """
-        if noise is not None and not isinstance(noise, TwinNoise):
-            raise InputError(f"noise is {noise!r}: give warp_resphys.TwinNoise(markers={noise!r}).")
-        return Twin(
-            FullEstimator(self.without_midpoint(), inputs, refine, modes, noise, gate, start), horizon, patience
         )
 
     def without_midpoint(self) -> "Robot":

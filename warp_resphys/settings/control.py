@@ -29,9 +29,6 @@ class PlanSettings(Settings):
     """Plans of whole motions."""
 
     corrections: Count = setting(3, "with the robot's simulator")
-    gradient: Literal["reduced", "adjoint"] = setting(
-        "reduced", "of corrections: reduced model, or the simulator's adjoint"
-    )
     reach: Positive = setting(1.0e-3, "largest distance of a path from reachable points", "m")
 
 
@@ -43,7 +40,7 @@ class FeedbackSettings(Settings):
 
 
 class ReductionSettings(Settings):
-    """Samples for reduced models, `control.sampling.Sampling`."""
+    """Samples for reduced models."""
 
     modes: Annotated[Some[Natural], AfterValidator(different)] = setting(
         (4, 6, 8), "numbers of coordinates, of which the best is chosen"
@@ -52,6 +49,16 @@ class ReductionSettings(Settings):
     tangents: Natural = setting(96, "number of these states whose vibrations are computed")
     motions: Natural = setting(6, "number of motions for the fit, and as many for its error")
     seconds: Positive = setting(2.5, "duration of a motion", "s")
+
+    @property
+    def tenths(self) -> int:
+        """Tenths of a second of a motion."""
+        return max(round(10 * self.seconds), 4)
+
+    @property
+    def total(self) -> int:
+        """Units of progress: equilibria, tangents, and tenths of a second of the motions."""
+        return self.equilibria + self.tangents + self.tenths
 
 
 class FigureSettings(Settings):

@@ -11,15 +11,13 @@ from typing import Any, ClassVar, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..control.reduced_twin import reduced_twin
 from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
-from ..robot.twin.estimator import TwinNoise
-from ..robot.twin.scores import Forecast
-from ..robot.twin.stream import Alignment, Listener, Packet, recorded_packets
-from ..robot.twin.twin import JUMPS, Estimate, Twin
+from ..twin.scores import Forecast
+from ..twin.stream import Alignment, Listener, Packet, recorded_packets
+from ..twin.twin import JUMPS, Estimate, Twin
 
 FloatArray = NDArray[np.float64]
 _REMEMBERED: Final = 2000  # computing times
@@ -45,18 +43,9 @@ class TwinSettings(Settings):
     planned: bool
     engine: Literal["full", "reduced"]
 
-    def twins_of(self, robot: Robot) -> Callable[[], Twin]:
-        """Returns a function that makes twins with these settings, all on one reduced model where they are reduced.
-
-        Raises:
-            InputError: the robot cannot be reduced; the function raises it where the robot has no such parameter, or no
-                simulator.
-        """
-        noise = TwinNoise(markers=self.noise)
-        if self.engine == "full":
-            return lambda: robot.twin(self.refine, self.horizon, self.patience, noise=noise)
-        estimator = reduced_twin(robot, self.horizon, self.patience, noise, refine=self.refine).estimator
-        return lambda: Twin(estimator, self.horizon, self.patience)
+    def twin(self, robot: Robot) -> Twin:
+        """Returns a twin of a robot with these settings; raises the errors of `Twin`."""
+        return Twin(robot, self.engine, self.refine, self.horizon, self.patience, self.noise)
 
 
 def trial_packets(robot: Robot, name: str) -> Iterator[Packet]:
@@ -105,7 +94,7 @@ class LiveTwin:
         self.robot, self._source, self._settings = robot, source, settings
         self._listener = Listener(source) if "://" in source else None
         self.seconds: deque[float] = deque(maxlen=_REMEMBERED)
-        self._made = settings.twins_of(robot)
+        self.twin = settings.twin(robot)
         self.reset()
 
     @property
@@ -115,7 +104,7 @@ class LiveTwin:
 
     def reset(self) -> None:
         """Starts the recording again, or forgets what was estimated."""
-        self.twin = self._made()
+        self.twin.reset()
         self._recorded = self._packets_of_recording()
         if self._recorded is not None and self._settings.planned:
             self._recorded = planned_packets(self._recorded)

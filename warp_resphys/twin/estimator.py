@@ -17,11 +17,12 @@ from typing import ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
-from ...io.errors import InputError
-from ..inputs import Given
-from ..state import RobotState
-from .kalman import Correction, FloatArray, Gate, conditioned, distances
-from .robots import Steppable
+from ..control.estimate import conditioned
+from ..control.world import BoolArray, FloatArray
+from ..io.errors import InputError
+from ..robot.inputs import Given
+from ..robot.robot import Robot
+from ..robot.state import RobotState
 
 _UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump, over the size of the body
 _SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
@@ -35,32 +36,35 @@ _SHAKEN: Final = (0.03, 1000.0)  # range of the factor
 _EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the body may leave
 _LARGEST: Final = 0.1  # correction of a vertex in one frame, over the size of the body
 _DOUBLINGS: Final = 40  # of the noise of a frame, after which it is left out
-_JUMP: Final = 0.02  # least distance of a marker that counts as a jump, over the size of the body
+_PLACED: Final = 1e-3  # deviation of markers on the body from where they are bound [m]
+_FORGET: Final = 10.0  # time after which a refined parameter may be another [s]
+# A marker that jumps away from where it is expected is left out until it has stayed away for a time.
+_GATE: Final = 6.0  # distance from where it is expected, in deviations
+_JUMP: Final = 0.02  # least distance that counts as a jump, over the size of the body
+_GRACE: Final = 0.1  # [s]
 
 
 @dataclass(frozen=True)
-class TwinNoise:
-    """Standard deviations from which a twin starts.
+class Correction:
+    """The result of a frame of M markers.
 
     Attributes:
-        markers: of a coordinate of a marker [m].
-        simulator: of simulated markers from real ones [m]; None for the mean error in the run's test trials.
-        placement: of the markers on the body, from where they are bound [m].
-        forget: time after which a refined parameter may be another [s].
-
-    Raises:
-        InputError: one that is not positive.
+        seen: (M,) markers in the frame.
+        refused: (M,) markers that were left out, since they jumped.
+        moved: (M,) markers that have moved on the body, to where they are looked for from now on.
+        restarted: whether the body has moved to where markers stayed, so that its state was unknown.
+        off: (M,) distances from where the corrected simulator expected them [m], NaN where not seen.
+        free: (M, 3) offsets from the simulator that sees no markers [m], NaN where not seen.
+        worse: whether these have been much smaller for a while, so that it went on from there.
     """
 
-    markers: float = 2e-4
-    simulator: float | None = None
-    placement: float = 1e-3
-    forget: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None and not value > 0.0:
-                raise InputError(f"noise.{name} is {value:g}: it must be positive.")
+    seen: BoolArray
+    refused: BoolArray
+    moved: BoolArray
+    restarted: bool
+    off: FloatArray
+    free: FloatArray
+    worse: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,8 +105,10 @@ class TwinEstimator(ABC, Generic[B]):
         prior: standard deviations of the refined parameters, by name.
         frequencies: (r,) of the shapes [rad/s].
         reach: root mean square displacement of the body per unit of a coordinate [m].
-        noise: of markers and simulator.
-        gate: for markers that jump.
+        noise: standard deviation of a coordinate of a marker [m].
+
+    Raises:
+        InputError: a noise that is not positive.
 
     Attributes:
         count: number M of markers.
@@ -114,21 +120,21 @@ class TwinEstimator(ABC, Generic[B]):
 
     def __init__(
         self,
-        robot: Steppable,
+        robot: Robot,
         inputs: Mapping[str, Given],
         prior: Mapping[str, float],
         frequencies: FloatArray,
         reach: float,
-        noise: TwinNoise | None,
-        gate: Gate | None,
+        noise: float,
     ) -> None:
+        if not noise > 0.0:
+            raise InputError(f"noise is {noise:g}: give the deviation of a marker's coordinate in m, more than zero.")
         self.robot, self.labels, self.time_step, self.inputs = robot, robot.labels, robot.time_step, dict(inputs)
-        self.noise, self._names = noise or TwinNoise(), tuple(prior)
+        self.noise, self._names = noise, tuple(prior)
         self._prior = np.array([*prior.values()], dtype=np.float64)
         rest = robot.simulator.rest_positions
         self.size = float((rest.amax(0) - rest.amin(0)).max())
         self.count = len(robot.labels) or len(rest)
-        self._gate = gate or Gate(least=_JUMP * self.size)
         self._set_noise(frequencies, reach)
 
     def _set_noise(self, frequencies: FloatArray, reach: float) -> None:
@@ -136,13 +142,12 @@ class TwinEstimator(ABC, Generic[B]):
 
         A force that is as large in all modes bends the body less in the faster ones, by the square of their frequency.
         """
-        noise, h = self.noise, self.time_step
-        known = self.robot.description.errors_mm.get("mean")
-        error = noise.simulator or (_SIMULATOR * self.size if known is None else 1e-3 * float(known))
+        h, known = self.time_step, self.robot.description.errors_mm.get("mean")
+        error = _SIMULATOR * self.size if known is None else 1e-3 * float(known)
         less = (frequencies.min() / frequencies) ** 2
         shape, force = _UNKNOWN * self.size / reach * less, error / reach * less
         shaken = force * frequencies * np.sqrt(frequencies.min() * h / (2.0 * np.pi))
-        self._modes, places = len(frequencies), np.full(3 * len(self.labels), noise.placement)
+        self._modes, places = len(frequencies), np.full(3 * len(self.labels), _PLACED)
         self._unknown = np.concatenate([shape, shape * frequencies, force]) ** 2
         self._simulated = np.concatenate([force, force * frequencies, force]) ** 2
         self._placed = places**2
@@ -152,7 +157,7 @@ class TwinEstimator(ABC, Generic[B]):
                 np.zeros(len(shape)),
                 shaken**2,
                 force**2 * -np.expm1(-2.0 * h / _WANDER),
-                self._prior**2 * h / noise.forget,
+                self._prior**2 * h / _FORGET,
                 np.zeros(len(places)),
             ]
         )
@@ -262,8 +267,8 @@ class TwinEstimator(ABC, Generic[B]):
         seen, residual = np.asarray(np.isfinite(markers).all(axis=1)), markers - now
         jump = np.linalg.norm(residual - belief.left, axis=1)  # NaN for markers that were never believed: these are.
         away = np.full(len(seen), np.nan)
-        away[seen] = distances(belief.covariance, slopes[seen], residual[seen], self.noise.markers)
-        refused, stays, since = self._gate.judged(away, jump, belief.since, passed)
+        away[seen] = distances(belief.covariance, slopes[seen], residual[seen], self.noise)
+        refused, stays, since = self._judged(away, jump, belief.since, passed)
         off, apart = (np.linalg.norm(markers - points, axis=1) for points in (now, free))
         moved, restarted = np.zeros_like(refused), bool(seen.sum() > 1 and refused.sum() > 0.5 * seen.sum())
         if restarted or stays.any():
@@ -291,6 +296,21 @@ class TwinEstimator(ABC, Generic[B]):
         left = np.where(use[:, None], residual - slopes @ change, belief.left)
         return self._changed(replace(belief, covariance=covariance, left=left), change), correction
 
+    def _judged(
+        self, away: FloatArray, jump: FloatArray, since: FloatArray, passed: float
+    ) -> tuple[BoolArray, BoolArray, FloatArray]:
+        """Returns which markers (M,) are left out, which of these have stayed away, and the new `Belief.since`.
+
+        Args:
+            away: (M,) `distances`, NaN where a marker is not seen.
+            jump: (M,) how far it has jumped beside what was expected, since it was last believed [m].
+            since: (M,) how long each has been left out [s].
+            passed: time since the last frame [s].
+        """
+        out = (away > _GATE) & (jump > _JUMP * self.size)
+        later = np.where(out, since + passed, np.where(np.isnan(away), since, 0.0))
+        return out, out & (since > 0.0) & (later >= _GRACE), later
+
     def _compared(
         self, squares: FloatArray, off: FloatArray, apart: FloatArray, passed: float
     ) -> tuple[FloatArray, bool]:
@@ -301,16 +321,14 @@ class TwinEstimator(ABC, Generic[B]):
         now = np.array([np.mean(x[seen] ** 2) for x in (off, apart)])
         squares = now + np.exp(-passed / _TRIED) * (squares - now)
         own, other = squares
-        return squares, bool(own > _WORSE**2 * (other + 3.0 * self.noise.markers**2))
+        return squares, bool(own > _WORSE**2 * (other + 3.0 * self.noise**2))
 
     def _conditioned(self, belief: B, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`kalman.conditioned` for markers, with more noise where the shape would change by too much at once."""
-        deviation, rows = self.noise.markers, slopes.reshape(-1, slopes.shape[2])
+        """`conditioned` for markers, with more noise where the shape would change by too much at once."""
+        deviation, rows = self.noise, slopes.reshape(-1, slopes.shape[2])
         for _ in range(_DOUBLINGS):
             change, covariance = conditioned(belief.covariance, rows, residual.ravel(), deviation)
-            if (
-                self._furthest(belief, *self._parts(change)[::3]) <= _LARGEST * self.size
-            ):  # The vibrations hold for small motions.
+            if self._furthest(belief, *self._parts(change)[::3]) <= _LARGEST * self.size:  # Vibrations are small.
                 return change, covariance
             deviation *= 2.0
         return np.zeros(len(belief.covariance)), belief.covariance
@@ -374,3 +392,16 @@ def _shaken(before: float, away: FloatArray) -> float:
         return before
     far = float(np.nanmedian(away)) ** 2 / _MEDIAN
     return float(np.clip(before * np.clip(far, *_FURTHER) ** _ADAPTED, *_SHAKEN))
+
+
+def distances(covariance: FloatArray, slopes: FloatArray, residual: FloatArray, deviation: float) -> FloatArray:
+    """Distances (M,) of markers from where they are expected, in standard deviations (Mahalanobis).
+
+    Args:
+        covariance: (n, n) of the errors.
+        slopes: (M, 3, n) of the markers.
+        residual: (M, 3) observed minus expected [m].
+        deviation: of a coordinate [m].
+    """
+    spread = slopes @ covariance @ slopes.mT + deviation**2 * np.eye(3)
+    return np.sqrt(np.einsum("mi,mi->m", residual, np.linalg.solve(spread, residual[..., None])[..., 0]))

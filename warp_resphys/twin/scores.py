@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from ...data.rigid_bodies import as_markers
-from ..state import RobotState
-from .kalman import FloatArray
+from ..control.world import FloatArray
+from ..data.rigid_bodies import as_markers
+from ..robot.state import RobotState
 
 REMEMBERED: Final = 400  # predictions
 _ENOUGH: Final = 20  # predictions from which intervals are scaled

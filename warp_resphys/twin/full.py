@@ -15,20 +15,21 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from ...energies.contact import Contact
-from ...energies.strings import PAYLOAD
-from ...energies.surfaces import SurfaceContact
-from ...io.errors import ConvergenceError, InputError, listed
-from ...learning.parameters import check_names, identifiable_parameters
-from ...stepping.quantity import Quantity
-from ...stepping.state import State
-from ..inputs import Given
-from ..state import RobotState
-from .estimator import Belief, TwinEstimator, TwinNoise
-from .kalman import FloatArray, Gate
-from .robots import Steppable
+from ..control.world import FloatArray
+from ..energies.contact import Contact
+from ..energies.strings import PAYLOAD
+from ..energies.surfaces import SurfaceContact
+from ..io.errors import ConvergenceError, InputError, listed
+from ..learning.parameters import check_names, identifiable_parameters
+from ..robot.inputs import Given
+from ..robot.robot import Robot
+from ..robot.state import RobotState
+from ..stepping.quantity import Quantity
+from ..stepping.state import State
+from .estimator import Belief, TwinEstimator
 from .tangent import StepTangent, pulled_by, shifted
 
+_MODES: Final = 8  # vibrations in which the state is corrected
 _DIFFERENCE: Final = 0.05  # of the robots that run beside, in deviations of their parameter
 _OPEN: Final = 1e-3  # least distance of a parameter from a bound that it must not reach, over its first value
 _CHANGED: Final = 0.05  # change of a column of the transition after which the next step renews one, too
@@ -63,10 +64,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         inputs: constant commands under which it rests at first.
         refine: standard deviations of the parameters to refine, by name, in their units; ``payload`` is one of them
             where the robot has one, and then starts from the first command and ignores later ones.
-        modes: number r of vibrations.
-        noise: of markers and simulator.
-        gate: for markers that jump.
-        start: of the robot, one environment; its equilibrium under the inputs if omitted.
+        noise: standard deviation of a coordinate of a marker [m].
 
     Raises:
         InputError: an unknown parameter or input; a network in place of the simulator; obstacles that move, or
@@ -76,13 +74,10 @@ class FullEstimator(TwinEstimator[FullBelief]):
 
     def __init__(
         self,
-        robot: Steppable,
+        robot: Robot,
         inputs: Mapping[str, Given],
-        refine: Mapping[str, float] | None = None,
-        modes: int = 8,
-        noise: TwinNoise | None = None,
-        gate: Gate | None = None,
-        start: RobotState | None = None,
+        refine: Mapping[str, float],
+        noise: float,
     ) -> None:
         if robot.is_data_driven:
             raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
@@ -99,14 +94,13 @@ class FullEstimator(TwinEstimator[FullBelief]):
                 "a twin of a robot with obstacles refines no parameters, as a body that lies on one hardly shows them: "
                 "leave refine out."
             )
-        self._refined, self.robot = dict(refine or {}), robot
+        self._refined, self.robot = dict(refine), robot
         self._check()
         self._known = self._values(inputs)
         resting = at_rest(robot, 1, inputs)
-        self.tangent = StepTangent.of(robot, resting, inputs, modes)
-        super().__init__(robot, inputs, self._refined, self.tangent.frequencies, self.tangent.size, noise, gate)
+        self.tangent = StepTangent.of(robot, resting, inputs, _MODES)
+        super().__init__(robot, inputs, self._refined, self.tangent.frequencies, self.tangent.size, noise)
         self._apart = _DIFFERENCE * self._prior
-        self._start = start
 
     def _check(self) -> None:
         named = [name for name in self._refined if name != PAYLOAD.name or name not in self.robot.inputs]
@@ -136,15 +130,14 @@ class FullEstimator(TwinEstimator[FullBelief]):
         self._known = self._values(inputs)
         values = self._known if refined is None else refined
         robot, given = self._at(values, inputs)
-        state = at_rest(robot, self._count, given) if self._start is None else self._start.repeat(self._count)
-        self._start = None
-        return FullBelief(**vars(self._first(values)), state=state.detach(), transition=self.tangent.transition)
+        state = at_rest(robot, self._count, given).detach()
+        return FullBelief(**vars(self._first(values)), state=state, transition=self.tangent.transition)
 
     @property
     def _count(self) -> int:
         return 2 + len(self._refined)
 
-    def _at(self, values: FloatArray, inputs: Mapping[str, Given], more: int = 0) -> tuple[Steppable, dict[str, Given]]:
+    def _at(self, values: FloatArray, inputs: Mapping[str, Given], more: int = 0) -> tuple[Robot, dict[str, Given]]:
         """The robot with the parameters of all environments, and some more like the first, and its commands."""
         table = np.tile(values, (self._count + more, 1))
         table[1 : self._count - 1] += np.diag(self._apart)
@@ -246,7 +239,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         return np.clip(parameters, low + far, high - far - self._apart)
 
 
-def at_rest(robot: Steppable, batch: int, inputs: Mapping[str, Given]) -> RobotState:
+def at_rest(robot: Robot, batch: int, inputs: Mapping[str, Given]) -> RobotState:
     """The equilibrium under constant commands, without the learned force where there is none with it."""
     try:
         return robot.settle(batch, **inputs)

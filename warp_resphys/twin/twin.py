@@ -1,8 +1,8 @@
-"""A robot's simulator that follows the robot as its markers come in, and looks ahead."""
+"""A robot's simulator that follows the real robot as its markers come in, and looks ahead."""
 
 from bisect import insort
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any, Final
@@ -11,14 +11,19 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ...io.errors import ConvergenceError, InputError
-from ..inputs import Given, InputReader
-from ..state import RobotState
-from .estimator import Belief, TwinEstimator
-from .kalman import Correction, FloatArray
+from ..control.world import FloatArray
+from ..io.errors import ConvergenceError, InputError
+from ..robot.inputs import Given, InputReader
+from ..robot.robot import Robot
+from ..robot.state import RobotState
+from .estimator import Belief, Correction, TwinEstimator
+from .full import FullEstimator
+from .reduced import ReducedEstimator
 from .scores import REMEMBERED, Disagreement, Forecast, Scores, mean_mm
 from .stream import Faults
 
+Engine = Callable[[Robot, Mapping[str, Given], Mapping[str, float], float], TwinEstimator[Any]]
+_ENGINES: Final[Mapping[str, Engine]] = {"full": FullEstimator, "reduced": ReducedEstimator}
 _ROUNDING: Final = 1e-3  # of times, in steps: clocks that count from 1970 resolve microseconds
 _LONGEST_GAP: Final = 2.0  # without a packet, after which the twin starts again [s]
 _STALE: Final = 10  # packets in order, all too old, after which the clock has been set back
@@ -59,33 +64,58 @@ class _Interval:
 
 
 class Twin:
-    """Follows a robot; `Robot.twin` makes one.
+    """A robot that follows a real one by its markers, and looks ahead.
 
     Packets may come late: all steps since are computed again, so that the estimate is the one of packets in order.
+    Corrections excite vibrations that the midpoint rule would keep, so that BDF2 steps in its place.
 
     Args:
-        estimator: of the robot.
+        robot: as `warp_resphys.load` returns it.
+        engine: ``full``, its simulator, or ``reduced``, its reduced model.
+        refine: standard deviations of parameters that are refined on the way, by name, in their units.
         horizon: of `ahead` [s].
         patience: how late a packet may come [s].
+        noise: standard deviation of a coordinate of a marker [m].
+        inputs: commands before the first packet, as for `Robot.step`.
 
     Raises:
-        InputError: a horizon or a patience that is not positive.
+        InputError: no robot; an unknown engine, input or parameter; a value that is not positive; a network in place of
+            the simulator; or a robot that cannot be reduced.
+        ConvergenceError: there is no equilibrium.
     """
 
-    def __init__(self, estimator: TwinEstimator[Any], horizon: float = 0.2, patience: float = 0.3) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        engine: str = "full",
+        refine: Mapping[str, float] | None = None,
+        horizon: float = 0.2,
+        patience: float = 0.3,
+        noise: float = 2e-4,
+        **inputs: Given,
+    ) -> None:
+        if not isinstance(robot, Robot):
+            raise InputError(f"robot is {robot!r}: give the robot of a run, as warp_resphys.load returns it.")
+        if engine not in _ENGINES:
+            raise InputError(f"engine is {engine!r}: choose {' or '.join(_ENGINES)}.")
         for name, value in (("horizon", horizon), ("patience", patience)):
             if not 0.0 < value < np.inf:
                 raise InputError(f"{name} is {value:g}: give seconds, more than zero.")
+        estimator = _ENGINES[engine](robot.without_midpoint(), inputs, refine or {}, noise)
         self.estimator, self.horizon, self.patience = estimator, horizon, patience
         self.labels, self._h = estimator.labels, estimator.time_step
         self._keep = int(np.ceil(patience / self._h)) + 1
         names = self.labels or [f"vertex_{number}" for number in range(estimator.count)]
         self._numbers = {label: number for number, label in enumerate(names)}
         self._reader = InputReader(estimator.robot.inputs, estimator.robot.simulator)
-        self._scores = Scores(estimator.noise.markers, self.labels)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets all packets."""
+        self._scores = Scores(self.estimator.noise, self.labels)
         self._free: deque[float] = deque(maxlen=REMEMBERED)
         self._counts = Faults()
-        self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(estimator.inputs))]
+        self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(self.estimator.inputs))]
         self._planned: list[tuple[float, dict[str, Given]]] = []
         self._latest = -np.inf  # time of the newest packet
         self._steps: dict[int, _Interval] = {}

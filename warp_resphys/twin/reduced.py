@@ -1,112 +1,24 @@
-"""The state of a robot, estimated from its markers on its reduced model: a twin of a few milliseconds a frame."""
+"""The state of a robot, estimated from its markers on its reduced model: a few milliseconds a frame."""
 
-import logging
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from typing_extensions import override
 
-from ..io.errors import ConvergenceError, DataFileError, InputError
-from ..io.progress import Progress
+from ..control.polynomials import Monomials
+from ..control.reduced import ReducedState
+from ..control.reduction import reduced_of
+from ..control.world import FloatArray
+from ..io.errors import ConvergenceError, InputError
 from ..learning.rollout import DIVERGENCE_DISTANCE
 from ..robot.inputs import Given, InputReader
 from ..robot.robot import Robot
 from ..robot.state import RobotState
-from ..robot.twin.estimator import Belief, TwinEstimator, TwinNoise
-from ..robot.twin.kalman import Gate
-from ..robot.twin.twin import Twin
-from .files import read_reduced, reduced_file, write_reduced
-from .polynomials import Monomials
-from .reduced import ReducedModel, ReducedState
-from .reduction import fingerprint, reduce
-from .sampling import Sampling, check_reducible
-from .world import FloatArray
+from .estimator import Belief, TwinEstimator
 
-log = logging.getLogger(__name__)
-_MUCH = 0.1  # error of the reduced model over the motion, above which it warns
 _SLOWEST = 1.0  # least frequency of a coordinate, for the scale of its errors [rad/s]
-
-
-def reduced_of(robot: Robot) -> ReducedModel:
-    """Returns the reduced model of a robot, from its run's folder; it is computed and kept there the first time.
-
-    That of a robot with other parameters than its run has identified is not kept.
-
-    Raises:
-        InputError: the robot cannot be reduced.
-        ConvergenceError: it has no equilibrium for inputs in the range of its trials.
-    """
-    check_reducible(robot)
-    path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
-    model = _kept(path, robot) or _computed(path, robot)
-    off, moved = model.quality["window_error_mm"], model.quality["window_motion_mm"]
-    if off > _MUCH * moved:
-        log.warning(
-            "The reduced model is %.2g mm off in motions of %.2g mm: compare it with twin.engine=full.", off, moved
-        )
-    return model
-
-
-def _kept(path: Path | None, robot: Robot) -> ReducedModel | None:
-    """The reduced model in a file; None if that is missing, damaged, of an earlier version, or of another robot."""
-    if path is not None and path.exists():
-        with suppress(DataFileError):
-            model = read_reduced(path, robot.description.learned)
-            if model.robot == fingerprint(robot):
-                return model
-    return None
-
-
-def _computed(path: Path | None, robot: Robot) -> ReducedModel:
-    """The reduced model, kept in a file if the robot has the parameters that its run has identified."""
-    sampling = Sampling()
-    with Progress("reduced model", sampling.total, "samples") as progress:
-        model = reduce(robot, sampling, progress.advance)
-    if path is not None and fingerprint(robot) == fingerprint(robot.with_parameters(**robot.description.parameters)):
-        try:
-            write_reduced(path, model)
-        except DataFileError as error:
-            log.warning("The reduced model is not kept for the next time: %s", error)
-    return model
-
-
-def reduced_twin(
-    robot: Robot,
-    horizon: float = 0.2,
-    patience: float = 0.3,
-    noise: TwinNoise | None = None,
-    gate: Gate | None = None,
-    refine: Mapping[str, float] | None = None,
-    **inputs: Given,
-) -> Twin:
-    """Returns a twin like `Robot.twin`, on the reduced model of a robot (`reduced_of`).
-
-    Args:
-        robot: whose trials are driven by one input.
-        horizon: of predictions [s].
-        patience: how late packets may come [s].
-        noise: of markers and simulator.
-        gate: for markers that jump.
-        refine: none, as a reduced model has no parameters.
-        inputs: commands before the first packet, as for `Robot.step`.
-
-    Raises:
-        InputError: the robot cannot be reduced; a parameter to refine, an unknown input, or one that the reduced model
-            does not have.
-        ConvergenceError: there is no equilibrium.
-    """
-    if not isinstance(robot, Robot):
-        raise InputError(f"robot is {robot!r}: give the robot of a run, as warp_resphys.load returns it.")
-    if refine:
-        raise InputError(
-            f"a reduced model has no {next(iter(refine))} to refine: set twin.engine=full, or use Robot.twin in Python."
-        )
-    robot = robot.without_midpoint()
-    return Twin(ReducedEstimator(robot, reduced_of(robot), inputs, noise, gate), horizon, patience)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,14 +38,13 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
     """Estimates the state of a robot with its reduced model, in whose coordinates all derivatives are exact.
 
     Args:
-        robot: whose vertices and inputs it has.
-        model: of the robot.
+        robot: whose trials are driven by one input.
         inputs: constant commands under which it rests at first.
-        noise: of markers and simulator.
-        gate: for markers that jump.
+        refine: none, as a reduced model has no parameters.
+        noise: standard deviation of a coordinate of a marker [m].
 
     Raises:
-        InputError: an input that the model does not have.
+        InputError: the robot cannot be reduced; a parameter to refine, or an input that the model does not have.
         ConvergenceError: there is no equilibrium.
     """
 
@@ -142,16 +53,20 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
     def __init__(
         self,
         robot: Robot,
-        model: ReducedModel,
         inputs: Mapping[str, Given],
-        noise: TwinNoise | None = None,
-        gate: Gate | None = None,
+        refine: Mapping[str, float],
+        noise: float,
     ) -> None:
-        self.model, self._reader = model, InputReader(robot.inputs, robot.simulator)
+        if refine:
+            raise InputError(
+                f"a reduced model has no {next(iter(refine))} to refine: set engine=full, in which a twin refines it."
+            )
+        self.model = model = reduced_of(robot)
+        self._reader = InputReader(robot.inputs, robot.simulator)
         stiffness = model.stiffness(self._rest(inputs).acting)[0]
         frequencies = np.sqrt(np.abs(np.diag(stiffness))).clip(_SLOWEST)
         reach = float(np.sqrt((model.basis**2).sum() / (len(model.basis) / 3) / model.modes))
-        super().__init__(robot, inputs, {}, frequencies, reach, noise, gate)
+        super().__init__(robot, inputs, {}, frequencies, reach, noise)
 
     @override
     def faults(self, inputs: Mapping[str, Given]) -> list[str]:
@@ -167,7 +82,7 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
             if bool((value != 0.0).any()):
                 raise InputError(
                     f"the reduced model has no input but {self.model.name}, and {name} is given: leave it out, or use "
-                    "the full simulator (twin.engine=full)."
+                    "the full simulator (engine=full)."
                 )
         return np.asarray(values.double().cpu().numpy())
 

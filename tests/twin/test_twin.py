@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from warp_resphys.control.estimate import conditioned
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load
-from warp_resphys.robot.twin.estimator import TwinNoise
-from warp_resphys.robot.twin.kalman import Gate, conditioned, distances
-from warp_resphys.robot.twin.stream import Listener, recorded_packets
-from warp_resphys.robot.twin.tangent import StepTangent, shifted
+from warp_resphys.twin.estimator import distances
+from warp_resphys.twin.stream import Listener, recorded_packets
+from warp_resphys.twin.tangent import StepTangent, shifted
+from warp_resphys.twin.twin import Twin
 
 NOISE = 1e-4
 
@@ -42,7 +43,7 @@ def pull(robot, newtons):
 
 
 def followed(robot, frames, order=None, **settings):
-    twin = robot.twin(noise=TwinNoise(markers=NOISE), **settings)
+    twin = Twin(robot, noise=NOISE, **settings)
     for number in order or range(len(frames)):
         twin.take(number * robot.time_step, frames[number])
     return twin
@@ -61,19 +62,6 @@ def test_conditioning_is_that_of_normal_variables():
     away = distances(covariance, slopes[:6].reshape(2, 3, 5), residual[:6].reshape(2, 3), 0.3)
     whole = np.sqrt(residual[:3] @ np.linalg.solve(spread[:3, :3], residual[:3]))
     assert away[0] == pytest.approx(whole)
-
-
-def test_a_marker_that_jumps_is_left_out_until_it_stays():
-    gate, since = Gate(limit=6.0, least=1e-3, grace=0.03), np.zeros(3)
-    away, jump = np.array([50.0, 1.0, np.nan]), np.array([0.01, 0.01, np.nan])
-    for number in range(3):
-        out, stays, since = gate.judged(away, jump, since, 0.01)
-        np.testing.assert_array_equal(out, [True, False, False])
-        assert bool(stays[0]) == (number == 2)
-    assert not gate.judged(away, np.full(3, 1e-4), since, 0.01)[0].any()
-    back = gate.judged(np.ones(3), jump, since, 0.01)
-    assert not back[0].any()
-    assert not back[2].any()
 
 
 def test_a_step_is_linear_in_its_vibrations(robot):
@@ -119,7 +107,7 @@ def test_it_finds_a_state_that_it_was_not_given(robot, swing):
 
 def test_its_predictions_are_better_than_the_last_markers(robot, swing):
     frames, _, _ = swing
-    twin = robot.twin(noise=TwinNoise(markers=NOISE), horizon=0.1)
+    twin = Twin(robot, noise=NOISE, horizon=0.1)
     assert twin.disagreement is None
     for number, frame in enumerate(frames):
         twin.take(number * robot.time_step, frame)
@@ -153,7 +141,7 @@ def test_commands_that_come_late_change_nothing(robot, swing):
     frames, _, _ = swing
     h, twins = robot.time_step, []
     for late in (False, True):
-        twin = robot.twin(noise=TwinNoise(markers=NOISE))
+        twin = Twin(robot, noise=NOISE)
         for number in range(20):
             if number == 5 and not late:
                 twin.take(5 * h, base=[0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])
@@ -184,7 +172,7 @@ def test_a_body_that_is_put_elsewhere_is_found_again(robot, swing):
     moved = np.concatenate([frames[40:60], frames[:60]])
     at_tip = true[0, :, 0] > true[0, :, 0].max() - 0.01
     moved = np.where(at_tip[:, None], moved, np.nan)
-    twin = followed(robot, moved, gate=Gate(limit=6.0, least=1e-3, grace=0.03))
+    twin = followed(robot, moved)
     assert twin.counts["jumps of the whole body"] == 1
     assert np.linalg.norm(twin.now.markers - true[59], axis=1).mean() < 3.0 * NOISE
 
@@ -198,8 +186,7 @@ def test_a_marker_that_slips_is_followed_to_its_new_place(robot, swing):
     marked._observe = lambda q: q[:, chosen]
     frames = true[:, chosen] + NOISE * np.random.default_rng(3).standard_normal((61, 4, 3))
     frames[25:, 1] += [0.0, 0.02, 0.0]
-    noise = TwinNoise(markers=NOISE, placement=1e-3)
-    twin = marked.twin(noise=noise, gate=Gate(limit=6.0, least=1e-3, grace=0.03))
+    twin = Twin(marked, noise=NOISE)
     for number, frame in enumerate(frames):
         twin.take(number * robot.time_step, dict(zip(marked.labels, frame, strict=True)))
     assert twin.counts["middle has moved on the body"] == 1
@@ -224,9 +211,9 @@ def test_it_refines_a_parameter_as_it_runs(robot):
     assert deviation < 0.1 * stiff
     assert abs(value - 1.2 * stiff) < 3.0 * deviation
     with pytest.raises(InputError, match="there is no parameter 'wobble'"):
-        robot.twin(refine={"wobble": 1.0})
+        Twin(robot, refine={"wobble": 1.0})
     with pytest.raises(InputError, match=r"refine\.youngs_modulus is -1"):
-        robot.twin(refine={"youngs_modulus": -1.0})
+        Twin(robot, refine={"youngs_modulus": -1.0})
 
 
 def test_a_clock_that_is_set_back_and_a_gap_start_it_again(robot, swing):
@@ -260,7 +247,7 @@ def test_a_wrong_packet_is_one_sentence_and_is_left_out(robot, swing, packet, me
 
 
 def test_millimetres_are_refused_and_unknown_markers_counted(robot, swing):
-    twin = robot.twin()
+    twin = Twin(robot)
     with pytest.raises(InputError, match="no packet"):
         _ = twin.now
     with pytest.raises(InputError, match="give positions in metres"):
@@ -313,7 +300,7 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
 
 def test_a_command_that_cannot_be_done_is_left_out(robot, swing):
     h, frames = robot.time_step, swing[0]
-    twin = robot.twin(noise=TwinNoise(markers=NOISE))
+    twin = Twin(robot, noise=NOISE)
     for number in range(10):
         commands = {"base": [0.0, 0.0, 0.03, 0.0, 0.0, 0.0]} if number == 5 else {}
         twin.take(number * h, frames[number], **commands)
@@ -327,7 +314,7 @@ def test_a_command_that_cannot_be_done_is_left_out(robot, swing):
 def test_predictions_follow_a_plan_of_commands(robot):
     h, lifted = robot.time_step, [0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]
     fixed, rest = robot.simulator.body.fixed_vertices, robot.simulator.rest_positions
-    twin = robot.twin(horizon=4 * h)
+    twin = Twin(robot, horizon=4 * h)
     twin.plan([(9 * h, {"base": [0.0] * 6}), (3 * h, {"base": lifted})])
     twin.take(0.0)
     ahead = twin.ahead().markers
@@ -348,7 +335,7 @@ def test_predictions_follow_a_plan_of_commands(robot):
 def test_its_transition_follows_the_body(robot):
     """In a bent body a step has other derivatives than at rest; after a turn of renewals the twin has them."""
     robot = robot._integrated_by("implicit_euler")
-    force, estimator = pull(robot, 8.0), robot.twin(modes=4).estimator
+    force, estimator = pull(robot, 8.0), Twin(robot).estimator
     belief = estimator.begin({})
     count = len(belief.bias)
     for _ in range(2 * 8 * 3 * count):  # two turns, at the longest pauses

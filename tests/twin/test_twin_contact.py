@@ -9,8 +9,8 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
-from warp_resphys.robot.twin.estimator import TwinNoise
 from warp_resphys.settings.body import SimulatorSettings
+from warp_resphys.twin.twin import Twin
 
 NOISE = 1e-4  # m
 RADIUS, PLACE = 0.02, np.array([0.075, -0.0225])  # m: of the bar, its x and z
@@ -49,7 +49,7 @@ def followed(robot, motion):
     seen = np.concatenate([np.flatnonzero(np.isclose(rest[:, 0], x))[:3] for x in (0.05, 0.1)])
     frames = np.full(truth.shape, np.nan)
     frames[:, seen] = truth[:, seen] + NOISE * np.random.default_rng(0).standard_normal((len(truth), 6, 3))
-    twin, states = robot.twin(noise=TwinNoise(markers=NOISE)), []
+    twin, states = Twin(robot, noise=NOISE), []
     for number, frame in enumerate(frames):
         twin.take(number * robot.time_step, frame)
         states.append(twin.now.state.q[0].numpy())
@@ -79,6 +79,6 @@ def test_markers_within_its_obstacle_do_not_move_a_twin_there(robot):
 
 def test_what_a_twin_cannot_follow_is_refused(robot):
     with pytest.raises(InputError, match="a twin of a robot with obstacles refines no parameters"):
-        robot.twin(refine={"youngs_modulus": 1e4})
+        Twin(robot, refine={"youngs_modulus": 1e4})
     with pytest.raises(InputError, match="a twin cannot follow a robot with obstacles that move"):
-        beam("obstacles.bar.moves=true").twin()
+        Twin(beam("obstacles.bar.moves=true"))

@@ -12,12 +12,12 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.recordings.reading import read_recording
-from ...data.registration import register_markers
-from ...data.rigid import RigidTransform
-from ...data.rigid_bodies import with_corners
-from ...io.errors import InputError, ResphysError, listed
-from .robots import Steppable
+from ..data.recordings.reading import read_recording
+from ..data.registration import register_markers
+from ..data.rigid import RigidTransform
+from ..data.rigid_bodies import with_corners
+from ..io.errors import InputError, ResphysError, listed
+from ..robot.robot import Robot
 
 _LARGEST: Final = 65_535  # bytes of a packet
 _FIELDS: Final = ("time", "markers", "inputs", "plan")
@@ -99,7 +99,7 @@ def _values(inputs: Mapping[str, Any]) -> dict[str, Any]:
     return read
 
 
-def recorded_packets(robot: Steppable, path: str | Path) -> Iterator[Packet]:
+def recorded_packets(robot: Robot, path: str | Path) -> Iterator[Packet]:
     """Returns the frames of a recording with its commands, in the order of time.
 
     Raises:
@@ -192,7 +192,7 @@ class Alignment:
         InputError: every vertex is observed, or the markers have a frame of their own.
     """
 
-    def __init__(self, robot: Steppable, at_rest: NDArray[np.float64]) -> None:
+    def __init__(self, robot: Robot, at_rest: NDArray[np.float64]) -> None:
         settings = robot.description.markers
         if settings is None or settings.frame == "own" or settings.plane is not None:
             raise InputError(

@@ -15,14 +15,13 @@ import scipy.sparse.linalg
 import torch
 from numpy.typing import NDArray
 
-from ...energies.materials import VISCOUS
-from ...stepping.integrators import make_integrator
-from ...stepping.state import State
-from ..inputs import FORCE, Given, InputReader
-from ..state import RobotState
-from .robots import Steppable
-
-FloatArray = NDArray[np.float64]
+from ..control.world import FloatArray
+from ..energies.materials import VISCOUS
+from ..robot.inputs import FORCE, Given, InputReader
+from ..robot.robot import Robot
+from ..robot.state import RobotState
+from ..stepping.integrators import make_integrator
+from ..stepping.state import State
 
 _STEP: Final = 1e-2  # of the central differences, over the size of the body
 _SAME: Final = 1e-3  # relative difference of eigenvalues that belong together
@@ -55,7 +54,7 @@ class StepTangent:
     free: torch.Tensor
 
     @classmethod
-    def of(cls, robot: Steppable, state: RobotState, inputs: Mapping[str, Given], modes: int) -> "StepTangent":
+    def of(cls, robot: Robot, state: RobotState, inputs: Mapping[str, Given], modes: int) -> "StepTangent":
         """Linearises a step from a state of rest, with one environment.
 
         Args:
@@ -116,7 +115,7 @@ class StepTangent:
         return np.concatenate([x.cpu().double().numpy() @ self.duals for x in changes], axis=1)
 
 
-def pulled_by(robot: Steppable, inputs: Mapping[str, Given], forces: torch.Tensor) -> dict[str, Given]:
+def pulled_by(robot: Robot, inputs: Mapping[str, Given], forces: torch.Tensor) -> dict[str, Given]:
     """Returns inputs with forces (B, N, 3) [N] that are added to theirs."""
     if FORCE in inputs:
         forces = forces + InputReader(robot.inputs, robot.simulator).field(inputs[FORCE], FORCE)
@@ -124,7 +123,7 @@ def pulled_by(robot: Steppable, inputs: Mapping[str, Given], forces: torch.Tenso
 
 
 def shifted(
-    robot: Steppable, state: RobotState, moved: torch.Tensor, faster: torch.Tensor, at_once: bool = True
+    robot: Robot, state: RobotState, moved: torch.Tensor, faster: torch.Tensor, at_once: bool = True
 ) -> RobotState:
     """Returns a state with other positions and velocities, and a past that fits them; obstacles push the body out.
 
@@ -149,7 +148,7 @@ def shifted(
 
 
 def _vibrations(
-    robot: Steppable, state: RobotState, inputs: Mapping[str, Given], modes: int
+    robot: Robot, state: RobotState, inputs: Mapping[str, Given], modes: int
 ) -> tuple[FloatArray, FloatArray, scipy.sparse.csc_array, NDArray[np.int64]]:
     """Eigenvalues (r,) [1/s^2], vectors (3 F, r), mass (3 F, 3 F) of the slowest vibrations; free vertices."""
     still = replace(state, body=State(state.q, torch.zeros_like(state.v), memory=state.body.memory))

@@ -105,7 +105,7 @@ class TestReducedWorld:
         for _ in range(4):
             assert not world.step(commands).any()
         for row in range(2):
-            expected = model.respond(model.rest(), np.tile(commands[row], (4, 1))).y[-1]
+            expected = model.respond(model.rest(), np.tile(commands[row], (4, 1, 1)))[-1, 0]
             np.testing.assert_allclose(world.markers()[row].ravel(), expected, atol=1e-9)
         assert np.abs(world.markers() - rest).max() > 1e-4
         furthest, world._furthest = world._furthest, 0.0
@@ -147,7 +147,9 @@ class TestReducedModel:
         commands, rest = np.zeros((30, 1, 3)), model.rest()
         still = replace(rest, v=rest.v + 1e-2 * np.eye(4)[:1])
         elastic = replace(model, branches=SquaredPolynomial(0.0 * model.branches.coefficients, model.branches.order))
-        off, without = (np.linalg.norm((one.move(still, commands).z - rest.z)[:, 0] - true) for one in (model, elastic))
+        off, without = (
+            np.linalg.norm((one.move(still, commands).z - rest.z)[:, 0, 0] - true) for one in (model, elastic)
+        )
         assert off < 0.03 * np.linalg.norm(true)
         assert without > 0.2 * np.linalg.norm(true)
 
@@ -173,7 +175,7 @@ class TestReducedModel:
         estimator = Estimator(model, Noise(observed=1e-6, rate=0.3, bias=0.05), inputs)
         state = model.rest(inputs)
         for _ in range(150):
-            state = model.transition(state, inputs, elsewhere)[0]
+            state = model.transition(state, inputs, elsewhere[None])[0]
             estimator.predict(inputs)
             estimator.correct(model.observe(state)[0].reshape(-1, 3))
         np.testing.assert_allclose(estimator.state.z, state.z, atol=2e-6)

@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 
-from .plan import Response
 from .world import FloatArray
 
 _RANKS = (8, 12, 18, 24, 36)  # candidates; validation chooses one
@@ -52,20 +51,13 @@ class LinearModel:
         """State (q,) of the last D frames of markers (3 M,), latest first [m]."""
         return np.asarray((np.concatenate(markers) - np.tile(self.rest, len(markers))) @ self.basis)
 
-    def respond(
-        self, start: FloatArray, inputs: FloatArray, basis: FloatArray | None = None, bias: FloatArray | None = None
-    ) -> Response:
-        """Predicts the markers over T steps, as `plan.PredictionModel` declares it; ``bias`` has no effect."""
-        s, states, slopes = start, [], []
-        ds = None if basis is None else np.zeros((len(s), basis.shape[2]))
-        for k, u in enumerate(inputs / self.scale):
-            s = self.a @ s + self.b @ u
+    def respond(self, start: FloatArray, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
+        """Predicts the markers, as `plan.PredictionModel` declares it; ``bias`` has no effect."""
+        s, states = start, []
+        for u in inputs / self.scale:
+            s = s @ self.a.T + u @ self.b.T
             states.append(s)
-            if basis is not None and ds is not None:
-                ds = self.a @ ds + self.b @ (basis[k] / self.scale[:, None])
-                slopes.append(ds)
-        y = self.rest + np.array(states) @ self.c.T
-        return Response(y, None if basis is None else self.c @ np.array(slopes))
+        return np.asarray(self.rest + np.array(states) @ self.c.T)
 
 
 def fit_linear(
@@ -117,7 +109,7 @@ def _prediction_error(model: LinearModel, trials: Sequence[tuple[FloatArray, Flo
     for markers, inputs in trials:
         for at in range(DELAYS - 1, len(inputs) - steps, steps):
             start = model.state([markers[at - j] for j in range(DELAYS)])
-            predicted = model.respond(start, inputs[at : at + steps]).y
+            predicted = model.respond(start, inputs[at : at + steps, None])[:, 0]
             off = (predicted - markers[at + 1 : at + 1 + steps]).reshape(steps, -1, 3)
             errors.append(np.linalg.norm(off, axis=2).mean())
     return 1e3 * float(np.mean(errors)) if errors else np.inf

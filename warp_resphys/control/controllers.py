@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from .baselines import DELAYS, LinearModel
 from .estimate import Estimator, Noise
-from .plan import Horizon, Limits, Plan, Planner, PredictionModel
+from .plan import Limits, Planner
 from .reduced import ReducedModel
 from .world import FloatArray
 
@@ -38,90 +38,43 @@ class OpenLoop(Controller):
         return np.asarray(self._inputs[number])
 
 
-class _Receding(Controller):
-    """Makes a new plan at every step; the previous plan, moved on by one step, is its initial guess."""
-
-    def __init__(
-        self, model: PredictionModel, tracked: FloatArray, limits: Limits, horizon: Horizon, path: FloatArray
-    ) -> None:
-        self._planner = Planner(model, tracked, limits, horizon)
-        self._path, self.last_command = path, np.array(limits.low)
-        self.knots: FloatArray | None = None
-
-    def _ahead(self, number: int) -> FloatArray:
-        """Path (T, d) over the horizon from a step on; past its end, its last point is repeated."""
-        steps = np.arange(number, number + self._planner.steps)
-        return np.asarray(self._path[np.minimum(steps, len(self._path) - 1)])
-
-    def _keep(self, plan: Plan) -> FloatArray:
-        """Returns the first inputs of a plan, and moves its knots on by a step for the next guess."""
-        steps, pieces = len(plan.inputs), len(plan.knots) - 1
-        line = np.concatenate([plan.knots[:1], plan.inputs])
-        at = np.minimum(np.arange(pieces + 1) * steps / pieces + 1.0, steps)
-        self.knots = np.stack([np.interp(at, np.arange(steps + 1), column) for column in line.T], axis=1)
-        self.last_command = plan.inputs[0]
-        return self.last_command
-
-
-class RecedingHorizon(_Receding):
-    """Plans with a reduced model, from an estimate of its state.
+class RecedingHorizon(Controller):
+    """Plans at every step with a reduced model, from an estimate of its state.
 
     Args:
+        planner: along the path, on the model.
         model: of the robot.
-        tracked: (d, 3 M) from the markers to the coordinates that follow the path.
-        limits: of the inputs.
-        horizon: of the plans.
         noise: of the estimator.
-        path: (T, d) reference after each step [m].
         rest: (M, 3) markers of the robot at rest without inputs [m].
     """
 
-    def __init__(
-        self,
-        model: ReducedModel,
-        tracked: FloatArray,
-        limits: Limits,
-        horizon: Horizon,
-        noise: Noise,
-        path: FloatArray,
-        rest: FloatArray,
-    ) -> None:
-        super().__init__(model, tracked, limits, horizon, path)
+    def __init__(self, planner: Planner, model: ReducedModel, noise: Noise, rest: FloatArray) -> None:
         offset = rest.ravel() - model.observe(model.rest())[0]
+        self._planner = planner
         self._estimator = Estimator(model, noise, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0))
-        self._offset = tracked @ self._estimator.offset
+        self._offset = planner.tracked @ self._estimator.offset
 
     @override
     def command(self, number: int, markers: FloatArray) -> FloatArray:
         estimate = self._estimator
         if number:
             estimate.correct(markers)
-        plan = self._planner.plan(
-            estimate.state, self.last_command, self._ahead(number), self.knots, estimate.bias, self._offset
-        )
-        estimate.predict(plan.inputs[0])
-        return self._keep(plan)
+        command: FloatArray = self._planner.plan(number, estimate.state, estimate.bias, self._offset)[0]
+        estimate.predict(command)
+        return command
 
 
-class LinearRecedingHorizon(_Receding):
+class LinearRecedingHorizon(Controller):
     """Plans with a linear model, from the last markers; a disturbance observer removes its constant error.
 
     Args:
+        planner: along the path, on the model.
         model: fitted to the recordings.
-        tracked, limits, horizon, path, rest: as for `RecedingHorizon`.
+        rest: as for `RecedingHorizon`.
     """
 
-    def __init__(
-        self,
-        model: LinearModel,
-        tracked: FloatArray,
-        limits: Limits,
-        horizon: Horizon,
-        path: FloatArray,
-        rest: FloatArray,
-    ) -> None:
-        super().__init__(model, tracked, limits, horizon, path)
-        self._model, self._tracked = model, tracked
+    def __init__(self, planner: Planner, model: LinearModel, rest: FloatArray) -> None:
+        self._planner, self._model = planner, model
         self.seen = np.tile(np.where(np.isfinite(rest), rest, model.rest.reshape(-1, 3)).ravel(), (DELAYS, 1))
         self.expected = self.seen[0]
         self.missed = np.zeros_like(self.expected)
@@ -133,11 +86,9 @@ class LinearRecedingHorizon(_Receding):
             self.missed = self.missed + _SETTLES * (now - self.expected - self.missed)
             self.seen = np.concatenate([now[None], self.seen[:-1]])
         state = self._model.state(list(self.seen))
-        plan = self._planner.plan(
-            state, self.last_command, self._ahead(number), self.knots, offset=self._tracked @ self.missed
-        )
-        self.expected = self._model.respond(state, plan.inputs[:1]).y[0]
-        return self._keep(plan)
+        command: FloatArray = self._planner.plan(number, state, offset=self._planner.tracked @ self.missed)[0]
+        self.expected = self._model.respond(state, command[None, None])[0, 0]
+        return command
 
 
 class JacobianFeedback(Controller):

@@ -5,7 +5,7 @@ a random walk. Estimating b removes the steady-state error of a receding horizon
 has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -49,7 +49,7 @@ class Estimator:
         self.bias = np.zeros(r)
         self.offset = np.zeros(model.curved.shape[2]) if offset is None else offset
         u = Monomials(self.state.acting)
-        seen = model.point_slopes(self.state.z, u)[0][0]
+        seen = model.point_slopes(self.state.z, u)[0]
         # Mean displacement of the markers per unit of each coordinate [m].
         size = np.linalg.norm(seen, axis=0) / np.sqrt(len(self.offset) / 3.0)
         one = 1e-3 / size
@@ -61,9 +61,8 @@ class Estimator:
 
     def predict(self, inputs: FloatArray) -> None:
         """Advances the estimate by one step under inputs (n,)."""
-        r = self.model.modes
-        transition = np.eye(3 * r)
-        self.state, transition[: 2 * r] = self.model.transition(self.state, inputs, self.bias)
+        transition = np.eye(3 * self.model.modes)
+        self.state, transition[: 2 * self.model.modes], _ = self.model.transition(self.state, inputs, self.bias[None])
         self._covariance = transition @ self._covariance @ transition.T + np.diag(self._wander)
 
     def correct(self, markers: FloatArray) -> None:
@@ -73,12 +72,11 @@ class Estimator:
         if not seen.any():
             return
         slopes = np.zeros((int(seen.sum()), 3 * r))
-        slopes[:, :r] = model.point_slopes(self.state.z, Monomials(self.state.acting))[0][0, seen]
+        slopes[:, :r] = model.point_slopes(self.state.z, Monomials(self.state.acting))[0, seen]
         expected = (model.observe(self.state)[0] + self.offset)[seen]
         residual = markers.ravel()[seen] - expected
         change, self._covariance = conditioned(self._covariance, slopes, residual, self._noise.observed)
-        z, v = self.state.z + change[:r], self.state.v + change[r : 2 * r]
-        self.state = replace(self.state, z=z, v=v)
+        self.state = self.state.moved(change[None, :r], change[None, r : 2 * r], model.time_step)
         self.bias = self.bias + change[2 * r :]
 
 

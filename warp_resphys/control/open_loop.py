@@ -1,7 +1,7 @@
 """Inputs for whole motions, planned on a reduced model and corrected with the full simulator.
 
-The reduced model plans, the robot's simulator plays the plan, and a Gauss-Newton step with the slopes of the reduced
-model reduces the remaining error (iterative learning control on the simulated robot).
+The reduced model plans by a receding horizon in which it is the robot itself. The robot's simulator plays the plan, and
+what its point differs from that of the model is added to the model's in the next plan (iterative learning control).
 """
 
 from collections.abc import Callable
@@ -19,66 +19,66 @@ from .world import FloatArray
 OnProgress = Callable[[int], None]
 
 _SHORTER: Final = 0.25  # factor on a correction that made the motion worse
+_PLAYED: Final = 3  # plans begin anew after one of so many parts of the horizon
 
 
-class Follower:
-    """Plans whole motions of a robot.
+def follow(
+    robot: Robot,
+    model: ReducedModel,
+    planner_of: Callable[[FloatArray], Planner],
+    paths: FloatArray,
+    corrections: int,
+    on_progress: OnProgress = lambda steps: None,
+) -> list[PlannedMotion]:
+    """Returns the best plans for paths.
 
     Args:
         robot: whose point follows the paths.
         model: its reduced model.
-        planner: for the number of steps of the motions.
+        planner_of: returns a planner for a path (T, d).
+        paths: (B, T, d) references of the point after each step [m].
         corrections: number of corrections by the robot.
+        on_progress: called with the number of further simulation steps that are done.
+
+    Raises:
+        InputError: no inputs satisfy their bounds.
+        ConvergenceError: the robot's simulation fails.
     """
+    tracked, low = planner_of(paths[0]).tracked, planner_of(paths[0]).limits.low
+    start, offsets = model.rest(low), np.zeros_like(paths)
+    wanted = np.stack([_planned(model, planner_of(path), offset) for path, offset in zip(paths, offsets, strict=True)])
+    inputs, kept, errors, best = wanted, wanted.copy(), list[FloatArray](), np.full(len(paths), np.inf)
+    kept_markers, shares = list[FloatArray](paths), np.ones(len(paths))
+    for _ in range(corrections + 1):
+        markers = _played(robot, model.name, low, inputs, on_progress)
+        points = markers[:, 1:] @ tracked.T
+        errors.append(1e3 * np.linalg.norm(points - paths, axis=2).mean(1))
+        for row, error in enumerate(errors[-1]):
+            if error < best[row]:
+                best[row], kept[row], kept_markers[row], shares[row] = error, inputs[row], markers[row], 1.0
+                offset = points[row] - model.respond(start, inputs[row][:, None])[:, 0] @ tracked.T
+                wanted[row] = _planned(model, planner_of(paths[row]), offset)
+            else:
+                shares[row] *= _SHORTER
+        inputs = kept + shares[:, None, None] * (wanted - kept)
+    rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
+    return [PlannedMotion(path, own, markers[1:] @ tracked.T, markers, mm) for path, own, markers, mm in rows]
 
-    def __init__(self, robot: Robot, model: ReducedModel, planner: Planner, corrections: int) -> None:
-        self._robot, self._model, self._planner, self._corrections = robot, model, planner, corrections
 
-    @property
-    def rollouts(self) -> int:
-        """Number of roll-outs of the robot in `follow`."""
-        return self._corrections + 1
+def _planned(model: ReducedModel, planner: Planner, offset: FloatArray) -> FloatArray:
+    """Inputs (T, n) for a whole path, whose points are off from those of the model by (T, d) [m]."""
+    state, inputs, steps = model.rest(planner.limits.low), list[FloatArray](), max(planner.steps // _PLAYED, 1)
+    for number in range(0, len(planner.path), steps):
+        now = planner.plan(number, state, offset=offset, played=steps)[: min(steps, len(planner.path) - number)]
+        state = model.move(state, now[:, None]).end
+        inputs.append(now)
+    return np.concatenate(inputs)
 
-    def follow(self, paths: FloatArray, on_progress: OnProgress = lambda steps: None) -> list[PlannedMotion]:
-        """Returns the best plans for paths (B, T, d) [m].
 
-        Args:
-            paths: references of the point after each step.
-            on_progress: called with the number of further simulation steps that are done.
-
-        Raises:
-            InputError: no inputs satisfy their bounds.
-            ConvergenceError: the robot's simulation fails.
-        """
-        planner, model = self._planner, self._model
-        before = np.array(planner.limits.low)
-        start = model.rest(before)
-        knots = np.stack([planner.plan(start, before, path).knots for path in paths])
-        errors, best = [], np.full(len(paths), np.inf)
-        kept, kept_markers = knots.copy(), list[FloatArray](paths)
-        steps, shares = np.zeros_like(knots), np.ones(len(paths))
-        for _ in range(self.rollouts):
-            markers = self._play(planner.lines @ knots, on_progress)
-            points = markers[:, 1:] @ planner.tracked.T
-            errors.append(1e3 * np.linalg.norm(points - paths, axis=2).mean(1))
-            for row, (path, error) in enumerate(zip(paths, errors[-1], strict=True)):
-                if error < best[row]:
-                    best[row], kept[row], kept_markers[row], shares[row] = error, knots[row], markers[row], 1.0
-                    steps[row] = planner.corrected(start, knots[row], points[row] - path) - knots[row]
-                else:
-                    shares[row] *= _SHORTER
-                knots[row] = kept[row] + shares[row] * steps[row]
-        rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
-        return [
-            PlannedMotion(path, planner.lines @ knots, markers[1:] @ planner.tracked.T, markers, mm)
-            for path, knots, markers, mm in rows
-        ]
-
-    @torch.no_grad()
-    def _play(self, inputs: FloatArray, on_progress: OnProgress) -> FloatArray:
-        """Returns the markers (B, T + 1, 3 M) of the robot under inputs (B, T, n) [m]."""
-        robot, name = self._robot, self._model.name
-        start = robot.begin(len(inputs), **{name: self._planner.limits.low})
-        given: dict[str, Any] = {name: robot.simulator.tensor(inputs.swapaxes(0, 1))}
-        motion = robot.rollout(start, on_step=lambda number: on_progress(1), **given)
-        return np.asarray(motion.markers.flatten(2).swapaxes(0, 1).double().cpu().numpy())
+@torch.no_grad()
+def _played(robot: Robot, name: str, low: FloatArray, inputs: FloatArray, on_progress: OnProgress) -> FloatArray:
+    """Markers (B, T + 1, 3 M) of the robot under inputs (B, T, n) [m]."""
+    start, given = robot.begin(len(inputs), **{name: low}), robot.simulator.tensor(inputs.swapaxes(0, 1))
+    series: dict[str, Any] = {name: given}
+    motion = robot.rollout(start, on_step=lambda number: on_progress(1), **series)
+    return np.asarray(motion.markers.flatten(2).swapaxes(0, 1).double().cpu().numpy())

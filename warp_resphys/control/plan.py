@@ -2,6 +2,7 @@
 
 The inputs of a plan are piecewise linear between knots. Each iteration solves a quadratic program for the change of
 the knots: it minimises the distance of the points from the path, plus small penalties on the inputs and their changes.
+Derivatives are differences of motions that are predicted at once.
 """
 
 from collections.abc import Sequence
@@ -11,27 +12,16 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from ..io.errors import InputError
+from .polynomials import around
 from .world import FloatArray
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
 _ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop
-
-
-@dataclass(frozen=True)
-class Response:
-    """The motion of observed points over T steps.
-
-    Attributes:
-        y: (T, 3 M) observed points after each step [m].
-        slopes: (T, 3 M, P) their derivatives by P parameters of the inputs; None if not requested.
-    """
-
-    y: FloatArray
-    slopes: FloatArray | None
+_DIFFERENCE: Final = 1e-3  # of knots for derivatives, as a share of the inputs' ranges
 
 
 class PredictionModel(Protocol):
-    """Predicts observed points under inputs, with derivatives: a `ReducedModel` or a `LinearModel`."""
+    """Predicts observed points under inputs: a `ReducedModel` or a `LinearModel`."""
 
     @property
     def time_step(self) -> float:
@@ -43,15 +33,12 @@ class PredictionModel(Protocol):
         """The number n of inputs."""
         ...
 
-    def respond(
-        self, start: Any, inputs: FloatArray, basis: FloatArray | None = None, bias: FloatArray | None = None
-    ) -> Response:
-        """Predicts the observed points over T steps.
+    def respond(self, start: Any, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
+        """Predicts the observed points (T, B, 3 M) of B motions over T steps [m].
 
         Args:
             start: the state.
-            inputs: (T, n) commanded during each step, in their unit.
-            basis: (T, n, P) derivatives of the inputs by parameters, for `Response.slopes`.
+            inputs: (T, B, n) commanded during each step, in their unit.
             bias: (r,) added to the reduced coordinates of the equilibria; a linear model ignores it.
         """
         ...
@@ -77,145 +64,94 @@ class Limits:
         return np.asarray(self.high - self.low)
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the penalties in a plan's objective, beside squared distances in millimetres.
-
-    Attributes:
-        effort: of the mean square of the inputs, as shares of their ranges.
-        change: of the mean square of their changes between knots, as shares of the rate limits.
-    """
-
-    effort: float = 1e-2
-    change: float = 1e-2
-
-
-@dataclass(frozen=True)
-class Horizon:
-    """Length and discretisation of plans.
-
-    Attributes:
-        steps: T.
-        pieces: of the piecewise linear inputs.
-        weights: of the penalties.
-        iterations: of Gauss-Newton, at most.
-    """
-
-    steps: int
-    pieces: int
-    weights: Weights = Weights()
-    iterations: int = 1
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Inputs over T steps.
-
-    Attributes:
-        inputs: (T, n) during each step.
-        knots: (K, n) at the ends of the linear pieces.
-    """
-
-    inputs: FloatArray
-    knots: FloatArray
-
-
 class Planner:
-    """Plans over a fixed number of steps.
+    """Plans over a horizon along a path; each begins where the last one was left.
 
     Args:
-        model: that predicts the points.
+        model: of the robot.
         tracked: (d, 3 M) from the observed points to the coordinates that follow the path.
-        limits: of the inputs.
-        horizon: of the plans.
-
-    Attributes:
-        lines: (T, K) from the knots to the inputs of each step.
+        limits: of the inputs; the first plan begins at the lower ones.
+        path: (T, d) reference of the points after each step [m], NaN where they are free.
+        steps: H, of the horizon; past the end of the path, its last point is repeated.
+        pieces: of the piecewise linear inputs.
+        weight: of the mean squares of the inputs, as shares of their ranges, and of their changes between knots, as
+            shares of the rate limits, beside squared distances in millimetres.
+        iterations: of Gauss-Newton, at most.
 
     Raises:
         InputError: more pieces than steps, or none.
     """
 
-    def __init__(self, model: PredictionModel, tracked: FloatArray, limits: Limits, horizon: Horizon) -> None:
-        steps, pieces, n = horizon.steps, horizon.pieces, model.parts
+    def __init__(
+        self,
+        model: PredictionModel,
+        tracked: FloatArray,
+        limits: Limits,
+        path: FloatArray,
+        steps: int,
+        pieces: int,
+        weight: float = 1e-2,
+        iterations: int = 1,
+    ) -> None:
         if not 1 <= pieces <= steps:
             raise InputError(f"a plan of {steps} steps cannot have {pieces} pieces: give from 1 to {steps}.")
-        self.model, self.tracked, self.limits, self._horizon = model, tracked, limits, horizon
-        self.steps = steps
-        knots, at = np.arange(pieces + 1.0), np.arange(1, steps + 1) / steps * pieces
-        self.lines = np.maximum(1.0 - np.abs(at[:, None] - knots), 0.0)
-        # The first knot is the input before the plan, and stays.
-        free = self.lines[:, 1:]
-        self._basis = np.einsum("tk,ij->tikj", free, np.eye(n)).reshape(steps, n, -1) * np.tile(limits.range, pieces)
-        seconds = steps * model.time_step / pieces
-        self._most = np.tile(limits.rate * seconds / limits.range, pieces)
-        self._difference = np.kron(np.eye(pieces) - np.eye(pieces, k=-1), np.eye(n))
+        self.model, self.tracked, self.limits, self.path = model, tracked, limits, path
+        self.steps, self._weight, self._iterations = steps, weight, iterations
+        ends = np.arange(1, steps + 1) / steps * pieces  # of the steps, in pieces
+        self._lines = np.maximum(1.0 - np.abs(ends[:, None] - np.arange(pieces + 1.0)), 0.0)
+        self._most = np.tile(limits.rate * (steps * model.time_step / pieces) / limits.range, pieces)
+        self._difference = np.kron(np.eye(pieces) - np.eye(pieces, k=-1), np.eye(model.parts))
+        self._knots = np.repeat(np.asarray(limits.low, dtype=np.float64)[None], pieces + 1, axis=0)
 
     def plan(
-        self,
-        start: Any,
-        before: FloatArray,
-        path: FloatArray,
-        guess: FloatArray | None = None,
-        bias: FloatArray | None = None,
-        offset: FloatArray | None = None,
-    ) -> Plan:
-        """Optimises the inputs.
+        self, number: int, start: Any, bias: FloatArray | None = None, offset: FloatArray | None = None, played: int = 1
+    ) -> FloatArray:
+        """Returns the inputs (H, n) from a step on.
 
         Args:
+            number: of the step.
             start: state of the model.
-            before: (n,) inputs until now.
-            path: (T, d) reference of the points after each step [m], NaN where they are free.
-            guess: (K, n) initial knots; constant inputs if omitted.
             bias: (r,) added to the reduced coordinates of the equilibria.
             offset: (T, d) or (d,) added to the points that the model predicts [m].
+            played: number of steps until the next plan.
 
         Raises:
             InputError: the quadratic program has no solution.
         """
-        limits = self.limits
-        goal = path - (0.0 if offset is None else offset)
-        knots = np.repeat(before[None], self.lines.shape[1], axis=0) if guess is None else guess.copy()
-        knots[0] = before
-        knots = np.clip(knots, limits.low, limits.high)
-        for _ in range(self._horizon.iterations):
-            response = self.model.respond(start, self.lines @ knots, self._basis, bias)
-            assert response.slopes is not None
-            step = self._step(response.slopes, response.y @ self.tracked.T - goal, knots)
-            knots[1:] += limits.range * step.reshape(-1, self.model.parts)
+        rows = np.minimum(np.arange(number, number + self.steps), len(self.path) - 1)
+        goal = self.path[rows]
+        if offset is not None:
+            goal = goal - (offset if offset.ndim == 1 else offset[rows])
+        limits, first = self.limits, self._knots[0]
+        shares = ((self._knots[1:] - limits.low) / limits.range).ravel()
+        for _ in range(self._iterations):
+            knots = limits.low + limits.range * around(shares, _DIFFERENCE).reshape(1 + len(shares), -1, len(first))
+            knots = np.concatenate([np.broadcast_to(first, (len(knots), 1, len(first))), knots], axis=1)
+            points = self.model.respond(start, np.einsum("tk,bkn->tbn", self._lines, knots), bias) @ self.tracked.T
+            slopes = np.moveaxis(points[:, 1:] - points[:, :1], 1, 2) / _DIFFERENCE
+            step = self._step(slopes, points[:, 0] - goal, shares)
+            shares = shares + step
             if np.abs(step).max() < _ENOUGH:
                 break
-        return Plan(self.lines @ knots, knots)
+        knots = np.concatenate([first[None], limits.low + limits.range * shares.reshape(-1, len(first))])
+        inputs = self._lines @ knots
+        series, at = np.concatenate([knots[:1], inputs]), np.arange(len(knots)) / (len(knots) - 1) * self.steps
+        later = np.minimum(at + played, self.steps)
+        self._knots = np.stack([np.interp(later, np.arange(self.steps + 1), column) for column in series.T], axis=1)
+        return np.asarray(inputs)
 
-    def corrected(self, start: Any, knots: FloatArray, errors: FloatArray) -> FloatArray:
-        """Returns improved knots (K, n), by one Gauss-Newton step from measured errors.
-
-        Args:
-            start: state of the model.
-            knots: (K, n) that were played.
-            errors: (T, d) of the robot's points from the path [m].
-        """
-        slopes = self.model.respond(start, self.lines @ knots, self._basis).slopes
-        assert slopes is not None
-        step = self._step(slopes, errors, knots)
-        return np.concatenate([knots[:1], knots[1:] + self.limits.range * step.reshape(-1, self.model.parts)])
-
-    def _step(self, slopes: FloatArray, errors: FloatArray, knots: FloatArray) -> FloatArray:
-        """Change (P,) of the knots after the first, as shares of the inputs' ranges."""
-        count, weights, limits = max(errors.size, 1), self._horizon.weights, self.limits
-        first, *others = (knots - limits.low) / limits.range
-        x = np.concatenate(others)
+    def _step(self, slopes: FloatArray, errors: FloatArray, shares: FloatArray) -> FloatArray:
+        """Change (P,) of the knots after the first, as shares (P,) of the inputs' ranges."""
+        first = (self._knots[0] - self.limits.low) / self.limits.range
         finite = np.isfinite(errors).ravel()
-        j = 1e3 * (self.tracked @ slopes).reshape(errors.size, -1) * finite[:, None]
+        j = 1e3 * slopes.reshape(errors.size, -1) * finite[:, None]
         pull = j.T @ (1e3 * np.where(finite, errors.ravel(), 0.0))
         d = self._difference / self._most[:, None]
-        start = np.concatenate([first, np.zeros(len(x) - len(first))])
-        jump = d @ x - start / self._most
-        effort = weights.effort / len(x) * count
-        change = weights.change / len(x) * count
-        hessian = j.T @ j + effort * np.eye(len(x)) + change * d.T @ d
-        pull = pull + effort * x + change * d.T @ jump
-        return solve_program(hessian, pull, d, -1.0 - jump, 1.0 - jump, -x, 1.0 - x)
+        jump = d @ shares - np.concatenate([first, np.zeros(len(shares) - len(first))]) / self._most
+        weight = self._weight * max(errors.size, 1) / len(shares)
+        hessian = j.T @ j + weight * (np.eye(len(shares)) + d.T @ d)
+        pull = pull + weight * (shares + d.T @ jump)
+        return solve_program(hessian, pull, d, -1.0 - jump, 1.0 - jump, -shares, 1.0 - shares)
 
 
 def solve_program(

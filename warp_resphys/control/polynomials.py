@@ -44,7 +44,6 @@ class Polynomial:
         self.coefficients, self.order = coefficients, order
         self._shape = coefficients.shape[1:]
         self._flat = coefficients.reshape(len(coefficients), -1)
-        self._sloped: FloatArray | None = None  # (F, n V) coefficients of the derivatives
 
     @classmethod
     def fitted(cls, points: FloatArray, values: FloatArray, order: int) -> "Polynomial":
@@ -59,14 +58,6 @@ class Polynomial:
         """Values (T, *shape) at points (T, n)."""
         at = at if isinstance(at, Monomials) else Monomials(at)
         return np.asarray((at.values(self.order) @ self._flat).reshape(len(at.points), *self._shape))
-
-    def slopes(self, at: FloatArray | Monomials) -> FloatArray:
-        """Derivatives (T, n, *shape) with respect to the variables at points (T, n)."""
-        at = at if isinstance(at, Monomials) else Monomials(at)
-        n = at.points.shape[1]
-        if self._sloped is None:
-            self._sloped = (derivatives(n, self.order) @ self._flat).swapaxes(0, 1).reshape(len(self._flat), -1)
-        return np.asarray((at.values(self.order) @ self._sloped).reshape(len(at.points), n, *self._shape))
 
 
 def best_order(points: FloatArray, values: FloatArray, least: int) -> int:
@@ -103,11 +94,6 @@ class SquaredPolynomial(Polynomial):
         root = super().__call__(at)
         return np.asarray(root @ root.mT)
 
-    def slopes(self, at: FloatArray | Monomials) -> FloatArray:
-        """Derivatives (T, n, ..., r, r) with respect to the variables at points (T, n)."""
-        product = super().slopes(at) @ super().__call__(at).mT[:, None]
-        return np.asarray(product + product.mT)
-
 
 @cache
 def powers(variables: int, order: int) -> NDArray[np.int64]:
@@ -117,19 +103,6 @@ def powers(variables: int, order: int) -> NDArray[np.int64]:
         for chosen in itertools.combinations_with_replacement(range(variables), degree):
             rows.append(np.bincount(chosen, minlength=variables) if chosen else np.zeros(variables, dtype=np.int64))
     return np.array(rows, dtype=np.int64)
-
-
-@cache
-def derivatives(variables: int, order: int) -> FloatArray:
-    """Matrices (n, F, F) from the coefficients of a polynomial to those of its derivatives by the variables."""
-    exponents = powers(variables, order)
-    place = {tuple(row): number for number, row in enumerate(exponents.tolist())}
-    matrices = np.zeros((variables, len(exponents), len(exponents)))
-    for number, row in enumerate(exponents):
-        for variable in np.flatnonzero(row):
-            lower = tuple((row - np.eye(variables, dtype=np.int64)[variable]).tolist())
-            matrices[variable, place[lower], number] = row[variable]
-    return matrices
 
 
 @cache
@@ -154,3 +127,9 @@ def solve_ridge(features: FloatArray, values: FloatArray, common_scale: bool = F
     scaled = features / scale
     normal = scaled.T @ scaled / len(features) + _RIDGE * np.eye(features.shape[1])
     return np.asarray(np.linalg.solve(normal, scaled.T @ values / len(features)) / scale[:, None])
+
+
+def around(point: FloatArray, step: float) -> FloatArray:
+    """Returns points (1 + k, ..., k) for differences: one (..., k), and it with each coordinate moved by a step."""
+    k = point.shape[-1]
+    return np.asarray(point + step * np.eye(1 + k, k, -1).reshape(1 + k, *[1] * (point.ndim - 1), k))

@@ -24,11 +24,11 @@ has a previous state, else 0) and step length h',
     s_{k+1} = L ((1 + g) s_k - g s_{k-1}) + J (A z_0 + P z_k - sum B e y + force(s_k)),     J = [N; N / h'],
     N = (1 / h'^2 + D / h' + A + P)^-1,   P = sum B gamma,   y_{k+1} = e y_k + gamma (z_{k+1} - z_k),
 
-with sums over the branches, and e and gamma of `energies.viscosity`. `ReducedMotion` has the derivatives. B models are
-stepped together. Inputs are in units of `ReducedModel.scale`.
+with sums over the branches, and e and gamma of `energies.viscosity`. B models are stepped together, so that differences
+of as many as there are variables give derivatives in one pass. Inputs are in units of `ReducedModel.scale`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
@@ -41,8 +41,7 @@ from ..data.input_response import InputResponse
 from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
 from ..io.errors import ConvergenceError, InputError
-from .plan import Response
-from .polynomials import Monomials, Polynomial, SquaredPolynomial
+from .polynomials import Monomials, Polynomial, SquaredPolynomial, around
 from .reduced_force import ForceAlong, ReducedForce
 from .sampling import check_integrator
 from .world import BoolArray, FloatArray
@@ -51,7 +50,9 @@ IntArray = NDArray[np.int64]
 
 _REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
 _ITERATIONS: Final = 50
-_HALVINGS: Final = 8
+_SHARES: Final = 0.5 ** np.arange(8.0)  # of a step of Newton's method, of which the best is taken
+_DIFFERENCE: Final = 1e-3  # of coordinates for derivatives of the force, relative to their size
+_MOVED: Final = 1e-4  # root mean square displacement of the vertices for derivatives of a step [m]
 _POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown", "branches", "shape")
 _FORCE_POLYNOMIALS: Final = ("places", "seen", "usual", "push")
 _PLAIN: Final = ("time_step", "integrator", "labels", "name", "acts", "filters", "times", "quality", "robot")
@@ -88,6 +89,11 @@ class ReducedState:
         """Joins two states: this one where chosen (B,), the other one elsewhere."""
         pairs = ((key, array, other.arrays()[key]) for key, array in self.arrays().items())
         return self.from_arrays({k: np.where(chosen[:, None] if a.ndim > 1 else chosen, a, b) for k, a, b in pairs})
+
+    def select(self, models: Sequence[int]) -> "ReducedState":
+        """Returns the state of some models, by number."""
+        rows = [*models]
+        return self.from_arrays({k: a[..., rows, :] if a.ndim > 1 else a[rows] for k, a in self.arrays().items()})
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays of the state by name."""
@@ -196,59 +202,52 @@ class ReducedModel:
         """
         commands = np.zeros((count, self.parts)) if inputs is None else np.tile(inputs, (count, 1))
         u = self._moving(self.response.scaled(commands))
-        z = np.repeat(self._equilibrium(Monomials(u[:1]))[0], count, axis=0)
+        z = np.repeat(self._equilibrium(Monomials(u[:1])), count, axis=0)
         still, relaxed = np.stack([z, np.zeros_like(z)]), np.zeros((len(self.times), *z.shape))
         memory, begins = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
         return ReducedState(still[0], still[1], relaxed, u, memory, still, begins)
 
-    def _equilibrium(self, u: Monomials) -> tuple[FloatArray, ForceAlong | None]:
-        """Solves A (z - z_0) = learned force by Newton's method with step halving; returns z (1, r) and the force."""
-        a, base = self.stiffness(u)[0], self.static(u)
-        force = self._force(u, np.repeat(u.points[None], len(self.filters), axis=0))
-        if force is None:
-            return base, None
-        size = np.abs(self.static.coefficients).max()
+    def _equilibrium(self, u: Monomials) -> FloatArray:
+        """Coordinates (S, r) with A (z - z_0) = learned force, by Newton's method with step halving."""
+        a, base = self.stiffness(u), self.static(u)
+        if self.force is None:
+            return base
+        size, means = np.abs(self.static.coefficients).max(), np.repeat(u.points[None], len(self.filters), axis=0)
 
-        def imbalance(z: FloatArray) -> tuple[FloatArray, float]:
-            """Residual (r,), and its largest entry as a displacement of the coordinates."""
-            residual = a @ (z - base)[0] - force(slice(1), np.stack([z, np.zeros_like(z)]))[0]
-            return residual, float(np.abs(np.linalg.solve(a, residual)).max())
+        def imbalance(z: FloatArray) -> FloatArray:
+            """Residuals (K, S, r) of K trials."""
+            flat, count = z.reshape(-1, self.modes), len(z)
+            force = self._force(Monomials(np.tile(u.points, (count, 1))), np.tile(means, (1, count, 1)))
+            assert force is not None
+            pushed = force(slice(None), np.stack([flat, np.zeros_like(flat)]))
+            return np.asarray((a @ (z - base)[..., None])[..., 0] - pushed.reshape(z.shape))
 
-        z, (residual, error) = base, imbalance(base)
+        def error(residual: FloatArray) -> FloatArray:
+            """Largest residuals (K,), as displacements of the coordinates."""
+            return np.asarray(np.abs(np.linalg.solve(a, residual[..., None])).max((1, 2, 3)))
+
+        z, step = base, _DIFFERENCE * size
         for _ in range(_ITERATIONS):
-            if error < _REST_TOLERANCE * size:
-                return z, force
-            step = np.linalg.solve(a - force.last_slope(), residual)
-            for share in 0.5 ** np.arange(_HALVINGS):
-                trial = z - share * step
-                residual, now = imbalance(trial)
-                if now < error:
-                    break
-            z, error = trial, now
+            residual = imbalance(around(z, step))
+            if error(residual[:1])[0] < _REST_TOLERANCE * size:
+                return z
+            slope = np.moveaxis(residual[1:] - residual[0], 0, -1) / step
+            change = np.linalg.solve(slope, residual[0][..., None])[..., 0]
+            trials = z - _SHARES[:, None, None] * change
+            z = trials[error(imbalance(trials)).argmin()]
         raise ConvergenceError("the reduced model has no equilibrium: its learned force is too large.", z, None)
 
     def _force(self, u: Monomials, means: FloatArray) -> ForceAlong | None:
         return None if self.force is None else ForceAlong(self.force, u, self.static, means)
 
-    def rest_observed(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns observed points (3 M,) in equilibrium under inputs (n,) [m], and their derivatives (3 M, n).
+    def rest_observed(self, inputs: FloatArray) -> FloatArray:
+        """Returns observed points (S, 3 M) in equilibrium under inputs (S, n) [m].
 
         Raises:
             ConvergenceError: there is no equilibrium.
         """
-        u = Monomials(self._moving(self.response.scaled(inputs))[None])
-        z, force = self._equilibrium(u)
-        a, slope = self.stiffness(u)[0], self.static.slopes(u)[0].T
-        by_u = a @ slope - np.einsum("nrs,s->rn", self.stiffness.slopes(u)[0], (z - self.static(u))[0])
-        if force is not None:
-            force.restart()
-            force(slice(1), np.stack([z, np.zeros_like(z)]))
-            by_state, more, by_means = (slopes[0] for slopes in force.slopes())
-            a, by_u = a - by_state[:, : self.modes], by_u + more + by_means.sum(1)
-        by_z, direct = (slopes[0] for slopes in self.point_slopes(z, u))
-        by_commands = np.zeros((len(by_z), self.parts))
-        by_commands[:, self.moving] = direct + by_z @ np.linalg.solve(a, by_u)
-        return self.points(z, u)[0], by_commands * self.acts.get("factor", 1.0) / self.scale
+        u = Monomials(self._moving(self.response.scaled(inputs)))
+        return self.points(self._equilibrium(u), u)
 
     def observe(self, state: ReducedState) -> FloatArray:
         """Observed points (B, 3 M) in a state [m]."""
@@ -266,14 +265,11 @@ class ReducedModel:
         linear = (self.shown(u) @ off[..., None])[..., 0]
         return self.observed(u) + linear + squares @ self.curved.reshape(squares.shape[1], -1)
 
-    def point_slopes(self, z: FloatArray, u: Monomials) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of `points` with respect to the coordinates (S, 3 M, r) and the inputs (S, 3 M, n)."""
+    def point_slopes(self, z: FloatArray, u: Monomials) -> FloatArray:
+        """Derivatives (S, 3 M, r) of `points` with respect to the coordinates."""
         off, r = z - self.static(u), self.modes
         bent = (off @ self.curved.reshape(r, -1)).reshape(len(z), r, -1)
-        by_z = self.shown(u) + 2.0 * bent.swapaxes(1, 2)
-        turned = (self.shown.slopes(u) @ off[:, None, :, None])[..., 0]  # (S, n, 3 M)
-        direct = (self.observed.slopes(u) + turned).swapaxes(1, 2)
-        return by_z, direct - by_z @ self.static.slopes(u).swapaxes(1, 2)
+        return np.asarray(self.shown(u) + 2.0 * bent.swapaxes(1, 2))
 
     def move(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> "ReducedMotion":
         """Advances B models by T steps.
@@ -281,7 +277,7 @@ class ReducedModel:
         Args:
             start: their state.
             inputs: (T, B, n) commanded during each step, in their unit.
-            bias: (r,) or (B, r), added to the equilibria z_0; (B, r) for T = 1.
+            bias: (r,) or (B, r), added to the equilibria z_0.
         """
         acting, means, memory = self.response(start.memory, inputs)
         acting, means = self._moving(acting), self._moving(means)
@@ -296,10 +292,11 @@ class ReducedModel:
         branches, (decay, gamma) = self.branches(u), self.relaxation
         held, carried = np.einsum("k,skrq->srq", gamma, branches), decay[:, None, None] * branches
         inverse = np.linalg.inv(inertia + a + held)
-        pull = (a @ (base if bias is None else base + bias)[..., None])[..., 0]
+        shifted = base if bias is None else (base.reshape(steps, batch, r) + bias).reshape(-1, r)
+        pull = (a @ shifted[..., None])[..., 0]
         force = self._force(u, means.reshape(len(means), len(u.points), n))
         now, before, states = np.stack([start.z, start.v]), start.previous, list[FloatArray]()
-        strain, strains = start.strains, list[FloatArray]()
+        strain, left = start.strains, np.zeros(batch, dtype=np.bool_)
         for k in range(steps):
             rows = slice(k * batch, (k + 1) * batch)
             at, rate = (1.0 + share[rows]) * now - share[rows] * before
@@ -307,38 +304,52 @@ class ReducedModel:
             right += (held[rows] @ now[0, ..., None])[..., 0] - np.einsum("bkrq,kbq->br", carried[rows], strain)
             if force is not None:
                 right += force(rows, now)
+                left |= force.left
             z = (inverse[rows] @ right[..., None])[..., 0]
             strain = self.relaxed(strain, z - now[0])
             now, before = np.stack([z, (z - at) / step[rows]]), now
-            states.append(now)
-            strains.append(strain)
+            states.append(z)
         end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, np.ones(batch, dtype=np.bool_))
-        series = np.stack(states, axis=1).reshape(2, -1, r)
-        past = np.stack(strains, axis=1).reshape(-1, len(u.points), r)
-        matrices = inertia, inverse, held, carried.sum(1)
-        return ReducedMotion(self, u, bias, share, step, *matrices, force, series[0], series[1], past, end)
+        return ReducedMotion(self, u, np.stack(states), left, end)
 
     def relaxed(self, strains: FloatArray, change: FloatArray) -> FloatArray:
         """Returns y_k after a step in which the coordinates change; (K, ...) and (...)."""
         decay, gamma = (value.reshape(-1, *np.ones(change.ndim, dtype=int)) for value in self.relaxation)
         return np.asarray(decay * strains + gamma * change)
 
-    def respond(
-        self,
-        start: ReducedState,
-        inputs: FloatArray,
-        basis: FloatArray | None = None,
-        bias: FloatArray | None = None,
-    ) -> Response:
-        """Predicts the observed points of one model (B = 1); `PredictionModel` documents the arguments."""
-        motion = self.move(start, inputs[:, None], bias)
-        slopes = None if basis is None else motion.slopes(basis)
-        return Response(motion.y, slopes)
+    def respond(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
+        """Predicts the observed points from the state of one model; `PredictionModel` documents the arguments."""
+        return self.move(start.select([0] * inputs.shape[1]), inputs, bias).y
 
-    def transition(self, start: ReducedState, inputs: FloatArray, bias: FloatArray) -> tuple[ReducedState, FloatArray]:
-        """Advances one model by a step under inputs (n,); returns the state and its derivatives by z, v and b."""
-        motion = self.move(start, inputs[None, None], bias)
-        return motion.end, np.concatenate([motion.by_state, motion.by_bias], axis=2)[0]
+    @cached_property
+    def amounts(self) -> FloatArray:
+        """Changes (3 r,) of coordinates, rates and bias for derivatives of a step."""
+        moved = _MOVED / np.sqrt((self.basis**2).sum(0) / (len(self.basis) / 3))
+        stiffness = self.stiffness(np.zeros((1, len(self.moving))))[0]
+        return np.concatenate([moved, moved * np.sqrt(np.abs(np.diag(stiffness))), moved])
+
+    def transition(
+        self, start: ReducedState, inputs: FloatArray, bias: FloatArray
+    ) -> tuple[ReducedState, FloatArray, bool]:
+        """Advances B models by a step, and the first also from other states.
+
+        Args:
+            start: their state.
+            inputs: (n,) commanded during the step, in their unit.
+            bias: (B, r), added to the equilibria z_0.
+
+        Returns:
+            Their state after it; derivatives (2 r, 3 r) of that of the first model by z, v and the bias, where z and v
+            are moved with their past (`ReducedState.moved`); and whether its force left its training range.
+        """
+        count, r = len(bias), self.modes
+        rows = [*range(count), *([0] * 3 * r)]
+        z, v, b = np.split(np.concatenate([np.zeros((count, 3 * r)), np.diag(self.amounts)]), 3, axis=1)
+        states = start.select(rows).moved(z, v, self.time_step)
+        motion = self.move(states, np.tile(inputs, (1, len(rows), 1)), bias[rows] + b)
+        after = np.concatenate([motion.end.z, motion.end.v], axis=1)
+        slopes = ((after[count:] - after[0]) / self.amounts[:, None]).T
+        return motion.end.select(range(count)), slopes, bool(motion.left[0])
 
     def checkpoint(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         """Returns arrays and plain data for `restored`, without the network."""
@@ -383,114 +394,23 @@ class ReducedModel:
 
 @dataclass(frozen=True)
 class ReducedMotion:
-    """T steps of B models with their derivatives; rows S = T B run over models first, then steps.
+    """T steps of B models.
 
     Attributes:
         model: the reduced model.
-        u: monomials of the (S, n) inputs.
-        bias: (r,) or (B, r), added to the equilibria z_0.
-        share: (S, 1) g, weight of the previous state.
-        step: (S, 1) h' [s].
-        inertia: (S, r, r) 1 / h'^2 + D / h'.
-        inverse: (S, r, r) N.
-        held: (S, r, r) P.
-        carried: (S, r, r) sum of B e.
-        force: the learned force along the motion, if the model has one.
-        z: (S, r) after each step.
-        v: (S, r) after each step [1/s].
-        strains: (K, S, r) y_k after each step.
+        u: monomials of the (T B, n) inputs.
+        z: (T, B, r) coordinates after each step.
+        left: (B,) whether the learned force was evaluated outside its training range.
         end: the last state.
     """
 
     model: ReducedModel
     u: Monomials
-    bias: FloatArray | None
-    share: FloatArray
-    step: FloatArray
-    inertia: FloatArray
-    inverse: FloatArray
-    held: FloatArray
-    carried: FloatArray
-    force: ForceAlong | None
     z: FloatArray
-    v: FloatArray
-    strains: FloatArray
+    left: BoolArray
     end: ReducedState
 
     @property
     def y(self) -> FloatArray:
-        """Observed points (S, 3 M) after each step [m]."""
-        return self.model.points(self.z, self.u)
-
-    @cached_property
-    def impulse(self) -> FloatArray:
-        """J, derivatives (S, 2 r, r) of the state after a step with respect to a force."""
-        return np.concatenate([self.inverse, self.inverse / self.step[..., None]], axis=1)
-
-    @property
-    def left(self) -> BoolArray:
-        """(S,) whether the learned force was evaluated outside its training range."""
-        return np.zeros(len(self.z), dtype=np.bool_) if self.force is None else self.force.left
-
-    @property
-    def by_bias(self) -> FloatArray:
-        """Derivatives (S, 2 r, r) of the state after a step with respect to the bias in it."""
-        return self.impulse @ self.model.stiffness(self.u)
-
-    @cached_property
-    def _carried(self) -> FloatArray:
-        """L, derivatives (S, 2 r, 2 r) of the state after a step by the state that the integrator starts from."""
-        step, identity = self.step[..., None], np.eye(self.model.modes)
-        by_z, by_v = self.inverse @ self.inertia, self.inverse / step
-        upper = np.concatenate([by_z, by_v], axis=2)
-        return np.concatenate([upper, np.concatenate([by_z - identity, by_v], axis=2) / step], axis=1)
-
-    @cached_property
-    def _force_slopes(self) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        return None if self.force is None else self.force.slopes()
-
-    @cached_property
-    def by_state(self) -> FloatArray:
-        """Derivatives (S, 2 r, 2 r) of the state after each step with respect to the state before it."""
-        slopes = (1.0 + self.share[..., None]) * self._carried
-        slopes[..., : self.model.modes] += self.impulse @ self.held
-        return slopes if self._force_slopes is None else slopes + self.impulse @ self._force_slopes[0]
-
-    @cached_property
-    def by_moved(self) -> FloatArray:
-        """`by_state` for states that are moved at once, with their past and branches (`ReducedState.moved`)."""
-        r = self.model.modes
-        past = np.eye(2 * r)
-        past[:r, r:] -= self.model.time_step * np.eye(r)
-        slopes = self.by_state - self.share[..., None] * self._carried @ past
-        slopes[..., :r] -= self.impulse @ self.carried
-        return slopes
-
-    def slopes(self, basis: FloatArray) -> FloatArray:
-        """Derivatives (T, 3 M, P) of `y` of one model by parameters, from those of the commands (T, n, P)."""
-        model, u = self.model, self.u
-        by_parameters, by_means = (
-            (x / model.scale[:, None])[..., model.moving, :] for x in model.response.from_rest(basis)
-        )
-        base = model.static(u)
-        off = self.z - (base if self.bias is None else base + self.bias)
-        by_u = model.stiffness(u) @ model.static.slopes(u).swapaxes(1, 2)
-        by_u = by_u - np.einsum("tnrs,ts->trn", model.stiffness.slopes(u), off)
-        by_u = by_u - np.einsum("tnrs,ts->trn", model.damping.slopes(u), self.v)
-        by_u = by_u - np.einsum("tnkrs,kts->trn", model.branches.slopes(u), self.strains)
-        pushed = by_u @ by_parameters
-        if self._force_slopes is not None:
-            _, more, means = self._force_slopes
-            pushed = pushed + more @ by_parameters + np.einsum("trfn,ftnp->trp", means, by_means)
-        direct, before = self.impulse @ pushed, self.share[..., None] * self._carried
-        stiff = model.relaxation[0][:, None, None] * model.branches(u)
-        now = past = np.zeros(direct.shape[1:])
-        strain, z_slopes = np.zeros((len(model.times), model.modes, direct.shape[2])), []
-        for k in range(len(direct)):
-            moved = self.by_state[k] @ now - before[k] @ past + direct[k]
-            moved -= self.impulse[k] @ (stiff[k] @ strain).sum(0)
-            strain = model.relaxed(strain, moved[: model.modes] - now[: model.modes])
-            now, past = moved, now
-            z_slopes.append(now[: model.modes])
-        by_z, own = model.point_slopes(self.z, u)
-        return by_z @ np.array(z_slopes) + own @ by_parameters
+        """Observed points (T, B, 3 M) after each step [m]."""
+        return self.model.points(self.z.reshape(-1, self.model.modes), self.u).reshape(*self.z.shape[:2], -1)

@@ -17,7 +17,7 @@ from ..data.input_response import with_means
 from ..learning.networks import SkipMLP, StateMap
 from ..learning.rollout import Range
 from .polynomials import Monomials, Polynomial
-from .world import FloatArray
+from .world import BoolArray, FloatArray
 
 Array = NDArray[Any]
 Layer = Callable[[Array], Array]
@@ -40,10 +40,11 @@ class Evaluator:
         if self._fades is not None:
             self._nothing = network.encode_outputs(torch.zeros_like(network.rest)[None]).numpy(force=True)
 
-    def __call__(self, inputs: FloatArray) -> FloatArray:
-        """Standardised outputs (S, c) for standardised inputs (S, i)."""
+    def __call__(self, inputs: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Returns standardised outputs (S, c) for inputs (S, i), and which of these (S,) are outside of the range."""
         held: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
-        fades = self._fades if (held != inputs).any() else None
+        left = (held != inputs).any(1)
+        fades = self._fades if left.any() else None
         hidden = held = held.astype(self._linear.dtype)
         for number, layers in enumerate(self._blocks):
             after = hidden
@@ -54,7 +55,7 @@ class Evaluator:
         if fades is not None:
             weight = fades.weight(torch.as_tensor(inputs).to(fades.low)).numpy(force=True)
             outputs = self._nothing + weight[:, None] * (outputs - self._nothing)
-        return np.asarray(outputs, dtype=np.float64)
+        return np.asarray(outputs, dtype=np.float64), left
 
 
 def _layer(module: nn.Module) -> Layer:
@@ -116,86 +117,40 @@ class ReducedForce:
 
     @cached_property
     def outputs(self) -> Evaluator:
-        """Standardised outputs (S, c) for standardised inputs (S, i)."""
+        """Standardised outputs for standardised inputs."""
         return Evaluator(self.network, self.range_)
-
-    def output_slopes(self, inputs: FloatArray, left: FloatArray) -> FloatArray:
-        """Derivatives (S, r, i) of ``left @ outputs`` with respect to the inputs (S, i), with left (S, r, c)."""
-        with torch.enable_grad():
-            unheld = torch.as_tensor(inputs).to(self.network.linear).requires_grad_()
-            range_ = self.range_
-            outputs = self.network.standardised(unheld)[0] if range_ is None else range_.outputs(self.network, unheld)
-            weights = torch.as_tensor(left).to(outputs).swapaxes(0, 1)  # (r, S, c)
-            (slopes,) = torch.autograd.grad(outputs, unheld, weights, is_grads_batched=True)
-        return np.asarray(slopes.swapaxes(0, 1).double().cpu().numpy())
 
 
 class ForceAlong:
-    """The learned force along a motion under S inputs; records its evaluations for the derivatives.
+    """The learned force along a motion under S inputs.
 
     Args:
         force: of the model.
         u: monomials of the inputs.
         static: z_0.
         means: (F, S, n) filtered inputs.
+
+    Attributes:
+        left: (B,) whether the last evaluation was outside of the network's training range.
     """
 
+    left: BoolArray
+
     def __init__(self, force: ReducedForce, u: Monomials, static: Polynomial, means: FloatArray) -> None:
-        self._force, self._u, self._static, self._filters = force, u, static, len(means)
         base = static(u)
-        self._base = np.concatenate([base, np.zeros_like(base)], axis=1)
+        at_rest = np.concatenate([base, np.zeros_like(base)], axis=1)
+        self._evaluated = force.outputs
         self._seen, self._usual, self._push = force.seen(u), force.usual(u), force.push(u)
         conditions = np.tile(force.conditions, (len(base), 1))
         if len(force.conditions_by):
             conditions = conditions + with_means(u.points, means) @ force.conditions_by.T
-        places = force.places(u) - (self._seen @ self._base[..., None])[..., 0]
+        places = force.places(u) - (self._seen @ at_rest[..., None])[..., 0]
         self._offset, self._modes = np.concatenate([places, conditions], axis=1), places.shape[1]
-        self.restart()
-
-    def restart(self) -> None:
-        """Discards the recorded evaluations."""
-        self._states: list[FloatArray] = []
-        self._inputs: list[FloatArray] = []
-        self._outputs: list[FloatArray] = []
 
     def __call__(self, rows: slice, state: FloatArray) -> FloatArray:
         """Force (B, r) in some rows of the S inputs, for coordinates and rates (2, B, r)."""
         flat = np.concatenate([*state], axis=1)
         inputs = self._offset[rows].copy()
         inputs[:, : self._modes] += (self._seen[rows] @ flat[..., None])[..., 0]
-        outputs = self._force.outputs(inputs)
-        self._states.append(flat)
-        self._inputs.append(inputs)
-        self._outputs.append(outputs)
+        outputs, self.left = self._evaluated(inputs)
         return np.asarray((self._push[rows] @ (outputs - self._usual[rows])[..., None])[..., 0])
-
-    @property
-    def left(self) -> NDArray[np.bool_]:
-        """(S,) whether the network was evaluated outside its training range."""
-        inputs, range_ = np.concatenate(self._inputs), self._force.range_
-        if range_ is None:
-            return np.zeros(len(inputs), dtype=np.bool_)
-        low, high = (edge.numpy(force=True) for edge in range_.edges)
-        return np.asarray(((inputs < low) | (inputs > high)).any(1))
-
-    def last_slope(self) -> FloatArray:
-        """Derivative (r, r) of the last force with respect to the coordinates, for S = 1."""
-        slopes = self._force.output_slopes(self._inputs[-1], self._push)[0]
-        return np.asarray(slopes[:, : self._modes] @ self._seen[0, :, : self._push.shape[1]])
-
-    def slopes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivatives of all forces: (S, r, 2 r) by the states, (S, r, n) by u, (S, r, F, n) by filtered inputs."""
-        force, u = self._force, self._u
-        states, inputs, outputs = map(np.concatenate, (self._states, self._inputs, self._outputs))
-        by_inputs = force.output_slopes(inputs, self._push)  # (S, r, i)
-        by_modes, by_conditions = by_inputs[..., : self._modes], by_inputs[..., self._modes :]
-        by_z = self._seen[..., : self._base.shape[1] // 2]
-        moved = force.places.slopes(u) - self._static.slopes(u) @ by_z.swapaxes(1, 2)
-        moved = moved + (force.seen.slopes(u) @ (states - self._base)[:, None, :, None])[..., 0]  # (S, n, m)
-        by_u = by_modes @ moved.swapaxes(1, 2) - self._push @ force.usual.slopes(u).swapaxes(1, 2)
-        by_u = by_u + (force.push.slopes(u) @ (outputs - self._usual)[:, None, :, None])[..., 0].swapaxes(1, 2)
-        by_means = np.zeros((*by_u.shape[:2], self._filters, by_u.shape[2]))
-        if len(force.conditions_by):
-            own, more = np.split(by_conditions @ force.conditions_by, [by_u.shape[2]], axis=2)
-            by_u, by_means = by_u + own, more.reshape(by_means.shape)
-        return by_modes @ self._seen, by_u, by_means

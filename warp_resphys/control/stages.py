@@ -1,6 +1,7 @@
 """Control stages: reduced models, plans, baselines without a simulator, and all controllers on the laboratory."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,12 +47,13 @@ from .files import (
     write_reduced,
 )
 from .laboratory import Laboratory
-from .open_loop import Follower
+from .open_loop import follow
 from .reduction import reduce
 from .sampling import check_plannable, driven_input
 from .task import Task, motion_name, motions_of
 from .world import FloatArray
 
+_RECEDING: Final = (1e-2, 1)  # weight of the inputs in plans with a receding horizon, and iterations
 _PRESSED: Final = 0.3  # share of the range by which inputs are changed to measure the Jacobian
 _ALL_SEEN: Final = 0.5  # share of a trial's frames that must show all markers, for the linear model
 
@@ -89,16 +91,12 @@ def plan_motions(context: StageContext) -> None:
     checkpoint = context.run_dir / f"{context.name}.state.safetensors"
     kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
     plans = {} if kept is None else plans_from_plain(*kept)
-    followers = {
-        seconds: Follower(robot, reduced, task.planner(reduced, seconds), plan.corrections)
-        for seconds in settings.figures.seconds
-    }
-    work = {seconds: follower.rollouts * task.steps(seconds) for seconds, follower in followers.items()}
+    work = {seconds: (plan.corrections + 1) * task.steps(seconds) for seconds in settings.figures.seconds}
     done = [seconds for seconds in work if _names(task, seconds)[0] in plans]
     with Progress(context.name, sum(work.values()), "steps", sum(work[seconds] for seconds in done)) as progress:
         for seconds in [seconds for seconds in work if seconds not in done]:
             paths = np.stack([task.timed(path, seconds, start) for path in task.paths])
-            followed = followers[seconds].follow(paths, progress.advance)
+            followed = follow(robot, reduced, partial(task.planner, reduced), paths, plan.corrections, progress.advance)
             plans |= dict(zip(_names(task, seconds), followed, strict=True))
             tensors, plain = plain_plans(plans)
             write_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
@@ -207,13 +205,14 @@ def receding_controllers(
     """
     control = settings.control
     task, controllers = task_of(control, robot), list[Controller]()
-    limits, horizon = task.limits, task.horizon(control.horizon)
     for model, rest in zip(control.receding, rests, strict=False):
         learned = robot if model == robot.description.model else load(folder, model, settings.device)
         reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
-        controllers.append(RecedingHorizon(reduced, task.tracked, limits, horizon, Noise(), path, rest))
+        planner = task.planner(reduced, path, control.horizon, *_RECEDING)
+        controllers.append(RecedingHorizon(planner, reduced, Noise(), rest))
     linear, rest = read_baselines(folder / BASELINES)[0], rests[len(controllers)]
-    return [*controllers, LinearRecedingHorizon(linear, task.tracked, limits, horizon, path, rest)]
+    planner = task.planner(linear, path, control.horizon, *_RECEDING)
+    return [*controllers, LinearRecedingHorizon(planner, linear, rest)]
 
 
 def _driven(part: TrialPart, report: Report) -> Arrays:

@@ -9,14 +9,16 @@ from scipy.optimize import least_squares
 
 from ..io.errors import InputError
 from ..settings.control import FigureSettings
-from .plan import Horizon, Limits, Planner, Weights, tracked_of
+from .plan import Limits, Planner, PredictionModel, tracked_of
+from .polynomials import around
 from .reduced import ReducedModel
 from .reference import Path
 from .world import FloatArray
 
 _POINTS = 40  # number of points of a path whose reach is checked
 _SPACING = 0.05  # between knots of the inputs of a plan [s]
-_WEIGHTS, _ITERATIONS = Weights(1e-3, 1e-3), 6  # of whole motions
+_AHEAD, _WEIGHT, _ITERATIONS = 0.3, 1e-3, 3  # of plans of whole motions: horizon [s], weight, and iterations
+_CHANGE = 1e-3  # of the inputs for derivatives of an equilibrium, as a share of their ranges
 _LEAST_PIECES = 3  # of the inputs in a receding horizon
 
 
@@ -61,16 +63,26 @@ class Task:
         """Reference (T, 3) after each step of a motion from a start (3,) [m]."""
         return path.timed(seconds, self.time_step, lead=start)[1:]
 
-    def planner(self, model: ReducedModel, seconds: float) -> Planner:
-        """Planner of whole motions."""
-        steps = self.steps(seconds)
-        pieces = min(max(round(steps * self.time_step / _SPACING), 1), steps)
-        return Planner(model, self.tracked, self.limits, Horizon(steps, pieces, _WEIGHTS, _ITERATIONS))
+    def planner(
+        self,
+        model: PredictionModel,
+        path: FloatArray,
+        horizon: float = _AHEAD,
+        weight: float = _WEIGHT,
+        iterations: int = _ITERATIONS,
+    ) -> Planner:
+        """Returns a planner along a path (T, 3), by default of whole motions.
 
-    def horizon(self, seconds: float) -> Horizon:
-        """Horizon of receding plans."""
-        steps = max(round(seconds / self.time_step), 1)
-        return Horizon(steps, min(max(round(steps * self.time_step / _SPACING), _LEAST_PIECES), steps))
+        Args:
+            model: of the robot.
+            path: reference after each step [m].
+            horizon: of a plan [s].
+            weight: of inputs and their changes.
+            iterations: of Gauss-Newton.
+        """
+        steps = max(round(horizon / self.time_step), 1)
+        pieces = min(max(round(steps * self.time_step / _SPACING), _LEAST_PIECES), steps)
+        return Planner(model, self.tracked, self.limits, path, steps, pieces, weight, iterations)
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Checks that the robot has an equilibrium at every point of the paths.
@@ -104,19 +116,20 @@ class Task:
         """Inputs (n,) as shares whose equilibrium is nearest to a point, and its position (3,) there [m]."""
         limits = self.limits
 
-        def place(shares: FloatArray) -> tuple[FloatArray, FloatArray]:
-            points, slopes = model.rest_observed(limits.low + limits.range * shares)
-            return self.tracked @ points, self.tracked @ slopes * limits.range
+        def places(shares: FloatArray) -> FloatArray:
+            return model.rest_observed(limits.low + limits.range * shares) @ self.tracked.T
+
+        def slopes(shares: FloatArray) -> FloatArray:
+            moved = places(around(shares, _CHANGE))
+            return 1e3 * (moved[1:] - moved[0]).T / _CHANGE
 
         starts = [np.full(self.parts, 0.4)] + ([] if guess is None else [np.clip(guess, 0.01, 0.99)])
         searches = [
-            least_squares(
-                lambda x: 1e3 * (place(x)[0] - point), start, lambda x: 1e3 * place(x)[1], (0.0, 1.0), xtol=1e-4
-            )
+            least_squares(lambda x: 1e3 * (places(x[None])[0] - point), start, slopes, (0.0, 1.0), xtol=1e-4)
             for start in starts
         ]
         best = min(searches, key=lambda search: search.cost).x
-        return best, place(best)[0]
+        return best, places(best[None])[0]
 
 
 def motions_of(figures: FigureSettings) -> list[str]:

@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..control.polynomials import Monomials, Polynomial
+from ..control.polynomials import Polynomial, around
 from ..control.world import FloatArray
 from ..io.errors import InputError
 from ..linalg.threads import threads_for
@@ -23,6 +23,7 @@ _BATCH: Final = 512  # actions, at most
 _NETWORK: Final = 128  # width of the policy's layers
 _ORDER: Final = 2  # of the polynomial from actions to equilibria
 _EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
+_CHANGE = 1e-6  # of actions for derivatives
 _STILL = 0.1  # observed change of positions in an action
 _ITERATIONS, _STRIDE = 16, 0.25  # Gauss-Newton iterations, and the largest change of an action in one
 
@@ -62,13 +63,14 @@ class ScriptedPolicy:
         """Actions (B, n) whose equilibria are closest to goals (B, 3), by Gauss-Newton's method within the bounds."""
         actions = np.zeros((len(goals), self._parts))
         for _ in range(_ITERATIONS):
-            slope = self._rests.slopes(Monomials(actions))  # (B, n, 3)
+            moved = np.stack([self._rests(at) for at in around(actions, _CHANGE)])  # (1 + n, B, 3)
+            slope = ((moved[1:] - moved[0]) / _CHANGE).swapaxes(0, 1)  # (B, n, 3)
             matrix = slope @ slope.swapaxes(1, 2) + _EFFORT * np.eye(self._parts)
-            force = (slope @ (goals - self._rests(actions))[..., None])[..., 0] - _EFFORT * actions
+            force = (slope @ (goals - moved[0])[..., None])[..., 0] - _EFFORT * actions
             held = (np.abs(actions) >= 1.0) & (actions * force > 0.0)  # at a bound, and pushed beyond it
             matrix = np.where(held[:, :, None] | held[:, None, :], np.eye(self._parts), matrix)
-            moved = np.linalg.solve(matrix, np.where(held, 0.0, force)[..., None])[..., 0]
-            actions = np.clip(actions + np.clip(moved, -_STRIDE, _STRIDE), -1.0, 1.0)
+            change = np.linalg.solve(matrix, np.where(held, 0.0, force)[..., None])[..., 0]
+            actions = np.clip(actions + np.clip(change, -_STRIDE, _STRIDE), -1.0, 1.0)
         return actions
 
 

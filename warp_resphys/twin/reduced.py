@@ -104,15 +104,13 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
 
     @override
     def advance(self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True) -> ReducedBelief:
-        commands = np.tile(self._held(inputs), (1, 2, 1))
-        motion = self.model.move(belief.state, commands, np.stack([belief.bias, np.zeros_like(belief.bias)]))
-        off = motion.z - self.model.static(motion.u)
+        bias = np.stack([belief.bias, np.zeros_like(belief.bias)])
+        end, transition, left = self.model.transition(belief.state, self._held(inputs), bias)
+        off = end.z - self.model.static(end.acting)
         far = np.linalg.norm((off @ self.model.basis.T).reshape(2, -1, 3), axis=2).max()
         if not far < DIVERGENCE_DISTANCE * self.size:
-            raise ConvergenceError("the reduced model has diverged.", motion.z, None)
-        transition = np.concatenate([motion.by_moved, motion.by_bias], axis=2)[0]
-        outside = belief.outside or bool(motion.left[0])
-        return replace(self._propagated(belief, transition), state=motion.end, outside=outside)
+            raise ConvergenceError("the reduced model has diverged.", end.z, None)
+        return replace(self._propagated(belief, transition), state=end, outside=belief.outside or left)
 
     @override
     def robot_state(self, belief: ReducedBelief) -> RobotState:
@@ -129,15 +127,14 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         state, u = belief.state, Monomials(belief.state.acting)
         z = state.z - ago * state.v
         now, free = self.model.points(z, u).reshape(2, -1, 3)
-        by_z = self.model.point_slopes(z, u)[0][0].reshape(self.count, 3, -1)
+        by_z = self.model.point_slopes(z, u)[0].reshape(self.count, 3, -1)
         by_place = np.eye(3 * self.count).reshape(self.count, 3, -1)
         slopes = np.concatenate([by_z, -ago * by_z, np.zeros_like(by_z), by_place], axis=2)
         return now + belief.places, slopes, free
 
     @override
     def _free(self, belief: ReducedBelief) -> ReducedBelief:
-        free = {name: value[..., [1, 1], :] for name, value in belief.state.arrays().items() if value.ndim > 1}
-        return replace(belief, state=ReducedState.from_arrays({**belief.state.arrays(), **free}))
+        return replace(belief, state=belief.state.select([1, 1]))
 
     @override
     def _moved(self, belief: ReducedBelief, z: FloatArray, w: FloatArray, parameters: FloatArray) -> ReducedBelief:

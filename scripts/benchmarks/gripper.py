@@ -17,11 +17,11 @@ from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.energies.surfaces import SurfaceContact
 from warp_resphys.energies.tendons import Tendons
+from warp_resphys.environments.grasp import ball_mesh
 from warp_resphys.experiment.build import choose_device
 from warp_resphys.fem.body import Body
 from warp_resphys.fem.scene import Scene
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
-from warp_resphys.robot.gripper import thing_mesh
 from warp_resphys.stepping.inputs import Inputs
 
 from .measuring import free_unknowns, now, solves, take_turns
@@ -56,7 +56,7 @@ class Grasp:
     @classmethod
     def of(cls, arguments: argparse.Namespace, batch: int, device: torch.device, contact: bool) -> "Grasp":
         """Returns grippers whose tensions are spread evenly; one alone has the largest."""
-        ball = thing_mesh("ball", RADIUS, BALL)
+        ball = ball_mesh(RADIUS, BALL)
         ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
         table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED)
         bodies = {name: finger(side, tuple(arguments.fingers)) for name, side in (("left", -1.0), ("right", 1.0))}

@@ -27,10 +27,10 @@ from warp_resphys import (
 )
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
+from warp_resphys.environments.grasp import ball_mesh
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
 from warp_resphys.mesh.mesh import join, select_cells
-from warp_resphys.robot.gripper import thing_mesh
 
 CPU = torch.device("cpu")
 SOFT = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45)
@@ -519,7 +519,7 @@ def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():
     shell = box_hexahedra((0.03, 0.03, 0.03), (3, 3, 3))
     middle = np.abs(shell.vertices[shell.cells].mean(1) - 0.015).max(1) < 1e-3
     hollow = Mesh(shell.vertices, shell.cells[~middle])
-    ball = replace(thing_mesh("ball", 0.002, 1), vertices=thing_mesh("ball", 0.002, 1).vertices + 0.015)
+    ball = replace(ball_mesh(0.002, 1), vertices=ball_mesh(0.002, 1).vertices + 0.015)
     pairs = {}
     for name, mesh in (("hollow", hollow), ("solid", shell)):
         both = join({"outer": mesh, "ball": ball})

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from warp_resphys.control.world import World
+from warp_resphys.control.worlds import World
 from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.picture import Camera
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask

@@ -30,11 +30,11 @@ from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.obstacles import ObstacleSurface
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
-from warp_resphys.robot.twin.full import FullEstimator
 from warp_resphys.settings.body import SimulatorSettings
 from warp_resphys.settings.trials import MotionSettings
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
+from warp_resphys.twin.twin import Twin
 
 BEAM = "mesh.divisions=[4,1,1]"
 FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"
@@ -156,7 +156,7 @@ class TestSurfaces:
 
     def test_a_twin_refuses_it(self):
         with pytest.raises(InputError, match="contact between surfaces"):
-            FullEstimator(robot_of(settings(BEAM, "self_contact={friction: 0.3}", "integrator=bdf2"), {}), {})
+            Twin(robot_of(settings(BEAM, "self_contact={friction: 0.3}", "integrator=bdf2"), {}))
 
 
 def swing(**more):

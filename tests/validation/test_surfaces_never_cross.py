@@ -48,8 +48,8 @@ from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.materials import Material
 from warp_resphys.energies.obstacles import Cylinder, HalfSpace
 from warp_resphys.energies.pairs import PairList, Surface
+from warp_resphys.environments.grasp import ball_mesh
 from warp_resphys.mesh.rod import boxes_hexahedra, rod
-from warp_resphys.robot.gripper import thing_mesh
 
 FloatArray = NDArray[np.float64]
 _SIDE = 0.1  # of Erleben's bodies [m]
@@ -272,7 +272,7 @@ def funnel() -> Case:
     x, r = levels[np.round(level).astype(int)].T
     ring = np.stack([x, (r + depth) * np.cos(turn), (r + depth) * np.sin(turn)], axis=1)
     walls = merged(ring[tube.cells])
-    ball = placed(thing_mesh("ball", radius, 4), (-0.02, 0.0, 0.0))
+    ball = placed(ball_mesh(radius, 4), (-0.02, 0.0, 0.0))
     bodies = {"funnel": Body(walls, fixed=np.arange(len(walls.vertices))), "ball": Body(ball)}
     contact, soft = SurfaceContact(1e5, 0.1, distance), replace(_RUBBER, youngs_modulus=2e4)
     return Case(bodies, contact, distance, 40, 1e-3, soft, (40.0 * G, 0.0, 0.0))

@@ -9,8 +9,8 @@ from typing_extensions import override
 from .baselines import DELAYS, LinearModel
 from .estimate import Estimator, Noise
 from .plan import Limits, Planner
+from .polynomials import FloatArray
 from .reduced import ReducedModel
-from .world import FloatArray
 
 _SETTLES = 0.1  # gain per step of the disturbance observer of the linear model
 _AVERAGED = 0.25  # window of the means of points and inputs, which averages vibrations out [s]

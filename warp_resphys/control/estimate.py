@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from .polynomials import Monomials
+from .polynomials import FloatArray, Monomials
 from .reduced import ReducedModel
-from .world import FloatArray
 
 _JITTER = 1e-12  # of a correlation matrix, which is singular where a quantity is known exactly
 

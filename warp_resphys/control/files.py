@@ -13,8 +13,8 @@ from ..experiment.models import Learned
 from ..io.errors import DataFileError
 from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from .baselines import LinearModel
+from .polynomials import FloatArray
 from .reduced import ReducedModel
-from .world import FloatArray
 
 BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"
@@ -136,18 +136,6 @@ def _write_motions(path: Path, kind: str, more: Mapping[str, Any], motions: Mapp
 def _read_motion(path: Path, kind: str, motion: str, made: type[AnyMotion]) -> AnyMotion:
     with read_hdf5(path, kind) as file:
         return made(*(read_array(file, f"{motion}/{field.name}").astype(np.float64) for field in fields(made)))
-
-
-def plain_plans(motions: Mapping[str, PlannedMotion]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Returns planned motions as tensors and plain data, for a checkpoint."""
-    arrays = {f"{name}/{key}": values for name, motion in motions.items() for key, values in vars(motion).items()}
-    return _tensors(arrays), {"names": list(motions)}
-
-
-def plans_from_plain(tensors: Mapping[str, torch.Tensor], plain: Mapping[str, Any]) -> dict[str, PlannedMotion]:
-    """Returns the planned motions that `plain_plans` was given."""
-    keys = [field.name for field in fields(PlannedMotion)]
-    return {name: PlannedMotion(*(tensors[f"{name}/{key}"].numpy() for key in keys)) for name in plain["names"]}
 
 
 def write_baselines(path: Path, linear: LinearModel, jacobian: FloatArray) -> None:

@@ -13,8 +13,8 @@ import torch
 from ..robot.robot import Robot
 from .files import PlannedMotion
 from .plan import Planner
+from .polynomials import FloatArray
 from .reduced import ReducedModel
-from .world import FloatArray
 
 OnProgress = Callable[[int], None]
 

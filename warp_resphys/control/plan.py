@@ -12,8 +12,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from ..io.errors import InputError
-from .polynomials import around
-from .world import FloatArray
+from .polynomials import FloatArray, around
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
 _ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop

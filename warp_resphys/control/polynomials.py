@@ -7,7 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .world import FloatArray
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 _SHARE_OF_POINTS: Final = 0.5  # largest number of coefficients, relative to the number of samples
 _HELD_OUT: Final = 5  # one of so many samples, for the choice of the order

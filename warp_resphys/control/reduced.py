@@ -41,10 +41,9 @@ from ..data.input_response import InputResponse
 from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
 from ..io.errors import ConvergenceError, InputError
-from .polynomials import Monomials, Polynomial, SquaredPolynomial, around
+from .polynomials import BoolArray, FloatArray, Monomials, Polynomial, SquaredPolynomial, around
 from .reduced_force import ForceAlong, ReducedForce
 from .sampling import check_integrator
-from .world import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 

@@ -16,8 +16,7 @@ from torch import nn
 from ..data.input_response import with_means
 from ..learning.networks import SkipMLP, StateMap
 from ..learning.rollout import Range
-from .polynomials import Monomials, Polynomial
-from .world import BoolArray, FloatArray
+from .polynomials import BoolArray, FloatArray, Monomials, Polynomial
 
 Array = NDArray[Any]
 Layer = Callable[[Array], Array]

@@ -23,11 +23,10 @@ from ..robot.state import RobotState
 from ..settings.control import ReductionSettings
 from ..stepping.state import State
 from .files import read_reduced, reduced_file, write_reduced
-from .polynomials import Polynomial, SquaredPolynomial, best_order, solve_ridge
+from .polynomials import FloatArray, Polynomial, SquaredPolynomial, best_order, solve_ridge
 from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Source, Tangent, check_reducible, driven_input
-from .world import FloatArray
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from ..io.errors import InputError
-from .world import FloatArray
+from .polynomials import FloatArray
 
 _SPACING: Final = 2000  # number of points of a path
 _CORNER: Final = 0.02  # length over which corners are rounded, as a share of the path

@@ -1,26 +1,24 @@
 """Replays motions that controllers have driven on the simulated laboratory, with the whole body."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..experiment.files import DRIVEN
 from ..io.errors import InputError
 from ..io.progress import Progress
 from ..io.settings import parse
 from ..io.stages import finished_record
+from ..report.driven_film import DrivenBodies
 from ..robot.loading import load
 from ..settings.stages import DriveStage
-from .files import DrivenMotion, read_driven
-from .laboratory import Laboratory
+from .files import read_driven
 from .plan import tracked_of
 from .sampling import driven_input
 from .stages import controllers_of
 from .task import motions_of
-from .world import FloatArray
+from .worlds import Laboratory
 
 
 def driven_settings(folder: Path) -> DriveStage:
@@ -37,28 +35,7 @@ def driven_settings(folder: Path) -> DriveStage:
     return parse(DriveStage, finished_record(folder, "drive")["settings"])
 
 
-@dataclass(frozen=True)
-class DrivenReplay:
-    """A motion that C controllers have driven.
-
-    Attributes:
-        times: (T + 1,) since the first command [s].
-        triangles: (S, 3) surface of the laboratory's body.
-        bodies: (C, T + 1, N, 3) vertices [m].
-        points: (C, T + 1, 3) positions of the tracked point [m].
-        driven: the motion as it was recorded.
-        gravity: (3,) in the frame of the bodies [m/s^2].
-    """
-
-    times: FloatArray
-    triangles: NDArray[np.int64]
-    bodies: FloatArray
-    points: FloatArray
-    driven: DrivenMotion
-    gravity: FloatArray
-
-
-def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenReplay:
+def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenBodies:
     """Drives the laboratory with the recorded inputs of a motion.
 
     Args:
@@ -90,12 +67,13 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
             points.append(laboratory.markers())
             progress.advance()
     markers = np.stack(points, 1)  # (C, T + 1, M, 3)
-    return DrivenReplay(
+    return DrivenBodies(
         robot.time_step * np.arange(steps + 1, dtype=np.float64),
         laboratory.bodies()[0],
-        np.stack(bodies, 1),
-        markers.reshape(*markers.shape[:2], -1) @ tracked.T,
-        driven,
+        dict(zip(controllers, np.stack(bodies, 1), strict=True)),
+        dict(zip(controllers, markers.reshape(*markers.shape[:2], -1) @ tracked.T, strict=True)),
+        driven.path,
+        np.array([control.right, control.up], dtype=np.float64),
         np.asarray(robot.simulator.gravity, dtype=np.float64),
     )
 

@@ -21,7 +21,7 @@ from ..robot.state import RobotState
 from ..settings.control import ReductionSettings
 from ..settings.trials import SequenceSettings
 from ..stepping.state import State
-from .world import FloatArray
+from .polynomials import FloatArray
 
 OnProgress = Callable[[int], None]
 

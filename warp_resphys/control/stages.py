@@ -11,7 +11,7 @@ from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN,
 from ..experiment.parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
-from ..io.files import resume_checkpoint, write_checkpoint, write_json
+from ..io.files import write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..mesh.motion_files import input_columns, write_csv
@@ -32,10 +32,9 @@ from .estimate import Noise
 from .files import (
     BASELINES,
     DrivenMotion,
-    plain_plans,
+    PlannedMotion,
     plan_table,
     plans_file,
-    plans_from_plain,
     read_baselines,
     read_plan,
     read_quality,
@@ -46,12 +45,12 @@ from .files import (
     write_plans,
     write_reduced,
 )
-from .laboratory import Laboratory
 from .open_loop import follow
+from .polynomials import FloatArray
 from .reduction import reduce
 from .sampling import check_plannable, driven_input
 from .task import Task, motion_name, motions_of
-from .world import FloatArray
+from .worlds import Laboratory
 
 _RECEDING: Final = (1e-2, 1)  # weight of the inputs in plans with a receding horizon, and iterations
 _PRESSED: Final = 0.3  # share of the range by which inputs are changed to measure the Jacobian
@@ -88,18 +87,13 @@ def plan_motions(context: StageContext) -> None:
         task.check_reach(reduced, plan.reach)
     # The point starts where the recordings have it before anything moved.
     start = task.tracked @ np.nanmean(read_dataset(context.run_dir / DATASET).held, axis=0).ravel()
-    checkpoint = context.run_dir / f"{context.name}.state.safetensors"
-    kept = resume_checkpoint(checkpoint, "plans", context.fingerprint)
-    plans = {} if kept is None else plans_from_plain(*kept)
-    work = {seconds: (plan.corrections + 1) * task.steps(seconds) for seconds in settings.figures.seconds}
-    done = [seconds for seconds in work if _names(task, seconds)[0] in plans]
-    with Progress(context.name, sum(work.values()), "steps", sum(work[seconds] for seconds in done)) as progress:
-        for seconds in [seconds for seconds in work if seconds not in done]:
+    plans = dict[str, PlannedMotion]()
+    total = (plan.corrections + 1) * sum(map(task.steps, settings.figures.seconds))
+    with Progress(context.name, total, "steps") as progress:
+        for seconds in settings.figures.seconds:
             paths = np.stack([task.timed(path, seconds, start) for path in task.paths])
             followed = follow(robot, reduced, partial(task.planner, reduced), paths, plan.corrections, progress.advance)
             plans |= dict(zip(_names(task, seconds), followed, strict=True))
-            tensors, plain = plain_plans(plans)
-            write_checkpoint(checkpoint, "plans", tensors, {**plain, "fingerprint": context.fingerprint})
     write_plans(context.run_dir / plans_file(model), plans)
     driven = driven_input(robot)
     for name, motion in plans.items():
@@ -107,7 +101,6 @@ def plan_motions(context: StageContext) -> None:
         markers = motion.markers.reshape(len(motion.markers), -1, 3)
         times = robot.time_step * np.arange(len(markers), dtype=np.float64)
         write_csv(context.run_dir / plan_table(model, name), times, robot.labels, markers, columns)
-    checkpoint.unlink(missing_ok=True)
 
 
 def fit_baselines(context: StageContext) -> None:

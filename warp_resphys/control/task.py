@@ -10,10 +10,9 @@ from scipy.optimize import least_squares
 from ..io.errors import InputError
 from ..settings.control import FigureSettings
 from .plan import Limits, Planner, PredictionModel, tracked_of
-from .polynomials import around
+from .polynomials import FloatArray, around
 from .reduced import ReducedModel
 from .reference import Path
-from .world import FloatArray
 
 _POINTS = 40  # number of points of a path whose reach is checked
 _SPACING = 0.05  # between knots of the inputs of a plan [s]

@@ -10,23 +10,18 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..control.laboratory import Laboratory
 from ..control.plan import tracked_of
+from ..control.polynomials import FloatArray
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input
-from ..control.world import FloatArray, World
+from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
 from ..io.errors import InputError
-from ..io.settings import parse
-from ..io.stages import finished_record
-from ..robot.gripper import laboratory_robot
 from ..robot.inputs import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
-from ..settings.stages import LaboratoryStage
 from .grasp import RISE, SPEED, GraspWorld
 from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
 from .vector import ActionMapping, RobotVectorEnv
-from .worlds import ReducedWorld, RobotWorld
 
 TASKS: Final = ("reach", "follow", "swing_up", "grasp")
 WORLDS: Final = ("simulator", "reduced", "laboratory")
@@ -95,11 +90,15 @@ def make_vector(
     swings = task == "swing_up"
     if swings and (BASE not in robot.inputs or world != "simulator"):
         raise InputError("swing_up moves the base of a simulated robot: choose a robot with fixed vertices.")
-    actions = max(round(seconds / action_time), 1)
-    if task == "grasp":
-        return _grasp(robot, run, num_envs, world, frames, actions, noise, autoreset_mode, render_mode)
-    shown = None if robot.labels else _spread_vertices(robot)
+    actions, up = max(round(seconds / action_time), 1), _up(robot)
     bodies: World
+    goals: RobotTask
+    if task == "grasp":
+        bodies, mapping = _grippers(robot, Path(run).expanduser(), num_envs, world, frames)
+        markers = bodies.markers()[0]
+        goals, point = SwingTask(num_envs, up, markers[-1], RISE), np.eye(3, markers.size, markers.size - 3)
+        return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
+    shown = None if robot.labels else _spread_vertices(robot)
     if world == "simulator":
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
         name, mixed = (BASE, along) if swings else (driven_input(robot).name, None)
@@ -108,40 +107,26 @@ def make_vector(
         bodies = ReducedWorld(reduced_of(robot), num_envs)
     else:
         folder = Path(run).expanduser()
-        settings = parse(LaboratoryStage, finished_record(folder, "laboratory")["settings"]).changed(device="cpu")
-        bodies = Laboratory(settings, folder, driven_input(robot).name, num_envs, seed, "count")
-    markers, up = bodies.markers()[0], _up(robot)
-    point = _tip(robot, markers, tracked, shown)
-    goals: RobotTask
+        bodies = Laboratory(laboratory_settings(folder), folder, driven_input(robot).name, num_envs, seed, "count")
+    point = _tip(robot, bodies.markers()[0], tracked, shown)
     if swings:
-        rest = point @ markers.ravel()
+        rest = point @ bodies.markers()[0].ravel()
         goals = SwingTask(num_envs, up, rest, float(np.linalg.norm(rest - _fixed(robot))))
         mapping = ActionMapping(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
     else:
         driven = driven_input(robot)
         low, high = np.array(driven.low), np.array(driven.high)
         reach = _reach(robot, driven.name, low, high, point, shown, seed) if reach is None else reach
-        goals = ReachTask(num_envs, actions, reach)
-        if task == "follow":
-            goals = FollowTask(num_envs, actions, reach, action_time)
+        follows = task == "follow"
+        goals = FollowTask(num_envs, actions, reach, action_time) if follows else ReachTask(num_envs, actions, reach)
         # Worlds begin without inputs.
         mapping = ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
     noise = noise if bodies.noise is None else bodies.noise
     return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
 
 
-def _grasp(
-    robot: Robot,
-    run: str | Path,
-    count: int,
-    world: str,
-    frames: int,
-    actions: int,
-    noise: float,
-    autoreset_mode: str | gym.vector.AutoresetMode,
-    render_mode: str | None,
-) -> RobotVectorEnv:
-    """Makes grippers of two fingers each, whose reward is the height of a ball."""
+def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> tuple[GraspWorld, ActionMapping]:
+    """Grippers of two fingers each, and the map from actions to their input and height."""
     driven = driven_input(robot)
     if world == "reduced":
         raise InputError("a grasp needs contact, which reduced models lack: choose world simulator or laboratory.")
@@ -150,16 +135,12 @@ def _grasp(
             "a grasp needs a finger that is fixed at its base and has one input: this robot has "
             f"{', '.join(driven.parts)}."
         )
-    finger = robot if world == "simulator" else laboratory_robot(run, "count")
-    grippers = GraspWorld(finger, driven.name, count, robot.time_step)
-    markers, up = grippers.markers()[0], _up(robot)
-    point = np.zeros((3, markers.size))
-    point[:, -3:] = np.eye(3)
+    time_step = robot.time_step
+    if world == "laboratory":
+        robot = laboratory_robot(laboratory_settings(run), upright=True, on_failure="count")
     low, high = np.append(np.array(driven.low), 0.0), np.append(np.array(driven.high), RISE)
     rate = np.array([(high[0] - low[0]) / _RISE, SPEED])
-    mapping = ActionMapping(low, high, rate, np.zeros(2), frames)
-    task = SwingTask(count, up, markers[-1], RISE)
-    return RobotVectorEnv(grippers, task, mapping, point, actions, noise, autoreset_mode, render_mode, up)
+    return GraspWorld(robot, driven.name, count, time_step), ActionMapping(low, high, rate, np.zeros(2), frames)
 
 
 def _reach(

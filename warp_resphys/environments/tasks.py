@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from ..control.polynomials import FloatArray
 from ..control.reference import Path
-from ..control.world import FloatArray
 from ..io.errors import InputError
 
 PREVIEW: Final = (0, 2, 5)  # actions ahead of the goals that are observed

@@ -10,7 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..control.world import FloatArray, World
+from ..control.polynomials import FloatArray
+from ..control.worlds import World
 from ..io.errors import InputError
 from .picture import Camera
 from .tasks import RobotTask

@@ -19,7 +19,6 @@ from ..learning.baselines import BASELINES
 from ..report.bodies import ComparedMotion
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times, shown_models
-from ..report.driven_film import DrivenBodies
 from ..report.obstacles import ObstacleSurface
 from ..report.render import DrawingError, RenderScene, hangs, write_film
 from ..robot.loading import load, recorded_trial
@@ -93,16 +92,7 @@ def _film_of_motion(run: Path, name: str, settings: FilmSettings) -> tuple[str, 
     if len(controllers) > _MOST_VIEWS:
         raise InputError(f"controllers names {len(controllers)}: a film shows at most {_MOST_VIEWS} side by side.")
     played = replay(run, name, controllers, np.inf if seconds is None else seconds)
-    shown = DrivenBodies(
-        played.times,
-        played.triangles,
-        dict(zip(controllers, played.bodies, strict=True)),
-        dict(zip(controllers, played.points, strict=True)),
-        played.driven.path,
-        np.array([control.right, control.up], dtype=np.float64),
-        played.gravity,
-    )
-    return name, shown.film(1.0 if settings.slower is None else settings.slower)
+    return name, played.film(1.0 if settings.slower is None else settings.slower)
 
 
 def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.inf) -> ComparedMotion:

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from ..control.world import FloatArray
+from ..control.polynomials import FloatArray
 from ..energies.contact import Contact
 from ..energies.strings import PAYLOAD
 from ..energies.surfaces import SurfaceContact

@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..control.polynomials import Monomials
+from ..control.polynomials import FloatArray, Monomials
 from ..control.reduced import ReducedState
 from ..control.reduction import reduced_of
-from ..control.world import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.rollout import DIVERGENCE_DISTANCE
 from ..robot.inputs import Given, InputReader

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from ..control.world import FloatArray
+from ..control.polynomials import FloatArray
 from ..data.rigid_bodies import as_markers
 from ..robot.state import RobotState
 

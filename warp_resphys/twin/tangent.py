@@ -15,7 +15,7 @@ import scipy.sparse.linalg
 import torch
 from numpy.typing import NDArray
 
-from ..control.world import FloatArray
+from ..control.polynomials import FloatArray
 from ..energies.materials import VISCOUS
 from ..robot.inputs import FORCE, Given, InputReader
 from ..robot.robot import Robot

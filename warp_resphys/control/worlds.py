@@ -1,0 +1,288 @@
+"""Simulated bodies that are commanded and observed step by step: robots, reduced models, the simulated laboratory."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from ..data.rigid import RigidTransform, kabsch
+from ..experiment.build import build_body
+from ..experiment.files import REGISTRATION
+from ..experiment.laboratory import make_setup
+from ..experiment.simulate import substeps_of, target_settings
+from ..io.errors import InputError
+from ..io.files import read_json
+from ..io.settings import parse
+from ..io.stages import finished_record
+from ..mesh.mesh import boundary_triangles
+from ..report.obstacles import ObstacleSurface
+from ..robot.description import Description
+from ..robot.robot import Robot
+from ..robot.state import RobotState
+from ..settings.stages import LaboratoryStage, PlayedSettings
+from ..settings.trials import MarkerSettings
+from .polynomials import BoolArray, FloatArray, IntArray
+from .reduced import ReducedModel
+
+_FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
+_LEAST: Final = 1e-3  # lower bound of drawn positive parameters, relative to the identified value
+_STREAM: Final = 7  # of the random number generator
+_BEFORE: Final = 1_000_000  # number of the first of the frames taken before the first step
+_LABORATORY: Final = "laboratory"
+
+
+class World(ABC):
+    """B bodies that take commands and have markers.
+
+    Attributes:
+        count: B.
+        time_step: h [s].
+        input: name of the commanded input.
+        parts: number n of its values.
+        noise: standard deviation of observed markers [m]; None if the caller chooses it.
+        travel: (3,) way by which commands may move a body as a whole [m].
+    """
+
+    count: int
+    time_step: float
+    input: str
+    parts: int
+    noise: float | None = None
+    travel: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @abstractmethod
+    def begin(self, chosen: BoolArray) -> None:
+        """Brings the chosen bodies (B,) back to rest without inputs."""
+
+    @abstractmethod
+    def step(self, commands: FloatArray) -> BoolArray:
+        """Makes one time step under commands (B, n); returns which bodies (B,) have failed since `begin`."""
+
+    @abstractmethod
+    def markers(self) -> FloatArray:
+        """Markers (B, M, 3), without noise [m]."""
+
+    def vary(self, random: Sequence[np.random.Generator]) -> None:
+        """Draws new parameters, by a generator for each body; all bodies `begin` afterwards."""
+        del random
+
+    def bodies(self) -> tuple[IntArray, FloatArray]:
+        """Surface triangles (S, 3) and vertices (B, N, 3) [m]; empty if the body is known by its markers only."""
+        return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
+
+    def obstacles(self) -> ObstacleSurface:
+        """Surfaces of the obstacles that the bodies touch."""
+        return ObstacleSurface()
+
+
+class RobotWorld(World):
+    """B copies of a robot in its full simulator.
+
+    Args:
+        robot: loaded with ``on_failure="count"``.
+        given: name of the commanded input.
+        count: B.
+        spread: variation of the parameters, in standard deviations of their identification; 0 for none.
+        mixed: (k, n) from k commands to the n values of the input; the identity if omitted.
+        shown: numbers of the observed points among all markers or vertices; all if omitted.
+        time_step: h [s], a multiple of the robot's; that of the robot if omitted.
+
+    Attributes:
+        state: of the robots.
+
+    Raises:
+        InputError: there is no such input, or the run has no standard deviations of its parameters.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        given: str,
+        count: int,
+        spread: float = 0.0,
+        mixed: FloatArray | None = None,
+        shown: Sequence[int] | None = None,
+        time_step: float | None = None,
+    ) -> None:
+        if given not in robot.inputs:
+            raise InputError(f"there is no input {given!r}: the robot has {', '.join(robot.inputs) or 'none'}.")
+        if spread > 0.0 and not (robot.description.uncertainty or {}).get("deviation"):
+            raise InputError(
+                f"{robot.description.name} has no standard deviations of its parameters, which spread needs: set "
+                "spread=0, or choose a run that identifies parameters."
+            )
+        self._nominal = self.robot = robot
+        self.count, self.time_step, self.input = count, time_step or robot.time_step, given
+        self._substeps = round(self.time_step / robot.time_step)
+        self._mixed = np.eye(len(robot.inputs[given].parts)) if mixed is None else mixed
+        self.parts, self._spread, self._shown = len(self._mixed), spread, shown
+        self.state = self._rest = self._begun()
+
+    @override
+    def vary(self, random: Sequence[np.random.Generator]) -> None:
+        if not self._spread:
+            return
+        description = self._nominal.description
+        uncertainty: Mapping[str, Any] = description.uncertainty or {}
+        names = list(uncertainty["deviation"])
+        deviation = np.array([uncertainty["deviation"][name] for name in names])
+        root = np.linalg.cholesky(np.array(uncertainty["correlation"]) + 1e-9 * np.eye(len(names)))
+        mean = np.array([description.parameters[name] for name in names])
+        drawn = np.stack([root @ generator.standard_normal(len(names)) for generator in random])
+        values = mean + self._spread * deviation * drawn
+        values = np.where(mean > 0.0, np.maximum(values, _LEAST * mean), values)
+        parameters = dict(zip(names, values.T, strict=True))
+        if "poissons_ratio" in parameters:
+            parameters["poissons_ratio"] = parameters["poissons_ratio"].clip(0.0, 0.499)
+        tensor = self._nominal.simulator.tensor
+        self.robot = self._nominal.with_parameters(**{name: tensor(values) for name, values in parameters.items()})
+        self._rest = self._begun()
+
+    def _begun(self) -> RobotState:
+        with torch.no_grad():
+            return self.robot.begin(self.count)
+
+    @override
+    def begin(self, chosen: BoolArray) -> None:
+        self.state = self._rest.where(torch.as_tensor(chosen, device=self._rest.q.device), self.state)
+
+    @override
+    @torch.no_grad()
+    def step(self, commands: FloatArray) -> BoolArray:
+        for _ in range(self._substeps):
+            self.state = self.robot.step(self.state, **{self.input: commands @ self._mixed})
+        return np.asarray(self.state.lost.cpu().numpy())
+
+    @override
+    def markers(self) -> FloatArray:
+        markers = self.robot.observe(self.state)
+        markers = markers if self._shown is None else markers[:, list(self._shown)]
+        return np.asarray(markers.double().cpu().numpy())
+
+    @override
+    def bodies(self) -> tuple[IntArray, FloatArray]:
+        return boundary_triangles(self.robot.simulator.body.mesh), self.state.q.double().cpu().numpy()
+
+    @override
+    def obstacles(self) -> ObstacleSurface:
+        return ObstacleSurface.of(self.robot.simulator.body, self._nominal.parameters)
+
+
+def laboratory_robot(settings: PlayedSettings, upright: bool = False, on_failure: str = "raise") -> Robot:
+    """Returns the simulated laboratory of a run as a robot with its own markers.
+
+    Args:
+        settings: of the laboratory.
+        upright: whether its body is not tilted.
+        on_failure: as for `Robot`.
+    """
+    target, setup = target_settings(settings, settings.laboratory), make_setup(settings)
+    gravity = settings.gravity if upright else tuple(setup.gravity.tolist())
+    description = Description(
+        name=_LABORATORY,
+        model=_LABORATORY,
+        settings=target.model_copy(update={"gravity": gravity}),
+        material=settings.laboratory.material,
+        mesh=build_body(target, settings.payload_at).mesh,
+        payload_at=settings.payload_at,
+        markers=MarkerSettings.model_validate(settings.binding.plain()),
+        labels=settings.binding.observed,
+        bound=torch.from_numpy(setup.tracked),
+    )
+    return Robot(description, settings.device, on_failure)
+
+
+def laboratory_settings(folder: Path) -> LaboratoryStage:
+    """Returns the settings of a run's laboratory, on the CPU.
+
+    Raises:
+        DataFileError: the run has no laboratory, or is unfinished.
+    """
+    return parse(LaboratoryStage, finished_record(folder, _LABORATORY)["settings"]).changed(device="cpu")
+
+
+class Laboratory(RobotWorld):
+    """Bodies that stand in for the real robot: they take commands step by step, and cameras see their markers.
+
+    Args:
+        settings: of the laboratory.
+        run_dir: of its run; the registration there gives the pose of the body in the cameras' frame.
+        name: of the input.
+        count: B.
+        seed: of the noise.
+        on_failure: ``raise``; or ``count``: a body whose simulation fails stays at rest until `begin`.
+    """
+
+    noise: float
+
+    def __init__(
+        self, settings: PlayedSettings, run_dir: Path, name: str, count: int, seed: int, on_failure: str = "raise"
+    ) -> None:
+        substeps_of(settings.time_step, settings.laboratory, _LABORATORY)
+        robot = laboratory_robot(settings, on_failure=on_failure)
+        super().__init__(robot, name, count, time_step=settings.time_step)
+        self.noise = settings.laboratory.noise
+        self._seeds = (settings.seed, _STREAM, seed)
+        self._frame = _registered(run_dir, make_setup(settings).reference, tuple(settings.binding.reference))
+
+    @override
+    def markers(self) -> FloatArray:
+        return np.asarray(self._frame.apply(super().markers()))
+
+    @override
+    def bodies(self) -> tuple[IntArray, FloatArray]:
+        triangles, vertices = super().bodies()
+        return triangles, np.asarray(self._frame.apply(vertices))
+
+    @override
+    def obstacles(self) -> ObstacleSurface:
+        return super().obstacles().carried(self._frame)
+
+    def seen(self, number: int) -> FloatArray:
+        """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""
+        markers = self.markers()
+        random = np.random.default_rng([*self._seeds, number])
+        return markers + self.noise * random.standard_normal(markers.shape)
+
+    def rest(self, frames: int = 20) -> FloatArray:
+        """Returns noisy markers (B, M, 3) averaged over frames taken before anything moves [m]."""
+        return np.asarray(np.mean([self.seen(_BEFORE + number) for number in range(frames)], axis=0))
+
+
+def _registered(run_dir: Path, reference: FloatArray, labels: tuple[str, ...]) -> RigidTransform:
+    """Transform from the frame of the laboratory's body to the frame of the experiment."""
+    trials = read_json(run_dir / REGISTRATION).values()
+    positions = [trial["positions"] for trial in trials if "positions" in trial]
+    return kabsch(reference, np.mean([[places[label] for label in labels] for places in positions], axis=0))
+
+
+class ReducedWorld(World):
+    """B copies of a robot's reduced model, a few hundred times as fast as its simulator."""
+
+    def __init__(self, model: ReducedModel, count: int) -> None:
+        self._model, self.count, self.time_step = model, count, model.time_step
+        self.input, self.parts = model.name, model.parts
+        self._rest = self._batch = model.rest(count=count)
+        self._furthest = _FURTHEST * np.abs(model.static.coefficients).max()
+        self._lost = np.zeros(count, dtype=np.bool_)
+
+    @override
+    def begin(self, chosen: BoolArray) -> None:
+        self._batch, self._lost = self._rest.where(chosen, self._batch), self._lost & ~chosen
+
+    @override
+    def step(self, commands: FloatArray) -> BoolArray:
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._batch = self._model.move(self._batch, commands[None]).end
+        self._lost = self._lost | ~(np.abs(self._batch.z) < self._furthest).all(axis=1)
+        if self._lost.any():
+            self._batch = self._rest.where(self._lost, self._batch)
+        return self._lost
+
+    @override
+    def markers(self) -> FloatArray:
+        return self._model.observe(self._batch).reshape(self.count, -1, 3)

@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 from urllib.parse import urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..data.recordings.reading import read_recording
 from ..data.registration import register_markers
@@ -21,7 +21,6 @@ from ..robot.robot import Robot
 
 _LARGEST: Final = 65_535  # bytes of a packet
 _FIELDS: Final = ("time", "markers", "inputs", "plan")
-_MOST: Final = 1e12  # of numbers in a packet
 _LONGEST: Final = 1000  # packets that wait for the registration
 _KINDS: Final = 30  # of faults that are counted apart
 _FIRST: Final = 20  # frames whose median is registered
@@ -47,8 +46,10 @@ class Packet:
     def of_text(cls, text: str | bytes) -> Self:
         """Reads a packet of JSON: ``{"time": 1.25, "markers": {"tip": [x, y, z]}, "inputs": {"pressure": [0, 1e4]}}``.
 
+        `Twin.take` checks its commands.
+
         Raises:
-            InputError: no JSON, no time, or another field.
+            InputError: no JSON, no time, another field, or no positions.
         """
         try:
             content = json.loads(text)
@@ -62,41 +63,28 @@ class Packet:
         for name in _FIELDS[1:3]:
             if not isinstance(content.get(name, {}), dict):
                 raise InputError(f"{name} of a packet is no object: give values by name.")
-        markers = {label: _position(label, place) for label, place in content.get("markers", {}).items()}
-        plan = None if content.get("plan") is None else _plan(content["plan"])
-        return cls(_number("time", content["time"]), markers, _values(content.get("inputs", {})), plan)
+        plan = content.get("plan")
+        try:
+            plan = None if plan is None else [(entry["time"], {**entry["inputs"]}) for entry in plan]
+        except (TypeError, KeyError):
+            raise InputError("plan of a packet is no list of objects with 'time' and 'inputs'.") from None
+        markers = {label: position_of(place, label) for label, place in content.get("markers", {}).items()}
+        return cls(content["time"], markers, content.get("inputs", {}), plan)
 
 
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST:
-        return float(value)
-    raise InputError(f"a packet has {str(value)[:40]} as {name}: give a number.")
+def position_of(place: ArrayLike, label: str) -> NDArray[np.float64]:
+    """Returns the position (3,) of a marker [m]; NaN where it is not seen.
 
-
-def _position(label: str, place: Any) -> tuple[float, ...]:
-    if place is None:
-        return (np.nan,) * 3
-    if not isinstance(place, list) or len(place) != 3:
-        raise InputError(f"a packet has no position of {label!r}: give x, y and z in m, or null for each.")
-    return tuple(np.nan if value is None or value != value else _number(label, value) for value in place)
-
-
-def _plan(content: Any) -> list[tuple[float, dict[str, Any]]]:
+    Raises:
+        InputError: no position.
+    """
     try:
-        return [(_number("time", entry["time"]), _values(entry["inputs"])) for entry in content]
-    except (TypeError, KeyError, AttributeError):
-        raise InputError("plan of a packet is no list of objects with 'time' and 'inputs'.") from None
-
-
-def _values(inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Commands, which are numbers, lists of numbers, or numbers by part."""
-    read = dict[str, Any]()
-    for name, value in inputs.items():
-        if isinstance(value, dict):
-            read[name] = {part: _number(name, one) for part, one in value.items()}
-        else:
-            read[name] = [_number(name, one) for one in value] if isinstance(value, list) else _number(name, value)
-    return read
+        position = np.array([np.nan if x is None else float(x) for x in np.ravel(np.asarray(place, dtype=object))])
+    except (TypeError, ValueError, OverflowError):
+        position = np.empty(0)
+    if place is not None and position.shape != (3,):
+        raise InputError(f"a packet has {place!r} as the position of {label!r}: give x, y and z in m.")
+    return position if np.isfinite(position).all() and place is not None else np.full(3, np.nan)
 
 
 def recorded_packets(robot: Robot, path: str | Path) -> Iterator[Packet]:

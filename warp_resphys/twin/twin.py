@@ -20,7 +20,7 @@ from .estimator import Belief, Correction, TwinEstimator
 from .full import FullEstimator
 from .reduced import ReducedEstimator
 from .scores import REMEMBERED, Disagreement, Forecast, Scores, mean_mm
-from .stream import Faults
+from .stream import Faults, position_of
 
 Engine = Callable[[Robot, Mapping[str, Given], Mapping[str, float], float], TwinEstimator[Any]]
 _ENGINES: Final[Mapping[str, Engine]] = {"full": FullEstimator, "reduced": ReducedEstimator}
@@ -251,22 +251,12 @@ class Twin:
                 if label not in self._numbers:
                     self._counts.add(f"unknown marker {label!r}")
                     continue
-                frame[self._numbers[label]] = self._place(place, label)
+                frame[self._numbers[label]] = position_of(place, label)
             return frame
         frame = np.asarray(markers, dtype=np.float64)
         if frame.shape != (count, 3):
             raise InputError(f"a packet has markers of shape {frame.shape}: give ({count}, 3), or positions by name.")
         return np.where(np.isfinite(frame).all(axis=1)[:, None], frame, np.nan)
-
-    @staticmethod
-    def _place(place: ArrayLike, label: str) -> FloatArray:
-        try:
-            position = np.array([np.nan if x is None else float(x) for x in np.ravel(np.asarray(place, dtype=object))])
-        except (TypeError, ValueError, OverflowError):
-            position = np.empty(0)
-        if position.shape != (3,):
-            raise InputError(f"a packet has {place!r} as the position of {label!r}: give x, y and z in m.")
-        return position if np.isfinite(position).all() else np.full(3, np.nan)
 
     def _check_unit(self, frame: FloatArray, belief: Belief) -> None:
         off = np.linalg.norm(frame - self.estimator.markers(belief)[0], axis=1)

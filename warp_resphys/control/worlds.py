@@ -10,7 +10,7 @@ import torch
 from typing_extensions import override
 
 from ..data.rigid import RigidTransform, kabsch
-from ..experiment.build import build_body
+from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import make_setup
 from ..experiment.simulate import substeps_of, target_settings
@@ -193,7 +193,7 @@ def laboratory_robot(settings: PlayedSettings, upright: bool = False, on_failure
         labels=settings.binding.observed,
         bound=torch.from_numpy(setup.tracked),
     )
-    return Robot(description, settings.device, on_failure)
+    return Robot(description, simulation_device(settings.device), on_failure)
 
 
 def laboratory_settings(folder: Path) -> LaboratoryStage:

@@ -12,8 +12,7 @@ from ..control.worlds import World
 from ..energies.contact import Contact
 from ..energies.obstacles import HalfSpace
 from ..energies.surfaces import SurfaceContact
-from ..fem.body import Body
-from ..fem.rigid import Rigid
+from ..fem.body import Body, Rigid
 from ..mesh.mesh import Mesh, boundary_triangles, box_hexahedra
 from ..report.obstacles import ObstacleSurface
 from ..robot.inputs import BASE

@@ -13,13 +13,12 @@ import warp_resphys
 from support.main_job import IN_RUN, run, run_without_report
 from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import sampling
-from warp_resphys.control.estimate import Estimator, Noise
+from warp_resphys.control.estimate import Estimator
 from warp_resphys.control.files import plans_file, read_plan, read_reduced, reduced_file
 from warp_resphys.control.polynomials import SquaredPolynomial
 from warp_resphys.control.reduction import reduce
-from warp_resphys.control.replay import driven_settings, replay
 from warp_resphys.control.sampling import check_plannable
-from warp_resphys.control.stages import controllers_of
+from warp_resphys.control.stages import controllers_of, driven_settings, replay
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import Laboratory, ReducedWorld
 from warp_resphys.io.errors import InputError
@@ -171,7 +170,7 @@ class TestReducedModel:
     def test_the_estimator_recovers_state_and_bias(self, model):
         """From noiseless markers of the same model with shifted equilibria."""
         inputs, elsewhere = np.array([0.5, 0.2, 0.9]), np.array([2e-4, -1e-4, 5e-5, 0.0])
-        estimator = Estimator(model, Noise(observed=1e-6, rate=0.3, bias=0.05), inputs)
+        estimator = Estimator(model, inputs, noise=1e-6)
         state = model.rest(inputs)
         for _ in range(150):
             state = model.transition(state, inputs, elsewhere[None])[0]
@@ -200,7 +199,7 @@ class TestReducedModel:
 
     def test_a_path_out_of_reach_is_named_with_the_nearest_point(self, folder, model, robot):
         far = control_of(folder).changed(centre=[0.0, 0.0, -0.35])
-        task = Task(far, robot.labels, robot.time_step, 3)
+        task = Task(far, robot)
         with pytest.raises(InputError, match=r"path circle: .*-350.0\) mm is .* mm away"):
             task.check_reach(model, 1e-3)
 

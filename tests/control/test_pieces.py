@@ -9,13 +9,14 @@ import torch
 
 from warp_resphys.control.baselines import fit_linear
 from warp_resphys.control.controllers import JacobianFeedback
-from warp_resphys.control.plan import Limits, Planner, solve_program, tracked_of
+from warp_resphys.control.plan import Planner, solve_program, tracked_of
 from warp_resphys.control.polynomials import Polynomial, powers
 from warp_resphys.control.reduced_force import Evaluator
 from warp_resphys.control.reference import Path
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import build_model
 from warp_resphys.learning.rollout import Range
+from warp_resphys.settings.control import LimitsOfInputs
 from warp_resphys.settings.learning import NetworkSettings
 
 SHAPES = ["circle", "eight", *"AQRX"]  # lines, a letter of several strokes, and round ones
@@ -145,7 +146,7 @@ class TestBaselines:
         trials = [driven_line(100, random, matrices) for _ in range(4)]
         model = fit_linear(trials[:3], trials[3:], np.ones(1), 0.01)
         start, path = model.state([np.full(6, 0.1)] * 4), driven_line(30, random, matrices)[0][1:]
-        limits = Limits(np.zeros(1), np.ones(1), np.full(1, 200.0))
+        limits = LimitsOfInputs(low=0.0, high=1.0, rate=200.0)
 
         def error(wanted):
             inputs = Planner(model, np.eye(6), limits, wanted, 30, 30, 1e-9, 2).plan(0, start)
@@ -167,7 +168,7 @@ class TestBaselines:
     def test_feedback_finds_a_place_that_its_jacobian_gets_wrong(self):
         true = np.array([[1e-3, 0.0, 5e-4], [0.0, 2e-3, 0.0]])
         wrong = true * 1.5 + 2e-4
-        limits = Limits(np.zeros(3), np.full(3, 10.0), np.full(3, 100.0))
+        limits = LimitsOfInputs(low=0.0, high=10.0, rate=100.0)
         goal, command = np.array([5e-3, 8e-3, 0.0]), np.zeros(3)
         tracked = np.eye(2, 3)
         feedback = JacobianFeedback(wrong, limits, 5.0, 0.01, tracked, np.tile(goal[:2], (300, 1)), np.zeros((1, 3)))

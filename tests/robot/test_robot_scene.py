@@ -6,7 +6,7 @@ import torch
 
 import warp_resphys
 from support.configured import settings
-from warp_resphys import Body, Corotated, RobotScene, SurfaceContact, box_hexahedra
+from warp_resphys import Body, Corotated, Inputs, RobotScene, SurfaceContact, box_hexahedra
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
@@ -65,8 +65,10 @@ def test_robots_in_contact_push_one_another():
     pose = (SIZE[0], 0.0415, 0.0, 0.0, 0.0, np.pi)
     scene = RobotScene({"first": (robot, AWAY), "second": (robot, pose)}, objects, CONTACT)
     start = state = scene.begin()
+    force = tip_force(robot, 0.0, 0.5, 0.0)
     for _ in range(12):
-        state, acting = scene.step_with_inputs(state, {"first": {"external_force": tip_force(robot, 0.0, 0.5, 0.0)}})
+        state = scene.step(state, {"first": {"external_force": force}})
+    acting = scene.scene.inputs({"first": Inputs(external_force=force[None])})
     way = (state.body.q - start.body.q)[0]
     assert float(way[scene.scene.vertex_slice("second"), 1].max()) > 1e-3  # by the first one
     assert float(way[scene.scene.vertex_slice("block"), 1].abs().max()) < 1e-3

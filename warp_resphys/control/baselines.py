@@ -52,7 +52,7 @@ class LinearModel:
         return np.asarray((np.concatenate(markers) - np.tile(self.rest, len(markers))) @ self.basis)
 
     def respond(self, start: FloatArray, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
-        """Predicts the markers, as `plan.PredictionModel` declares it; ``bias`` has no effect."""
+        """Predicts the markers (T, B, 3 M) of B motions [m], as `ReducedModel.respond`; ``bias`` has no effect."""
         s, states = start, []
         for u in inputs / self.scale:
             s = s @ self.a.T + u @ self.b.T

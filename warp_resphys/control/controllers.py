@@ -1,14 +1,14 @@
 """Controllers: open loop (a plan is played), receding horizon (a new plan at every step), and Jacobian feedback."""
 
-import time
 from abc import ABC, abstractmethod
 
 import numpy as np
 from typing_extensions import override
 
+from ..settings.control import LimitsOfInputs
 from .baselines import DELAYS, LinearModel
-from .estimate import Estimator, Noise
-from .plan import Limits, Planner
+from .estimate import Estimator
+from .plan import Planner
 from .polynomials import FloatArray
 from .reduced import ReducedModel
 
@@ -44,14 +44,13 @@ class RecedingHorizon(Controller):
     Args:
         planner: along the path, on the model.
         model: of the robot.
-        noise: of the estimator.
         rest: (M, 3) markers of the robot at rest without inputs [m].
     """
 
-    def __init__(self, planner: Planner, model: ReducedModel, noise: Noise, rest: FloatArray) -> None:
+    def __init__(self, planner: Planner, model: ReducedModel, rest: FloatArray) -> None:
         offset = rest.ravel() - model.observe(model.rest())[0]
         self._planner = planner
-        self._estimator = Estimator(model, noise, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0))
+        self._estimator = Estimator(model, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0))
         self._offset = planner.tracked @ self._estimator.offset
 
     @override
@@ -98,7 +97,7 @@ class JacobianFeedback(Controller):
 
     Args:
         jacobian: (d, n) of the points with respect to the inputs, measured [m per unit].
-        limits: of the inputs.
+        limits: of each input.
         gain: of the error [1/s].
         time_step: h [s].
         tracked: (d, 3 M) from the markers to the coordinates that follow the path.
@@ -109,7 +108,7 @@ class JacobianFeedback(Controller):
     def __init__(
         self,
         jacobian: FloatArray,
-        limits: Limits,
+        limits: LimitsOfInputs,
         gain: float,
         time_step: float,
         tracked: FloatArray,
@@ -118,10 +117,10 @@ class JacobianFeedback(Controller):
     ) -> None:
         self.jacobian, self._limits, self._gain, self._step = jacobian * limits.range, limits, gain, time_step
         self._tracked, self._path, self.last_seen = tracked, path, rest.ravel()
-        self.shares = np.zeros(len(limits.range))
+        self.shares = np.zeros(jacobian.shape[1])
         self._damping = _DAMPING * float(np.linalg.norm(self.jacobian, 2))
         self._window = max(round(_AVERAGED / time_step), 1)
-        self.past = np.zeros((0, len(jacobian) + len(limits.range)))  # points and inputs as shares, latest last
+        self.past = np.zeros((0, sum(jacobian.shape)))  # points and inputs as shares, latest last
 
     @override
     def command(self, number: int, markers: FloatArray) -> FloatArray:
@@ -143,10 +142,3 @@ class JacobianFeedback(Controller):
         most = self._limits.rate * h / self._limits.range
         self.shares = np.clip(u + np.clip(change, -most, most), 0.0, 1.0)
         return np.asarray(self._limits.low + self._limits.range * self.shares)
-
-
-def timed_command(controller: Controller, number: int, markers: FloatArray) -> tuple[FloatArray, float]:
-    """Returns a command (n,) and the seconds that computing it took."""
-    begun = time.perf_counter()
-    inputs = controller.command(number, markers)
-    return inputs, time.perf_counter() - begun

@@ -5,30 +5,15 @@ a random walk. Estimating b removes the steady-state error of a receding horizon
 has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.linalg
 
 from .polynomials import FloatArray, Monomials
 from .reduced import ReducedModel
 
+_RATE = 0.3  # unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre
+_BIAS = 5e-3  # drift of the bias in a second, as a displacement of the markers [m]
 _JITTER = 1e-12  # of a correlation matrix, which is singular where a quantity is known exactly
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations of the measurement and process noise.
-
-    Attributes:
-        observed: of a coordinate of a marker [m].
-        rate: of the unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre.
-        bias: of the drift of the bias in a second, as a displacement of the markers [m].
-    """
-
-    observed: float = 1e-4
-    rate: float = 0.3
-    bias: float = 5e-3
 
 
 class Estimator:
@@ -36,12 +21,14 @@ class Estimator:
 
     Args:
         model: of the robot.
-        noise: of the measurements and of the model.
         inputs: (n,) under which the robot rests at first.
         offset: (3 M,) of its markers from those of the model, at rest [m]; zero if omitted.
+        noise: standard deviation of a coordinate of a marker [m].
     """
 
-    def __init__(self, model: ReducedModel, noise: Noise, inputs: FloatArray, offset: FloatArray | None = None) -> None:
+    def __init__(
+        self, model: ReducedModel, inputs: FloatArray, offset: FloatArray | None = None, noise: float = 1e-4
+    ) -> None:
         self.model, self._noise = model, noise
         self.state = model.rest(inputs)
         r = model.modes
@@ -54,7 +41,7 @@ class Estimator:
         one = 1e-3 / size
         stiffness = np.abs(np.diag(model.stiffness(u)[0]))
         self._wander = np.concatenate(
-            [np.zeros(r), (noise.rate * one * np.sqrt(stiffness)) ** 2, (noise.bias / size) ** 2 * model.time_step]
+            [np.zeros(r), (_RATE * one * np.sqrt(stiffness)) ** 2, (_BIAS / size) ** 2 * model.time_step]
         )
         self._covariance = np.diag(np.concatenate([one**2, (one * np.sqrt(stiffness)) ** 2, (2.0 * one) ** 2]))
 
@@ -74,7 +61,7 @@ class Estimator:
         slopes[:, :r] = model.point_slopes(self.state.z, Monomials(self.state.acting))[0, seen]
         expected = (model.observe(self.state)[0] + self.offset)[seen]
         residual = markers.ravel()[seen] - expected
-        change, self._covariance = conditioned(self._covariance, slopes, residual, self._noise.observed)
+        change, self._covariance = conditioned(self._covariance, slopes, residual, self._noise)
         self.state = self.state.moved(change[None, :r], change[None, r : 2 * r], model.time_step)
         self.bias = self.bias + change[2 * r :]
 

@@ -10,14 +10,24 @@ import torch
 
 from ..experiment.files import DRIVEN
 from ..experiment.models import Learned
-from ..io.errors import DataFileError
+from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from .baselines import LinearModel
-from .polynomials import FloatArray
+from .polynomials import FloatArray, Polynomial, SquaredPolynomial
 from .reduced import ReducedModel
+from .reduced_force import ReducedForce
 
 BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"
+_FORCE: Final = (
+    "places",
+    "seen",
+    "conditions",
+    "conditions_by",
+    "usual",
+    "push",
+)  # of a learned force, but its network
+_KINDS: Final = {"damping": SquaredPolynomial, "branches": SquaredPolynomial}
 _BASELINES: Final = "baselines"
 _PLANS: Final = "plans"
 _DRIVEN: Final = DRIVEN.removesuffix(".h5")
@@ -42,7 +52,14 @@ def plan_table(model: str, motion: str) -> str:
 
 def write_reduced(path: Path, model: ReducedModel) -> None:
     """Writes a reduced model without its network."""
-    arrays, plain = model.checkpoint()
+    values = {field.name: getattr(model, field.name) for field in fields(model)}
+    if (force := values.pop("force")) is not None:
+        values |= {name: getattr(force, name) for name in _FORCE}
+    polynomials = {name: value for name, value in values.items() if isinstance(value, Polynomial)}
+    arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    plain = {name: value for name, value in values.items() if name not in {*polynomials, *arrays}}
+    plain["orders"] = {name: polynomial.order for name, polynomial in polynomials.items()}
+    arrays |= {name: polynomial.coefficients for name, polynomial in polynomials.items()}
     write_checkpoint(path, _REDUCED, _tensors(arrays), plain)
 
 
@@ -51,10 +68,20 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
 
     Raises:
         DataFileError: the file is missing, damaged, or of an earlier version.
+        InputError: the model has a learned force, and ``learned`` is None.
     """
-    tensors, plain = read_checkpoint(path, _REDUCED)
+    tensors, values = read_checkpoint(path, _REDUCED)
     try:
-        return ReducedModel.restored({name: tensor.numpy() for name, tensor in tensors.items()}, plain, learned)
+        orders, arrays = values.pop("orders"), {name: tensor.numpy() for name, tensor in tensors.items()}
+        values |= arrays | {name: _KINDS.get(name, Polynomial)(arrays[name], order) for name, order in orders.items()}
+        own = {field.name: values[field.name] for field in fields(ReducedModel) if field.name != "force"}
+        own |= {key: tuple(own[key]) for key in ("labels", "filters", "times")}
+        if "push" not in orders:
+            return ReducedModel(**own)
+        if learned is None:
+            raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
+        force = ReducedForce(learned.network, learned.range_, **{name: values[name] for name in _FORCE})
+        return ReducedModel(**own, force=force)
     except KeyError as error:
         raise DataFileError(f"{path} is of an earlier version: delete it and run the same command again.") from error
 

@@ -44,7 +44,7 @@ def follow(
         InputError: no inputs satisfy their bounds.
         ConvergenceError: the robot's simulation fails.
     """
-    tracked, low = planner_of(paths[0]).tracked, planner_of(paths[0]).limits.low
+    tracked, low = planner_of(paths[0]).tracked, np.full(model.parts, planner_of(paths[0]).limits.low)
     start, offsets = model.rest(low), np.zeros_like(paths)
     wanted = np.stack([_planned(model, planner_of(path), offset) for path, offset in zip(paths, offsets, strict=True)])
     inputs, kept, errors, best = wanted, wanted.copy(), list[FloatArray](), np.full(len(paths), np.inf)
@@ -67,7 +67,8 @@ def follow(
 
 def _planned(model: ReducedModel, planner: Planner, offset: FloatArray) -> FloatArray:
     """Inputs (T, n) for a whole path, whose points are off from those of the model by (T, d) [m]."""
-    state, inputs, steps = model.rest(planner.limits.low), list[FloatArray](), max(planner.steps // _PLAYED, 1)
+    state, inputs = model.rest(np.full(model.parts, planner.limits.low)), list[FloatArray]()
+    steps = max(planner.steps // _PLAYED, 1)
     for number in range(0, len(planner.path), steps):
         now = planner.plan(number, state, offset=offset, played=steps)[: min(steps, len(planner.path) - number)]
         state = model.move(state, now[:, None]).end

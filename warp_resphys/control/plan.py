@@ -6,70 +6,28 @@ Derivatives are differences of motions that are predicted at once.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
 from ..io.errors import InputError
+from ..settings.control import LimitsOfInputs
+from .baselines import LinearModel
 from .polynomials import FloatArray, around
+from .reduced import ReducedModel
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program
 _ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop
 _DIFFERENCE: Final = 1e-3  # of knots for derivatives, as a share of the inputs' ranges
 
 
-class PredictionModel(Protocol):
-    """Predicts observed points under inputs: a `ReducedModel` or a `LinearModel`."""
-
-    @property
-    def time_step(self) -> float:
-        """The step h [s]."""
-        ...
-
-    @property
-    def parts(self) -> int:
-        """The number n of inputs."""
-        ...
-
-    def respond(self, start: Any, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
-        """Predicts the observed points (T, B, 3 M) of B motions over T steps [m].
-
-        Args:
-            start: the state.
-            inputs: (T, B, n) commanded during each step, in their unit.
-            bias: (r,) added to the reduced coordinates of the equilibria; a linear model ignores it.
-        """
-        ...
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Bounds of the inputs.
-
-    Attributes:
-        low: (n,) lower bounds.
-        high: (n,) upper bounds.
-        rate: (n,) largest change per second.
-    """
-
-    low: FloatArray
-    high: FloatArray
-    rate: FloatArray
-
-    @property
-    def range(self) -> FloatArray:
-        """(n,) upper less lower bounds."""
-        return np.asarray(self.high - self.low)
-
-
 class Planner:
     """Plans over a horizon along a path; each begins where the last one was left.
 
     Args:
-        model: of the robot.
+        model: of the robot, whose `respond` predicts it.
         tracked: (d, 3 M) from the observed points to the coordinates that follow the path.
-        limits: of the inputs; the first plan begins at the lower ones.
+        limits: of each input; the first plan begins at the lower ones.
         path: (T, d) reference of the points after each step [m], NaN where they are free.
         steps: H, of the horizon; past the end of the path, its last point is repeated.
         pieces: of the piecewise linear inputs.
@@ -83,9 +41,9 @@ class Planner:
 
     def __init__(
         self,
-        model: PredictionModel,
+        model: ReducedModel | LinearModel,
         tracked: FloatArray,
-        limits: Limits,
+        limits: LimitsOfInputs,
         path: FloatArray,
         steps: int,
         pieces: int,
@@ -98,9 +56,9 @@ class Planner:
         self.steps, self._weight, self._iterations = steps, weight, iterations
         ends = np.arange(1, steps + 1) / steps * pieces  # of the steps, in pieces
         self._lines = np.maximum(1.0 - np.abs(ends[:, None] - np.arange(pieces + 1.0)), 0.0)
-        self._most = np.tile(limits.rate * (steps * model.time_step / pieces) / limits.range, pieces)
+        self._most = limits.rate * (steps * model.time_step / pieces) / limits.range
         self._difference = np.kron(np.eye(pieces) - np.eye(pieces, k=-1), np.eye(model.parts))
-        self._knots = np.repeat(np.asarray(limits.low, dtype=np.float64)[None], pieces + 1, axis=0)
+        self._knots = np.full((pieces + 1, model.parts), limits.low)
 
     def plan(
         self, number: int, start: Any, bias: FloatArray | None = None, offset: FloatArray | None = None, played: int = 1
@@ -145,7 +103,7 @@ class Planner:
         finite = np.isfinite(errors).ravel()
         j = 1e3 * slopes.reshape(errors.size, -1) * finite[:, None]
         pull = j.T @ (1e3 * np.where(finite, errors.ravel(), 0.0))
-        d = self._difference / self._most[:, None]
+        d: FloatArray = self._difference / self._most
         jump = d @ shares - np.concatenate([first, np.zeros(len(shares) - len(first))]) / self._most
         weight = self._weight * max(errors.size, 1) / len(shares)
         hessian = j.T @ j + weight * (np.eye(len(shares)) + d.T @ d)

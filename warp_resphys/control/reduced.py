@@ -39,8 +39,7 @@ from numpy.typing import NDArray
 
 from ..data.input_response import InputResponse
 from ..energies.viscosity import relaxation
-from ..experiment.models import Learned
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError
 from .polynomials import BoolArray, FloatArray, Monomials, Polynomial, SquaredPolynomial, around
 from .reduced_force import ForceAlong, ReducedForce
 from .sampling import check_integrator
@@ -52,9 +51,6 @@ _ITERATIONS: Final = 50
 _SHARES: Final = 0.5 ** np.arange(8.0)  # of a step of Newton's method, of which the best is taken
 _DIFFERENCE: Final = 1e-3  # of coordinates for derivatives of the force, relative to their size
 _MOVED: Final = 1e-4  # root mean square displacement of the vertices for derivatives of a step [m]
-_POLYNOMIALS: Final = ("static", "observed", "stiffness", "damping", "shown", "branches", "shape")
-_FORCE_POLYNOMIALS: Final = ("places", "seen", "usual", "push")
-_PLAIN: Final = ("time_step", "integrator", "labels", "name", "acts", "filters", "times", "quality", "robot")
 
 
 @dataclass(frozen=True)
@@ -317,7 +313,13 @@ class ReducedModel:
         return np.asarray(decay * strains + gamma * change)
 
     def respond(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> FloatArray:
-        """Predicts the observed points from the state of one model; `PredictionModel` documents the arguments."""
+        """Predicts the observed points (T, B, 3 M) of B motions over T steps [m].
+
+        Args:
+            start: state of one model.
+            inputs: (T, B, n) commanded during each step, in their unit.
+            bias: (r,) added to the equilibria z_0.
+        """
         return self.move(start.select([0] * inputs.shape[1]), inputs, bias).y
 
     @cached_property
@@ -349,46 +351,6 @@ class ReducedModel:
         after = np.concatenate([motion.end.z, motion.end.v], axis=1)
         slopes = ((after[count:] - after[0]) / self.amounts[:, None]).T
         return motion.end.select(range(count)), slopes, bool(motion.left[0])
-
-    def checkpoint(self) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-        """Returns arrays and plain data for `restored`, without the network."""
-        polynomials = {name: getattr(self, name) for name in _POLYNOMIALS}
-        arrays = {"scale": self.scale, "range": self.range, "curved": self.curved, "basis": self.basis}
-        if self.force is not None:
-            polynomials |= {name: getattr(self.force, name) for name in _FORCE_POLYNOMIALS}
-            arrays |= {"conditions": self.force.conditions, "conditions_by": self.force.conditions_by}
-        plain = {key: getattr(self, key) for key in _PLAIN}
-        plain["orders"] = {name: polynomial.order for name, polynomial in polynomials.items()}
-        return arrays | {name: polynomial.coefficients for name, polynomial in polynomials.items()}, plain
-
-    @classmethod
-    def restored(
-        cls, arrays: Mapping[str, FloatArray], plain: Mapping[str, Any], learned: Learned | None = None
-    ) -> "ReducedModel":
-        """Restores a model from its `checkpoint`.
-
-        Args:
-            arrays: of the checkpoint.
-            plain: of the checkpoint.
-            learned: of its robot (`Description.learned`); needed if the model has a learned force.
-
-        Raises:
-            InputError: the model has a learned force, and ``learned`` is None.
-        """
-        kinds = {"damping": SquaredPolynomial, "branches": SquaredPolynomial}
-        polynomials = {
-            name: kinds.get(name, Polynomial)(arrays[name], order) for name, order in plain["orders"].items()
-        }
-        own = {key: plain[key] for key in _PLAIN} | {name: polynomials.pop(name) for name in _POLYNOMIALS}
-        own |= {key: tuple(own[key]) for key in ("labels", "filters", "times")}
-        force = None
-        if polynomials and learned is None:
-            raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
-        if polynomials and learned is not None:
-            conditions: dict[str, Any] = {name: arrays[name] for name in ("conditions", "conditions_by")}
-            force = ReducedForce(learned.network, learned.range_, **conditions | polynomials)
-        own |= {name: arrays[name] for name in ("scale", "range", "curved", "basis")}
-        return cls(**own, force=force)
 
 
 @dataclass(frozen=True)

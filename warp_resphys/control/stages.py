@@ -1,5 +1,6 @@
 """Control stages: reduced models, plans, baselines without a simulator, and all controllers on the laboratory."""
 
+import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,11 +14,13 @@ from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.progress import Progress
-from ..io.stages import StageContext
+from ..io.settings import parse
+from ..io.stages import StageContext, finished_record
 from ..mesh.motion_files import input_columns, write_csv
+from ..report.driven_film import DrivenBodies
 from ..robot.loading import load
 from ..robot.robot import Robot
-from ..settings.control import ControlSettings, FigureSettings
+from ..settings.control import ControlSettings
 from ..settings.stages import BaselinesStage, DriveStage, PlanStage, ReduceStage
 from .baselines import fit_linear
 from .controllers import (
@@ -26,9 +29,7 @@ from .controllers import (
     LinearRecedingHorizon,
     OpenLoop,
     RecedingHorizon,
-    timed_command,
 )
-from .estimate import Noise
 from .files import (
     BASELINES,
     DrivenMotion,
@@ -36,6 +37,7 @@ from .files import (
     plan_table,
     plans_file,
     read_baselines,
+    read_driven,
     read_plan,
     read_quality,
     read_reduced,
@@ -46,6 +48,7 @@ from .files import (
     write_reduced,
 )
 from .open_loop import follow
+from .plan import tracked_of
 from .polynomials import FloatArray
 from .reduction import reduce
 from .sampling import check_plannable, driven_input
@@ -81,7 +84,7 @@ def plan_motions(context: StageContext) -> None:
     settings: PlanStage = context.settings
     model, plan = settings.model, settings.plan
     robot = load(context.run_dir, model, settings.device)
-    task = task_of(settings.figures, robot)
+    task = Task(settings.figures, robot)
     reduced = read_reduced(context.run_dir / reduced_file(model), robot.description.learned)
     if settings.must_reach:
         task.check_reach(reduced, plan.reach)
@@ -111,16 +114,16 @@ def fit_baselines(context: StageContext) -> None:
     """
     settings: BaselinesStage = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    task, driven, data = task_of(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
+    task, driven, data = Task(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
     assert driven.high is not None
     train, validation = (
         [_series(data, name, driven.name, robot.time_step) for name in names]
         for names in (settings.split.train, settings.split.validation)
     )
     linear = fit_linear(train, validation or train, np.asarray(driven.high), robot.time_step)
-    feedback, limits = settings.feedback, task.limits
+    feedback, limits = settings.feedback, settings.figures.limits
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
-    pressed = _PRESSED * np.diag(limits.range)
+    pressed = _PRESSED * limits.range * np.eye(parts)
     laboratory = Laboratory(settings.played, context.run_dir, driven.name, parts, len(motions_of(settings.figures)))
     rest, seen = laboratory.rest(), []
     with Progress(context.name, steps, "steps") as progress:
@@ -158,7 +161,7 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     control = settings.control
     controllers = controllers_of(control)
     robot = load(context.run_dir, control.models[-1], settings.device)
-    task, parts = task_of(control, robot), list[TrialPart]()
+    task, parts = Task(control, robot), list[TrialPart]()
     for seconds in control.seconds:
         for name in _names(task, seconds):
             parts += split_into_parts(context, (name,), task.steps(seconds) + 1, name)
@@ -197,12 +200,12 @@ def receding_controllers(
         rests: (>= C, M, 3) markers that each controller observes while the robot rests without inputs [m].
     """
     control = settings.control
-    task, controllers = task_of(control, robot), list[Controller]()
+    task, controllers = Task(control, robot), list[Controller]()
     for model, rest in zip(control.receding, rests, strict=False):
         learned = robot if model == robot.description.model else load(folder, model, settings.device)
         reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
         planner = task.planner(reduced, path, control.horizon, *_RECEDING)
-        controllers.append(RecedingHorizon(planner, reduced, Noise(), rest))
+        controllers.append(RecedingHorizon(planner, reduced, rest))
     linear, rest = read_baselines(folder / BASELINES)[0], rests[len(controllers)]
     planner = task.planner(linear, path, control.horizon, *_RECEDING)
     return [*controllers, LinearRecedingHorizon(planner, linear, rest)]
@@ -212,22 +215,25 @@ def _driven(part: TrialPart, report: Report) -> Arrays:
     """One motion with all controllers, each on a body of its own: points, inputs and computing times."""
     settings: DriveStage = part.context.settings
     control, folder, (name,) = settings.control, part.context.run_dir, part.names
-    robot, plans = load(folder, control.models[-1], settings.device), {}
-    task, driven, count = task_of(control, robot), driven_input(robot), len(controllers_of(control))
+    robot = load(folder, control.models[-1], settings.device)
+    task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
     laboratory = Laboratory(settings.played, folder, driven.name, count, motions_of(control).index(name))
     plans = {model: read_plan(folder / plans_file(model), name) for model in control.models}
     rest, path = laboratory.rest(), plans[control.models[-1]].path
     controllers: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
     controllers += receding_controllers(settings, folder, robot, path, rest[len(controllers) :])
-    limits, jacobian = task.limits, read_baselines(folder / BASELINES)[1]
+    limits, jacobian = control.limits, read_baselines(folder / BASELINES)[1]
     for gain in control.feedback.gains:
         own = rest[len(controllers)]
         controllers.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
     points, inputs, seconds = list[FloatArray](), list[FloatArray](), list[FloatArray]()
     for step in range(part.frames - 1):
         seen = laboratory.seen(step)
-        commands = [timed_command(controller, step, seen[row]) for row, controller in enumerate(controllers)]
-        acting, took = (np.array(column) for column in zip(*commands, strict=True))
+        acting, took = np.zeros((count, task.parts)), np.zeros(count)
+        for row, controller in enumerate(controllers):
+            began = time.perf_counter()
+            acting[row] = controller.command(step, seen[row])
+            took[row] = time.perf_counter() - began
         laboratory.step(acting)
         points.append(laboratory.markers().reshape(count, -1) @ task.tracked.T)
         inputs.append(acting)
@@ -271,11 +277,69 @@ def _summary(
     }
 
 
-def task_of(figures: FigureSettings, robot: Robot) -> Task:
-    """Returns the task of a robot: the figures that its point follows."""
-    return Task(figures, robot.labels, robot.time_step, len(driven_input(robot).parts))
-
-
 def _names(task: Task, seconds: float) -> list[str]:
     """Names of the motions whose curves take so long."""
     return [motion_name(path.name, seconds) for path in task.paths]
+
+
+def driven_settings(folder: Path) -> DriveStage:
+    """Returns the settings with which controllers have driven the laboratory of a run.
+
+    Raises:
+        InputError: no motion was driven.
+        DataFileError: there is no such run, or its files have changed.
+    """
+    if (folder / "stages").is_dir() and not (folder / DRIVEN).is_file():
+        raise InputError(
+            f"no motion was driven in {folder}: name a finished run of an experiment with control, as sopra_control."
+        )
+    return parse(DriveStage, finished_record(folder, "drive")["settings"])
+
+
+def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenBodies:
+    """Drives the laboratory with the recorded inputs of a motion.
+
+    Args:
+        folder: of the run.
+        motion: such as ``eight_4s``.
+        controllers: such as ``open_resphys``.
+        seconds: after which the replay stops.
+
+    Raises:
+        InputError: no such motion or controller, or no motion was driven.
+        DataFileError: there is no such run, or its files have changed.
+        ConvergenceError: the simulation diverges.
+    """
+    settings = driven_settings(folder)
+    control = settings.control
+    names = controllers_of(control)
+    _check("motion", [motion], motions_of(control))
+    _check("controllers", controllers, names)
+    robot = load(folder, control.models[-1], settings.device)
+    driven, rows = read_driven(folder / DRIVEN, motion), [names.index(name) for name in controllers]
+    steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
+    laboratory = Laboratory(settings.played, folder, driven_input(robot).name, len(rows), 0)
+    tracked = tracked_of(robot.labels, control.tracked)
+    bodies, points = [laboratory.bodies()[1]], [laboratory.markers()]
+    with Progress("laboratory", steps, "steps") as progress:
+        for number in range(steps):
+            laboratory.step(driven.inputs[rows, number])
+            bodies.append(laboratory.bodies()[1])
+            points.append(laboratory.markers())
+            progress.advance()
+    markers = np.stack(points, 1)  # (C, T + 1, M, 3)
+    return DrivenBodies(
+        robot.time_step * np.arange(steps + 1, dtype=np.float64),
+        laboratory.bodies()[0],
+        dict(zip(controllers, np.stack(bodies, 1), strict=True)),
+        dict(zip(controllers, markers.reshape(*markers.shape[:2], -1) @ tracked.T, strict=True)),
+        driven.path,
+        np.array([control.right, control.up], dtype=np.float64),
+        np.asarray(robot.simulator.gravity, dtype=np.float64),
+    )
+
+
+def _check(key: str, wanted: Sequence[str], choices: Sequence[str]) -> None:
+    unknown = [name for name in wanted if name not in choices]
+    if unknown or not wanted:
+        raise InputError(f"{key} names {unknown[0] if unknown else 'none'}: choose from {', '.join(choices)}.")

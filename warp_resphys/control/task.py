@@ -1,18 +1,19 @@
 """The tracking task of the configuration group ``control``: paths, tracked point, limits of the inputs."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from ..io.errors import InputError
+from ..robot.robot import Robot
 from ..settings.control import FigureSettings
-from .plan import Limits, Planner, PredictionModel, tracked_of
+from .baselines import LinearModel
+from .plan import Planner, tracked_of
 from .polynomials import FloatArray, around
 from .reduced import ReducedModel
 from .reference import Path
+from .sampling import driven_input
 
 _POINTS = 40  # number of points of a path whose reach is checked
 _SPACING = 0.05  # between knots of the inputs of a plan [s]
@@ -21,32 +22,26 @@ _CHANGE = 1e-3  # of the inputs for derivatives of an equilibrium, as a share of
 _LEAST_PIECES = 3  # of the inputs in a receding horizon
 
 
-@dataclass(frozen=True)
 class Task:
     """Figures that a point of a robot follows.
 
-    Attributes:
+    Args:
         figures: settings of the figures.
-        labels: of the M markers.
+        robot: whose markers and steps they have.
+
+    Attributes:
         time_step: h [s].
         parts: number n of inputs.
     """
 
-    figures: FigureSettings
-    labels: Sequence[str]
-    time_step: float
-    parts: int
+    def __init__(self, figures: FigureSettings, robot: Robot) -> None:
+        self.figures, self._labels, self.time_step = figures, robot.labels, robot.time_step
+        self.parts = len(driven_input(robot).parts)
 
     @cached_property
     def tracked(self) -> FloatArray:
         """Matrix (3, 3 M) from the markers to the tracked point, a mean of some of them."""
-        return tracked_of(self.labels, self.figures.tracked)
-
-    @property
-    def limits(self) -> Limits:
-        """Limits of the inputs."""
-        limits = self.figures.limits
-        return Limits(*(np.full(self.parts, bound) for bound in (limits.low, limits.high, limits.rate)))
+        return tracked_of(self._labels, self.figures.tracked)
 
     @property
     def paths(self) -> list[Path]:
@@ -64,7 +59,7 @@ class Task:
 
     def planner(
         self,
-        model: PredictionModel,
+        model: ReducedModel | LinearModel,
         path: FloatArray,
         horizon: float = _AHEAD,
         weight: float = _WEIGHT,
@@ -81,7 +76,7 @@ class Task:
         """
         steps = max(round(horizon / self.time_step), 1)
         pieces = min(max(round(steps * self.time_step / _SPACING), _LEAST_PIECES), steps)
-        return Planner(model, self.tracked, self.limits, path, steps, pieces, weight, iterations)
+        return Planner(model, self.tracked, self.figures.limits, path, steps, pieces, weight, iterations)
 
     def check_reach(self, model: ReducedModel, reach: float) -> None:
         """Checks that the robot has an equilibrium at every point of the paths.
@@ -113,7 +108,7 @@ class Task:
         self, model: ReducedModel, point: FloatArray, guess: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
         """Inputs (n,) as shares whose equilibrium is nearest to a point, and its position (3,) there [m]."""
-        limits = self.limits
+        limits = self.figures.limits
 
         def places(shares: FloatArray) -> FloatArray:
             return model.rest_observed(limits.low + limits.range * shares) @ self.tracked.T

@@ -183,12 +183,6 @@ class RobotScene:
             InputError: an unknown robot, an invalid input, or surfaces that cross.
             ConvergenceError: the step failed.
         """
-        return self.step_with_inputs(state, inputs)[0]
-
-    def step_with_inputs(
-        self, state: SceneState, inputs: Mapping[str, Mapping[str, Given]] | None = None
-    ) -> tuple[SceneState, Inputs]:
-        """Returns the state after one time step as `step`, and the simulator's inputs, as for `Simulator.contacts`."""
         given, by_body = self._checked(inputs), dict[str, Inputs]()
         after = dict[str, Callable[[State], RobotState]]()
         for name, robot in self.robots.items():
@@ -200,14 +194,13 @@ class RobotScene:
                 if own.fixed_positions is None and len(body.fixed_vertices):
                     places = self.simulator.rest_positions[first + body.fixed_vertices]
                     by_body[name] = own.replace(fixed_positions=places.expand(state.body.batch, -1, -1))
-        acting = self.scene.inputs(by_body)
-        new, report = self.simulator.step(state.body, acting, self.constants)
+        new, report = self.simulator.step(state.body, self.scene.inputs(by_body), self.constants)
         lost = state.lost | ~report.converged
         if bool(lost.any()):
             rest = self.simulator.rest_state(state.body.batch)
             new = RobotState(rest).where(lost, RobotState(new)).body
         robots = {name: replace(after[name](self._own(name, new)), lost=lost) for name in self.robots}
-        return SceneState(new, robots, lost), acting
+        return SceneState(new, robots, lost)
 
     def observe(self, state: SceneState) -> dict[str, torch.Tensor]:
         """Returns markers (B, M, 3) of the robots in the frame of the scene, by name [m]."""

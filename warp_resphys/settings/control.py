@@ -24,6 +24,11 @@ class LimitsOfInputs(Settings):
     high: Positive = setting(description="at most data.input_limit")
     rate: Positive = setting(description="largest rate of change, in its unit a second")
 
+    @property
+    def range(self) -> float:
+        """The upper less the lower bound."""
+        return self.high - self.low
+
 
 class PlanSettings(Settings):
     """Plans of whole motions."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..control.replay import driven_settings, replay
+from ..control.stages import driven_settings, replay
 from ..energies.contact import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError

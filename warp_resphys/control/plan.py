@@ -103,7 +103,7 @@ class Planner:
         finite = np.isfinite(errors).ravel()
         j = 1e3 * slopes.reshape(errors.size, -1) * finite[:, None]
         pull = j.T @ (1e3 * np.where(finite, errors.ravel(), 0.0))
-        d: FloatArray = self._difference / self._most
+        d = np.asarray(self._difference / self._most, dtype=np.float64)
         jump = d @ shares - np.concatenate([first, np.zeros(len(shares) - len(first))]) / self._most
         weight = self._weight * max(errors.size, 1) / len(shares)
         hessian = j.T @ j + weight * (np.eye(len(shares)) + d.T @ d)

@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from .modules import named_module
+from .points import MatrixPoints, VectorPoints
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,8 +40,7 @@ def sum_blocks(
 @wp.kernel
 def cell_blocks(
     active: wp.array[int],  # (B) zero: skip the environment
-    gradients: wp.array2d[wp.vec3d],
-    points_per_cell: int,
+    points: MatrixPoints,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
     block_offset: int,
     blocks_out: wp.array2d[wp.mat33d],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
@@ -49,17 +49,17 @@ def cell_blocks(
     b, cell, a = wp.tid()
     if active[b] == 0:
         return
-    k = gradients.shape[1]
+    k = points.nodes.shape[1]
     first = block_offset + cell * (k * (k + 1)) / 2 + (a * (a + 1)) / 2
-    for q in range(points_per_cell):
-        p = cell * points_per_cell + q
-        g = gradients[p, a]
+    for q in range(points.per_cell):
+        p = cell * points.per_cell + q
+        g = points.operators[p, a]
         t = tangent[b, p]
         x = g[0] * t[0] + g[1] * t[1] + g[2] * t[3]
         y = g[0] * wp.transpose(t[1]) + g[1] * t[2] + g[2] * t[4]
         z = g[0] * wp.transpose(t[3]) + g[1] * wp.transpose(t[4]) + g[2] * t[5]
         for c in range(a + 1):
-            h = gradients[p, c]
+            h = points.operators[p, c]
             block = h[0] * x + h[1] * y + h[2] * z
             if q > 0:
                 block += blocks_out[b, first + c]
@@ -69,8 +69,7 @@ def cell_blocks(
 @wp.kernel
 def cell_pair_blocks(
     active: wp.array[int],  # (B) zero: skip the environment
-    gradients: wp.array2d[wp.vec3d],
-    points_per_cell: int,
+    points: MatrixPoints,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
     pairs: wp.array2d[int],  # (K (K + 1) / 2, 2) rows a >= columns c
     block_offset: int,
@@ -82,9 +81,9 @@ def cell_pair_blocks(
         return
     a, c = pairs[pair, 0], pairs[pair, 1]
     total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for q in range(points_per_cell):
-        p = cell * points_per_cell + q
-        g, h = gradients[p, a], gradients[p, c]
+    for q in range(points.per_cell):
+        p = cell * points.per_cell + q
+        g, h = points.operators[p, a], points.operators[p, c]
         t = tangent[b, p]
         total += (g[0] * h[0]) * t[0] + (g[1] * h[1]) * t[2] + (g[2] * h[2]) * t[5]
         total += (g[1] * h[0]) * t[1] + (g[0] * h[1]) * wp.transpose(t[1])
@@ -96,8 +95,7 @@ def cell_pair_blocks(
 @wp.kernel
 def line_pair_blocks(
     active: wp.array[int],  # (B) zero: skip the environment
-    weights: wp.array2d[wp.float64],  # (P, K)
-    points_per_cell: int,
+    points: VectorPoints,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 1)
     pairs: wp.array2d[int],
     block_offset: int,
@@ -109,9 +107,9 @@ def line_pair_blocks(
         return
     a, c = pairs[pair, 0], pairs[pair, 1]
     total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for q in range(points_per_cell):
-        p = cell * points_per_cell + q
-        total += (weights[p, a] * weights[p, c]) * tangent[b, p, 0]
+    for q in range(points.per_cell):
+        p = cell * points.per_cell + q
+        total += (points.operators[p, a] * points.operators[p, c]) * tangent[b, p, 0]
     blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
 
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .modules import named_module
-from .points import line_at, value_reader
+from .points import PartValues, VectorPoints, value_reader, vector_at
 
 ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
 SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
@@ -112,14 +112,9 @@ def axial_kernels(law: str) -> SimpleNamespace:
     @wp.kernel(module=module)
     def local_step(
         active: wp.array[int],  # (B) zero: skip the environment
-        nodes: wp.array2d[int],
-        operators: wp.array2d[wp.float64],  # (P, K)
-        weights: wp.array[wp.float64],  # (P) w
-        addresses: wp.array[wp.uint64],  # see `points.value_reader`
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: VectorPoints,
+        values: PartValues,
         toe: wp.float64,  # elongation at which the law reaches its full stiffness
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         stress_out: wp.array2d[wp.vec3d],
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
@@ -127,36 +122,31 @@ def axial_kernels(law: str) -> SimpleNamespace:
         b, p = wp.tid()
         if active[b] == 0:
             return
-        v = read_values(addresses, sizes, places, b, p)
-        u, length = stretched(line_at(positions, nodes, operators, b, p, p / points_per_cell), v)
+        v = read_values(values, b, p)
+        u, length = stretched(vector_at(points, positions, b, p), v)
         energy, pull, _slope, _by_values = tension(length, toe, v)
-        stress_out[b, p] = (weights[p] * pull) * u
-        energy_out[b, p] = weights[p] * energy
+        stress_out[b, p] = (values.weights[p] * pull) * u
+        energy_out[b, p] = values.weights[p] * energy
 
     @wp.kernel(module=module)
     def tangent(
         active: wp.array[int],
         clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        nodes: wp.array2d[int],
-        operators: wp.array2d[wp.float64],
-        weights: wp.array[wp.float64],
-        addresses: wp.array[wp.uint64],
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: VectorPoints,
+        values: PartValues,
         toe: wp.float64,
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
     ):
         b, p = wp.tid()
         if active[b] == 0:
             return
-        v = read_values(addresses, sizes, places, b, p)
-        u, length = stretched(line_at(positions, nodes, operators, b, p, p / points_per_cell), v)
+        v = read_values(values, b, p)
+        u, length = stretched(vector_at(points, positions, b, p), v)
         _energy, pull, slope, _by_values = tension(length, toe, v)
-        across, along = ZERO, weights[p] * slope
+        across, along = ZERO, values.weights[p] * slope
         if length > ZERO:
-            across = weights[p] * pull / length
+            across = values.weights[p] * pull / length
         if clamp[b] != 0:
             across = wp.max(across, ZERO)
         block = (along - across) * wp.outer(u, u)
@@ -169,31 +159,26 @@ def axial_kernels(law: str) -> SimpleNamespace:
     # the vector the other way: its derivative is the tangent times dz.
     @wp.kernel(module=module)
     def adjoint(
-        nodes: wp.array2d[int],
-        operators: wp.array2d[wp.float64],
-        weights: wp.array[wp.float64],
-        addresses: wp.array[wp.uint64],
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: VectorPoints,
+        values: PartValues,
         toe: wp.float64,
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
         values_out: wp.array2d[vector],  # (B, P) this point's part of dL/dv
     ):
         b, p = wp.tid()
-        v = read_values(addresses, sizes, places, b, p)
-        u, length = stretched(line_at(positions, nodes, operators, b, p, p / points_per_cell), v)
-        dz = line_at(direction, nodes, operators, b, p, p / points_per_cell)
+        v = read_values(values, b, p)
+        u, length = stretched(vector_at(points, positions, b, p), v)
+        dz = vector_at(points, direction, b, p)
         _energy, pull, slope, by_values = tension(length, toe, v)
         axial = wp.dot(u, dz)
-        result = (-weights[p] * axial) * by_values
+        result = (-values.weights[p] * axial) * by_values
         if wp.static(tied):
             moved = (slope * axial) * u
             if length > ZERO:
                 moved += (pull / length) * (dz - axial * u)
             for i in range(3):
-                result[i] = weights[p] * moved[i]
+                result[i] = values.weights[p] * moved[i]
         values_out[b, p] = result
 
     return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)

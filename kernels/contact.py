@@ -6,7 +6,7 @@ Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of
 import warp as wp
 
 from .obstacles import GRID, Obstacles, distance, turn_slope
-from .points import line_at
+from .points import VectorPoints, vector_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,13 +59,11 @@ def slide(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.vec3d:
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     area: wp.array[wp.float64],  # (P) [m^2]
     o: Obstacles,
     stiffness: wp.array2d[wp.float64],  # (B, O) kappa [Pa]
     f: Friction,
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
@@ -74,7 +72,7 @@ def local_step(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
+    x = vector_at(points, positions, b, p)
     force, energy = wp.vec3d(), wp.float64(0.0)
     for k in range(o.kind.shape[0]):
         at = distance(o, b, k, x)
@@ -115,13 +113,11 @@ def friction_tangent(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.mat
 def tangent(
     active: wp.array[int],
     clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     area: wp.array[wp.float64],
     o: Obstacles,
     stiffness: wp.array2d[wp.float64],
     f: Friction,
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
@@ -129,7 +125,7 @@ def tangent(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
+    x = vector_at(points, positions, b, p)
     block = wp.mat33d()
     for k in range(o.kind.shape[0]):
         at = distance(o, b, k, x)
@@ -160,21 +156,19 @@ class Slopes:
 
 @wp.kernel
 def adjoint(
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     area: wp.array[wp.float64],
     o: Obstacles,
     stiffness: wp.array2d[wp.float64],
     f: Friction,
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
     out: Slopes,
 ):
     """-z . d force / d value, at fixed positions."""
     b, p, k = wp.tid()
-    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
-    z = line_at(direction, nodes, weights, b, p, p / points_per_cell)
+    x = vector_at(points, positions, b, p)
+    z = vector_at(points, direction, b, p)
     at = distance(o, b, k, x)
     e = barrier(at.d / o.reach)
     factor = stiffness[b, k] * area[p]
@@ -198,10 +192,8 @@ def adjoint(
 @wp.kernel
 def bound(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     o: Obstacles,
-    points_per_cell: int,
     origin: wp.array2d[wp.vec3d],  # (B, N) without penetration [m]
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
     share: wp.array[wp.float64],  # (B) is lowered to the share of the way from origin that leaves `KEPT` of every gap
@@ -214,9 +206,8 @@ def bound(
     b, p, k = wp.tid()
     if active[b] == 0:
         return
-    cell = p / points_per_cell
-    x = line_at(origin, nodes, weights, b, p, cell)
-    way = line_at(positions, nodes, weights, b, p, cell) - x
+    x = vector_at(points, origin, b, p)
+    way = vector_at(points, positions, b, p) - x
     at = distance(o, b, k, x)
     kept = KEPT * at.d
     if o.kind[k] != GRID:

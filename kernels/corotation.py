@@ -3,6 +3,7 @@
 import warp as wp
 
 from .matrices import polar_rotation
+from .points import MatrixPoints
 
 wp.set_module_options({"enable_backward": False})
 
@@ -12,7 +13,7 @@ THIRD, ONE = wp.float64(1.0 / 3.0), wp.float64(1.0)
 
 @wp.kernel
 def cell_gradients(
-    nodes: wp.array2d[int],  # (C, K)
+    points: MatrixPoints,
     operators: wp.array2d[wp.vec3d],  # (C, K) mean gradients of the shape functions, times a weight
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
     gradient_out: wp.array2d[wp.mat33d],  # (B, C)
@@ -20,8 +21,8 @@ def cell_gradients(
     """Weighted mean deformation gradients of cells."""
     b, cell = wp.tid()
     f = wp.mat33d()
-    for a in range(nodes.shape[1]):
-        f += wp.outer(positions[b, nodes[cell, a]], operators[cell, a])
+    for a in range(points.nodes.shape[1]):
+        f += wp.outer(positions[b, points.nodes[cell, a]], operators[cell, a])
     gradient_out[b, cell] = f
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .points import deformation_gradient, green_strain
+from .points import MatrixPoints, green_strain, matrix_at
 from .solid import add_square, add_strain_tangent
 
 wp.set_module_options({"enable_backward": False})
@@ -24,12 +24,10 @@ def slider(square: wp.float64, limit: wp.float64) -> wp.vec3d:
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     modulus: wp.array2d[wp.float64],  # (B, P) mu times the point's volume [J]
     sliders: wp.array2d[wp.vec2d],  # (B, K) ratio g and yield strain e
     plastic: wp.array3d[wp.mat33d],  # (B, K, P) plastic strain at the start of the step
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],  # (B, P) [J]
@@ -38,7 +36,7 @@ def local_step(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    f = matrix_at(points, positions, b, p)
     strain = green_strain(f)
     stress, energy = wp.mat33d(), wp.float64(0.0)
     for k in range(sliders.shape[1]):
@@ -55,12 +53,10 @@ def local_step(
 def tangent(
     active: wp.array[int],
     clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     modulus: wp.array2d[wp.float64],
     sliders: wp.array2d[wp.vec2d],
     plastic: wp.array3d[wp.mat33d],
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
 ):
@@ -68,7 +64,7 @@ def tangent(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    f = matrix_at(points, positions, b, p)
     strain = green_strain(f)
     out = tangent_out[b, p]
     for i in range(6):
@@ -87,12 +83,10 @@ def tangent(
 
 @wp.kernel
 def adjoint(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     modulus: wp.array2d[wp.float64],
     sliders: wp.array2d[wp.vec2d],
     plastic: wp.array3d[wp.mat33d],
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
     modulus_out: wp.array2d[wp.float64],  # (B, P) dL/d modulus
@@ -105,9 +99,8 @@ def adjoint(
     A = E - E_p has, 2 m (phi' R + 2 phi'' a A).
     """
     b, p = wp.tid()
-    cell = p / points_per_cell
-    f = deformation_gradient(positions, nodes, gradients, b, p, cell)
-    rise = wp.transpose(f) * deformation_gradient(direction, nodes, gradients, b, p, cell)
+    f = matrix_at(points, positions, b, p)
+    rise = wp.transpose(f) * matrix_at(points, direction, b, p)
     rise = HALF * (rise + wp.transpose(rise))
     strain = green_strain(f)
     by_modulus = wp.float64(0.0)

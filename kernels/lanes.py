@@ -25,8 +25,8 @@ import warp as wp
 from .materials.corotated import rotation_blocks
 from .matrices import HALLEY_ITERATIONS, HALLEY_TOLERANCE, LARGEST_TRACE
 from .modules import named_module
-from .points import deformation_gradient
-from .solid import add_viscous_tangent, viscous_response
+from .points import MatrixPoints, matrix_at
+from .solid import add_viscous_tangent, solid_kernels, viscous_response
 
 WIDTH = 8  # points: as many doubles as the widest vector instructions take
 FLATTEST = wp.float64(0.2)  # smallest J of points that are taken together; the others' errors would grow with 1 / J
@@ -144,49 +144,54 @@ def scatter(x: lanes, y: lanes, z: lanes, nodes: wp.array[int], part: int, force
         force_out[nodes[first + n]] += wp.vec3d(x[n], y[n], z[n])
 
 
+@wp.struct
+class LaneCells:
+    """Gradients of cells for the vector instructions."""
+
+    together: wp.array4d[lanes]  # (C, G, K, 3) of a cell's first S points, filled up with the last
+    by_nodes: wp.array3d[lanes]  # (P, K / 8, 3) of eight nodes at a time, filled up with zeros
+    shape_points: int  # S, the number of points without a volume term, which come first
+
+
 @functools.cache
 def cell_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of a material whose shape term is that of ``kernels.materials.corotated``."""
     module = named_module(f"lanes.{law.NAME}")
     respond, elastic_tangent, moduli = law.response, law.tangent, law.moduli
+    values_type = solid_kernels(law).Values
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
     @wp.kernel(module=module)
     def cell_step(
         active: wp.array[int],  # (B) zero: skip the environment
-        nodes: wp.array2d[int],  # (C, K)
-        gradients: wp.array2d[wp.vec3d],  # (P, K)
-        stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
-        viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
-        strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
-        dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
-        points_per_cell: int,
+        points: MatrixPoints,
+        values: values_type,
         positions: wp.array2d[wp.vec3d],
-        together: wp.array4d[lanes],  # (C, G, K, 3) gradients of a cell's first S points, filled up with the last
-        by_nodes: wp.array3d[lanes],  # (P, K / 8, 3) gradients, of eight nodes at a time, filled up with zeros
-        shape_points: int,  # S, the number of points without a volume term, which come first
+        cells: LaneCells,
         force_out: wp.array2d[wp.vec3d],  # (B, N) [N], added to
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
     ):
         b, cell = wp.tid()
         if active[b] == 0:
             return
-        damping, begin = viscosity[b], cell * points_per_cell
+        damping, begin = values.viscosity[b], cell * points.per_cell
         first_alone = wp.int32(0)  # of the points that are taken one by one
-        for group in range(together.shape[1]):
-            f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
+        for group in range(cells.together.shape[1]):
+            f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(
+                points.nodes[cell], cells.together[cell, group], positions[b]
+            )
             j, e00, e11, e22, e12, e02, e01 = strain(f00, f01, f02, f10, f11, f12, f20, f21, f22)
             _g, _i2, energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
             if not exact:
                 break
-            first, count = begin + group * WIDTH, wp.min(shape_points - group * WIDTH, WIDTH)
+            first, count = begin + group * WIDTH, wp.min(cells.shape_points - group * WIDTH, WIDTH)
             mu = lanes()
             for n in range(count):
-                mu[n] = wp.dot(mu_of, stiffness[b, first + n])
+                mu[n] = wp.dot(mu_of, values.stiffness[b, first + n])
             if damping[0] > ZERO:
                 w00, w11, w22, w12, w02, w01 = lanes(), lanes(), lanes(), lanes(), lanes(), lanes()
                 for n in range(count):
-                    w = strain_offset[b, first + n]
+                    w = values.strain_offset[b, first + n]
                     w00[n] = w[0, 0]
                     w11[n] = w[1, 1]
                     w22[n] = w[2, 2]
@@ -217,57 +222,52 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
             p20 = wp.cw_mul(mu, dot(f20, f21, f22, t00, t01, t02))
             p21 = wp.cw_mul(mu, dot(f20, f21, f22, t01, t11, t12))
             p22 = wp.cw_mul(mu, dot(f20, f21, f22, t02, t12, t22))
-            for part in range(by_nodes.shape[1]):
+            for part in range(cells.by_nodes.shape[1]):
                 x, y, z = lanes(), lanes(), lanes()
                 for n in range(count):
-                    x += along(p00[n], p01[n], p02[n], by_nodes[first + n, part])
-                    y += along(p10[n], p11[n], p12[n], by_nodes[first + n, part])
-                    z += along(p20[n], p21[n], p22[n], by_nodes[first + n, part])
-                scatter(x, y, z, nodes[cell], part, force_out[b])
-            first_alone = wp.min((group + 1) * WIDTH, shape_points)
-        for p in range(begin + first_alone, begin + points_per_cell):
-            f_one = deformation_gradient(positions, nodes, gradients, b, p, cell)
-            m = stiffness[b, p]
+                    x += along(p00[n], p01[n], p02[n], cells.by_nodes[first + n, part])
+                    y += along(p10[n], p11[n], p12[n], cells.by_nodes[first + n, part])
+                    z += along(p20[n], p21[n], p22[n], cells.by_nodes[first + n, part])
+                scatter(x, y, z, points.nodes[cell], part, force_out[b])
+            first_alone = wp.min((group + 1) * WIDTH, cells.shape_points)
+        for p in range(begin + first_alone, begin + points.per_cell):
+            f_one = matrix_at(points, positions, b, p)
+            m = values.stiffness[b, p]
             energy_one, stress_one = respond(f_one, m)
             if damping[0] + damping[1] > ZERO:
                 lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-                added = viscous_response(f_one, lame, damping, strain_offset[b, p], dilation_offset[b, p])
+                added = viscous_response(f_one, lame, damping, values.strain_offset[b, p], values.dilation_offset[b, p])
                 energy_one += added[0]
                 stress_one += added[1]
             energy_out[b, p] = energy_one
-            for part in range(by_nodes.shape[1]):
-                x_one = along(stress_one[0, 0], stress_one[0, 1], stress_one[0, 2], by_nodes[p, part])
-                y_one = along(stress_one[1, 0], stress_one[1, 1], stress_one[1, 2], by_nodes[p, part])
-                z_one = along(stress_one[2, 0], stress_one[2, 1], stress_one[2, 2], by_nodes[p, part])
-                scatter(x_one, y_one, z_one, nodes[cell], part, force_out[b])
+            for part in range(cells.by_nodes.shape[1]):
+                x_one = along(stress_one[0, 0], stress_one[0, 1], stress_one[0, 2], cells.by_nodes[p, part])
+                y_one = along(stress_one[1, 0], stress_one[1, 1], stress_one[1, 2], cells.by_nodes[p, part])
+                z_one = along(stress_one[2, 0], stress_one[2, 1], stress_one[2, 2], cells.by_nodes[p, part])
+                scatter(x_one, y_one, z_one, points.nodes[cell], part, force_out[b])
 
     @wp.kernel(module=module)
     def cell_tangent(
         active: wp.array[int],
         clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[wp.vec3d],
-        stiffness: wp.array2d[moduli],
-        viscosity: wp.array[wp.vec2d],
-        strain_offset: wp.array2d[wp.mat33d],
-        dilation_offset: wp.array2d[wp.float64],
-        points_per_cell: int,
+        points: MatrixPoints,
+        values: values_type,
         positions: wp.array2d[wp.vec3d],
-        together: wp.array4d[lanes],
-        by_nodes: wp.array3d[lanes],
-        shape_points: int,
+        cells: LaneCells,
         tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
     ):
         b, cell = wp.tid()
         if active[b] == 0:
             return
-        c, begin, clamped = viscosity[b], cell * points_per_cell, clamp[b] != 0
-        groups = together.shape[1]
+        c, begin, clamped = values.viscosity[b], cell * points.per_cell, clamp[b] != 0
+        groups = cells.together.shape[1]
         if clamped:
             groups = 0
         first_alone = wp.int32(0)
         for group in range(groups):
-            f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(nodes[cell], together[cell, group], positions[b])
+            f00, f01, f02, f10, f11, f12, f20, f21, f22 = deformation(
+                points.nodes[cell], cells.together[cell, group], positions[b]
+            )
             j, e00, e11, e22, e12, e02, e01 = strain(f00, f01, f02, f10, f11, f12, f20, f21, f22)
             g, i2, _energy, t00, t11, t22, t12, t02, t01, exact = stretch(j, e00, e11, e22, e12, e02, e01)
             if not exact:
@@ -287,25 +287,27 @@ def cell_kernels(law: ModuleType) -> SimpleNamespace:
             a12 = wp.cw_mul(g, dot(f10, f11, f12, f20, f21, f22))
             a02 = wp.cw_mul(g, dot(f00, f01, f02, f20, f21, f22))
             a01 = wp.cw_mul(g, dot(f00, f01, f02, f10, f11, f12))
-            first, count = begin + group * WIDTH, wp.min(shape_points - group * WIDTH, WIDTH)
+            first, count = begin + group * WIDTH, wp.min(cells.shape_points - group * WIDTH, WIDTH)
             for n in range(count):
                 p = first + n
-                mu = wp.dot(mu_of, stiffness[b, p])
+                mu = wp.dot(mu_of, values.stiffness[b, p])
                 r = wp.mat33d(r00[n], r01[n], r02[n], r10[n], r11[n], r12[n], r20[n], r21[n], r22[n])
                 a = wp.mat33d(a00[n], a01[n], a02[n], a01[n], a11[n], a12[n], a02[n], a12[n], a22[n])
                 rotation_blocks(r, (TWO * mu) * a, mu, tangent_out[b, p])
                 if c[0] > ZERO:
                     f = wp.mat33d(f00[n], f01[n], f02[n], f10[n], f11[n], f12[n], f20[n], f21[n], f22[n])
-                    add_viscous_tangent(f, wp.vec2d(mu, ZERO), c, strain_offset[b, p], ZERO, False, tangent_out[b, p])
-            first_alone = wp.min((group + 1) * WIDTH, shape_points)
-        for p_one in range(begin + first_alone, begin + points_per_cell):
-            f_one = deformation_gradient(positions, nodes, gradients, b, p_one, cell)
-            m = stiffness[b, p_one]
+                    add_viscous_tangent(
+                        f, wp.vec2d(mu, ZERO), c, values.strain_offset[b, p], ZERO, False, tangent_out[b, p]
+                    )
+            first_alone = wp.min((group + 1) * WIDTH, cells.shape_points)
+        for p_one in range(begin + first_alone, begin + points.per_cell):
+            f_one = matrix_at(points, positions, b, p_one)
+            m = values.stiffness[b, p_one]
             out = tangent_out[b, p_one]
             elastic_tangent(f_one, m, clamped, out)
             if c[0] + c[1] > ZERO:
                 lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-                offset, dilation = strain_offset[b, p_one], dilation_offset[b, p_one]
+                offset, dilation = values.strain_offset[b, p_one], values.dilation_offset[b, p_one]
                 add_viscous_tangent(f_one, lame, c, offset, dilation, clamped, out)
 
     return SimpleNamespace(step=cell_step, tangent=cell_tangent)

@@ -9,7 +9,7 @@ the step, its energy is
 
 import warp as wp
 
-from .points import line_at
+from .points import VectorPoints, vector_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,13 +27,11 @@ def split(displacement: wp.vec3d, area: wp.vec3d):
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     reference: wp.array2d[wp.vec3d],  # (B, P) position at the start of the step [m]
     target: wp.array2d[wp.vec3d],  # (B, P) inertial target [m]
     area: wp.array2d[wp.vec3d],  # (B, P) a n [m^2]
     coefficients: wp.array2d[wp.vec4d],  # (B, 1)
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
@@ -42,7 +40,7 @@ def local_step(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    x = line_at(positions, nodes, weights, b, p, p / points_per_cell)
+    x = vector_at(points, positions, b, p)
     d = x - reference[b, p]
     e = x - target[b, p]
     c = coefficients[b, 0]
@@ -59,13 +57,11 @@ def local_step(
 def tangent(
     active: wp.array[int],
     clamp: wp.array[int],  # (B) without effect: the energy is convex
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     reference: wp.array2d[wp.vec3d],
     target: wp.array2d[wp.vec3d],
     area: wp.array2d[wp.vec3d],
     coefficients: wp.array2d[wp.vec4d],
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
@@ -73,7 +69,7 @@ def tangent(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    d = line_at(positions, nodes, weights, b, p, p / points_per_cell) - reference[b, p]
+    d = vector_at(points, positions, b, p) - reference[b, p]
     c = coefficients[b, 0]
     a, n, across, along = split(d, area[b, p])
     slip = wp.length(along)

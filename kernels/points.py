@@ -18,25 +18,43 @@ wp.set_module_options({"enable_backward": False})
 ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 
 
+@wp.struct
+class MatrixPoints:
+    """Points with operators for a matrix."""
+
+    nodes: wp.array2d[int]  # (C, K)
+    operators: wp.array2d[wp.vec3d]  # (P, K) g_a
+    per_cell: int  # Q
+
+
+@wp.struct
+class VectorPoints:
+    """Points with operators for a vector."""
+
+    nodes: wp.array2d[int]
+    operators: wp.array2d[wp.float64]
+    per_cell: int
+
+
 @wp.func
-def deformation_gradient(
-    positions: wp.array2d[wp.vec3d], nodes: wp.array2d[int], gradients: wp.array2d[wp.vec3d], b: int, p: int, cell: int
-) -> wp.mat33d:
-    """F = sum_a x_a (grad N_a)^T."""
+def matrix_at(points: MatrixPoints, positions: wp.array2d[wp.vec3d], b: int, p: int) -> wp.mat33d:
+    """F = sum_a x_a g_a^T."""
+    nodes = points.nodes[p / points.per_cell]
+    operators = points.operators[p]
     f = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for a in range(nodes.shape[1]):
-        f += wp.outer(positions[b, nodes[cell, a]], gradients[p, a])
+    for a in range(nodes.shape[0]):
+        f += wp.outer(positions[b, nodes[a]], operators[a])
     return f
 
 
 @wp.func
-def line_at(
-    positions: wp.array2d[wp.vec3d], nodes: wp.array2d[int], weights: wp.array2d[wp.float64], b: int, p: int, cell: int
-) -> wp.vec3d:
+def vector_at(points: VectorPoints, positions: wp.array2d[wp.vec3d], b: int, p: int) -> wp.vec3d:
     """sum_a g_a x_a: a deformed line, or a position."""
+    nodes = points.nodes[p / points.per_cell]
+    operators = points.operators[p]
     x = wp.vec3d(ZERO, ZERO, ZERO)
-    for a in range(nodes.shape[1]):
-        x += weights[p, a] * positions[b, nodes[cell, a]]
+    for a in range(nodes.shape[0]):
+        x += operators[a] * positions[b, nodes[a]]
     return x
 
 
@@ -47,22 +65,27 @@ def green_strain(f: wp.mat33d) -> wp.mat33d:
     return e - wp.mat33d(HALF, ZERO, ZERO, ZERO, HALF, ZERO, ZERO, ZERO, HALF)
 
 
+@wp.struct
+class PartValues:
+    """Weights of points, and the values at each of them, which are parts of any number of arrays."""
+
+    weights: wp.array[wp.float64]  # (P)
+    addresses: wp.array[wp.uint64]  # of float64 arrays (B, size)
+    sizes: wp.array[int]
+    places: wp.array2d[int]  # (n, P) column of each value at each point
+
+
 @functools.cache
 def value_reader(vector: Any) -> Any:
-    """Returns the function that reads the values at point p of environment b into a vector type.
-
-    Its arguments are the addresses of float64 arrays (B, size), their sizes, and the column of each value at each point
-    (n, P), so that kernels take any number of values without further arguments or copies.
-    """
+    """Returns the function that reads the values at point p of environment b into a vector type."""
 
     @wp.func(module=named_module(f"values.{vector._length_}"))
-    def read_values(
-        addresses: wp.array[wp.uint64], sizes: wp.array[int], places: wp.array2d[int], b: int, p: int
-    ) -> vector:
+    def read_values(from_parts: PartValues, b: int, p: int) -> vector:
         values = vector()
-        for k in range(places.shape[0]):
-            row = wp.array(ptr=addresses[k], shape=((b + 1) * sizes[k],), dtype=wp.float64)
-            values[k] = row[b * sizes[k] + places[k, p]]
+        for k in range(from_parts.places.shape[0]):
+            size = from_parts.sizes[k]
+            row = wp.array(ptr=from_parts.addresses[k], shape=((b + 1) * size,), dtype=wp.float64)
+            values[k] = row[b * size + from_parts.places[k, p]]
         return values
 
     return read_values
@@ -72,13 +95,11 @@ def value_reader(vector: Any) -> Any:
 def gather_kernels(width: int) -> SimpleNamespace:
     """Returns kernels from stresses to forces, for operators with three components or one."""
     module = named_module(f"points.{width}")
-    operator, shape = (wp.float64, wp.vec3d) if width == 1 else (wp.vec3d, wp.mat33d)
+    points_type, shape = (VectorPoints, wp.vec3d) if width == 1 else (MatrixPoints, wp.mat33d)
 
     @wp.kernel(module=module)
     def gather(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[operator],
-        points_per_cell: int,
+        points: points_type,
         incident_start: wp.array[int],  # (N + 1) first entry of each vertex
         incident: wp.array[int],  # cell * K + local node, cells in ascending order: a fixed summation order
         stress: wp.array2d[shape],
@@ -87,20 +108,19 @@ def gather_kernels(width: int) -> SimpleNamespace:
         """Adds the transposed operator applied to the stress to the force of every vertex."""
         b, i = wp.tid()
         total = force_out[b, i]
-        k = nodes.shape[1]
+        k = points.nodes.shape[1]
         for entry in range(incident_start[i], incident_start[i + 1]):
             cell = incident[entry] / k
             a = incident[entry] - cell * k
-            for q in range(points_per_cell):
-                p = cell * points_per_cell + q
-                total += stress[b, p] * gradients[p, a]
+            for q in range(points.per_cell):
+                p = cell * points.per_cell + q
+                total += stress[b, p] * points.operators[p, a]
         force_out[b, i] = total
 
     @wp.kernel(module=module)
     def cell_forces(
         active: wp.array[int],  # (B) zero: skip the environment
-        gradients: wp.array2d[operator],  # (P, K)
-        points_per_cell: int,
+        points: points_type,
         stress: wp.array2d[shape],
         force_out: wp.array2d[wp.vec3d],  # (B, C K) [N]
     ):
@@ -108,13 +128,13 @@ def gather_kernels(width: int) -> SimpleNamespace:
         b, entry = wp.tid()
         if active[b] == 0:
             return
-        k = gradients.shape[1]
+        k = points.nodes.shape[1]
         cell = entry / k
         a = entry - cell * k
         total = wp.vec3d(ZERO, ZERO, ZERO)
-        for q in range(points_per_cell):
-            p = cell * points_per_cell + q
-            total += stress[b, p] * gradients[p, a]
+        for q in range(points.per_cell):
+            p = cell * points.per_cell + q
+            total += stress[b, p] * points.operators[p, a]
         force_out[b, entry] = total
 
     return SimpleNamespace(gather=gather, cell_forces=cell_forces)
@@ -165,16 +185,14 @@ def project(
 
 @wp.kernel
 def tangent_product(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
-    points_per_cell: int,
+    points: MatrixPoints,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
     direction: wp.array2d[wp.vec3d],  # (B, N) [m]
     stress_out: wp.array2d[wp.mat33d],  # (B, P) dP in that direction [J]
 ):
     """Derivative of the stress in a direction."""
     b, p = wp.tid()
-    df = deformation_gradient(direction, nodes, gradients, b, p, p / points_per_cell)
+    df = matrix_at(points, direction, b, p)
     t = tangent[b, p]
     columns = wp.transpose(df)
     x = columns[0]
@@ -189,13 +207,11 @@ def tangent_product(
 
 @wp.kernel
 def line_tangent_product(
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
-    points_per_cell: int,
+    points: VectorPoints,
     tangent: wp.array3d[wp.mat33d],  # (B, P, 1)
     direction: wp.array2d[wp.vec3d],  # (B, N) [m]
     stress_out: wp.array2d[wp.vec3d],  # (B, P)
 ):
     """Derivative of the stress in a direction, for an energy that is a function of a vector."""
     b, p = wp.tid()
-    stress_out[b, p] = tangent[b, p, 0] * line_at(direction, nodes, weights, b, p, p / points_per_cell)
+    stress_out[b, p] = tangent[b, p, 0] * vector_at(points, direction, b, p)

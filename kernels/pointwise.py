@@ -21,7 +21,7 @@ import warp as wp
 
 from .matrices import symmetric_eigen
 from .modules import named_module
-from .points import deformation_gradient, line_at, value_reader
+from .points import MatrixPoints, PartValues, VectorPoints, matrix_at, value_reader, vector_at
 
 STEP = wp.constant(wp.float64(3e-4))  # of differences, over the size of f
 OFFSETS, SHARES = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0)), wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
@@ -96,20 +96,15 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
     # Unrolled, the loops below would take minutes to compile.
     wp.set_module_options({"max_unroll": 1}, module)
     line = shape is wp.vec3d
-    see, operator, inner = (line_at, wp.float64, wp.dot) if line else (deformation_gradient, wp.vec3d, wp.ddot)
+    see, points_type, inner = (vector_at, VectorPoints, wp.dot) if line else (matrix_at, MatrixPoints, wp.ddot)
     read_values = value_reader(vector)
 
     @wp.kernel(module=module)
     def local_step(
         active: wp.array[int],  # (B) zero: skip the environment
-        nodes: wp.array2d[int],
-        operators: wp.array2d[operator],
-        weights: wp.array[wp.float64],  # (P) w
-        addresses: wp.array[wp.uint64],  # see `points.value_reader`
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: points_type,
+        values: PartValues,
         size: wp.float64,  # of f
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         stress_out: wp.array2d[shape],
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
@@ -117,30 +112,25 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
         b, p = wp.tid()
         if active[b] == 0:
             return
-        v = read_values(addresses, sizes, places, b, p)
-        f = see(positions, nodes, operators, b, p, p / points_per_cell)
+        v = read_values(values, b, p)
+        f = see(points, positions, b, p)
         stress, _by_values = wp.grad(density)(f, v)
-        stress_out[b, p] = weights[p] * stress
-        energy_out[b, p] = weights[p] * density(f, v)
+        stress_out[b, p] = values.weights[p] * stress
+        energy_out[b, p] = values.weights[p] * density(f, v)
 
     @wp.kernel(module=module)
     def adjoint(
-        nodes: wp.array2d[int],
-        operators: wp.array2d[operator],
-        weights: wp.array[wp.float64],
-        addresses: wp.array[wp.uint64],
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: points_type,
+        values: PartValues,
         size: wp.float64,
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
         values_out: wp.array2d[vector],  # (B, P) this point's part of dL/dv
     ):
         b, p = wp.tid()
-        v = read_values(addresses, sizes, places, b, p)
-        f = see(positions, nodes, operators, b, p, p / points_per_cell)
-        dz = see(direction, nodes, operators, b, p, p / points_per_cell)
+        v = read_values(values, b, p)
+        f = see(points, positions, b, p)
+        dz = see(points, direction, b, p)
         length = wp.sqrt(inner(dz, dz))
         result = vector()
         if length > ZERO:
@@ -148,7 +138,7 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
             for k in range(4):
                 _stress, by_values = wp.grad(density)(f + (OFFSETS[k] * h) * dz, v)
                 result += SHARES[k] * by_values
-            result = (-weights[p] / (TWELVE * h)) * result
+            result = (-values.weights[p] / (TWELVE * h)) * result
         values_out[b, p] = result
 
     tangent = (_line_tangent if line else _tangent)(density, vector, module, read_values)
@@ -162,22 +152,17 @@ def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any
     def tangent(
         active: wp.array[int],
         clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        nodes: wp.array2d[int],
-        operators: wp.array2d[wp.float64],
-        weights: wp.array[wp.float64],
-        addresses: wp.array[wp.uint64],
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: VectorPoints,
+        values: PartValues,
         size: wp.float64,
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
     ):
         b, p = wp.tid()
         if active[b] == 0:
             return
-        v = read_values(addresses, sizes, places, b, p)
-        x = line_at(positions, nodes, operators, b, p, p / points_per_cell)
+        v = read_values(values, b, p)
+        x = vector_at(points, positions, b, p)
         h = STEP * size
         rows = wp.mat33d()
         for n in range(3):
@@ -189,7 +174,7 @@ def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any
                 slope += SHARES[k] * stress
             for i in range(3):
                 rows[n, i] = slope[i]
-        block = (HALF * weights[p] / (TWELVE * h)) * (rows + wp.transpose(rows))
+        block = (HALF * values.weights[p] / (TWELVE * h)) * (rows + wp.transpose(rows))
         if clamp[b] != 0:
             q, e = symmetric_eigen(block)
             positive = wp.diag(wp.vec3d(wp.max(e[0], ZERO), wp.max(e[1], ZERO), wp.max(e[2], ZERO)))
@@ -206,23 +191,18 @@ def _tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> 
     def tangent(
         active: wp.array[int],
         clamp: wp.array[int],
-        nodes: wp.array2d[int],
-        operators: wp.array2d[wp.vec3d],
-        weights: wp.array[wp.float64],
-        addresses: wp.array[wp.uint64],
-        sizes: wp.array[int],
-        places: wp.array2d[int],
+        points: MatrixPoints,
+        values: PartValues,
         size: wp.float64,
-        points_per_cell: int,
         positions: wp.array2d[wp.vec3d],
         tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
     ):
         b, p = wp.tid()
         if active[b] == 0:
             return
-        v = read_values(addresses, sizes, places, b, p)
-        f = deformation_gradient(positions, nodes, operators, b, p, p / points_per_cell)
-        scale = weights[p] / (TWELVE * STEP * size)
+        v = read_values(values, b, p)
+        f = matrix_at(points, positions, b, p)
+        scale = values.weights[p] / (TWELVE * STEP * size)
         hessian = mat99()
         for n in range(3):
             for j in range(3):

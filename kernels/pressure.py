@@ -3,7 +3,7 @@
 import warp as wp
 
 from .matrices import cofactor
-from .points import deformation_gradient
+from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,12 +15,10 @@ ZERO = wp.float64(0.0)
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     weights: wp.array[wp.float64],  # (P) a third of the quadrature weight
     chamber: wp.array[int],  # (P)
     pressure: wp.array2d[wp.float64],  # (B, chambers) [Pa]
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],  # (B, P) [J]
@@ -29,7 +27,7 @@ def local_step(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    f = matrix_at(points, positions, b, p)
     scale = weights[p] * pressure[b, chamber[p]]
     stress_out[b, p] = scale * cofactor(f)
     energy_out[b, p] = scale * wp.determinant(f)
@@ -39,12 +37,10 @@ def local_step(
 def tangent(
     active: wp.array[int],
     clamp: wp.array[int],  # (B) non-zero: set to zero, as the eigenvalues have both signs
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     weights: wp.array[wp.float64],
     chamber: wp.array[int],
     pressure: wp.array2d[wp.float64],
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
@@ -52,7 +48,7 @@ def tangent(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    f = matrix_at(points, positions, b, p)
     scale = weights[p] * pressure[b, chamber[p]]
     if clamp[b] != 0:
         scale = ZERO
@@ -70,17 +66,14 @@ def tangent(
 
 @wp.kernel
 def adjoint(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     weights: wp.array[wp.float64],
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
     pressure_out: wp.array2d[wp.float64],  # (B, P) this point's part of dL/dp of its chamber
 ):
     """dL/dp = -z . dg/dp = -w cof F : grad z."""
     b, p = wp.tid()
-    cell = p / points_per_cell
-    f = deformation_gradient(positions, nodes, gradients, b, p, cell)
-    dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
+    f = matrix_at(points, positions, b, p)
+    dz = matrix_at(points, direction, b, p)
     pressure_out[b, p] = -weights[p] * wp.ddot(cofactor(f), dz)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .matrices import polar_rotation
-from .points import deformation_gradient, line_at
+from .points import MatrixPoints, VectorPoints, matrix_at, vector_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,11 +13,9 @@ ZERO, HALF = wp.float64(0.0), wp.float64(0.5)
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     inertia: wp.array2d[wp.float64],  # (B, P) k, mass over the square of the effective time step [N/m]
     target: wp.array2d[wp.vec3d],  # (B, P) y, inertial target [m]
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
@@ -26,7 +24,7 @@ def local_step(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    offset = line_at(positions, nodes, weights, b, p, p / points_per_cell) - target[b, p]
+    offset = vector_at(points, positions, b, p) - target[b, p]
     pull = inertia[b, p] * offset
     stress_out[b, p] = pull
     energy_out[b, p] = HALF * wp.dot(pull, offset)
@@ -49,11 +47,9 @@ def tangent(
 
 @wp.kernel
 def slopes(
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     inertia: wp.array2d[wp.float64],
     target: wp.array2d[wp.vec3d],
-    points_per_cell: int,
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
     inertia_out: wp.array2d[wp.float64],  # (B, P) dL/dk
@@ -61,26 +57,24 @@ def slopes(
 ):
     """-z . d residual by the inertia and by the target."""
     b, p = wp.tid()
-    cell = p / points_per_cell
-    offset = line_at(positions, nodes, weights, b, p, cell) - target[b, p]
-    dz = line_at(direction, nodes, weights, b, p, cell)
+    offset = vector_at(points, positions, b, p) - target[b, p]
+    dz = vector_at(points, direction, b, p)
     inertia_out[b, p] = -wp.dot(offset, dz)
     target_out[b, p] = inertia[b, p] * dz
 
 
 @wp.kernel
 def straighten(
-    nodes: wp.array2d[int],  # (P, 4) control vertices
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     centre: wp.array2d[wp.float64],  # (P, 4) weights of the centre of mass
     arms: wp.array2d[wp.vec3d],  # (P, 4) from there to the control vertices at rest [m]
     positions: wp.array2d[wp.vec3d],
 ):
     """Replaces the deformation gradient of every part by its rotation, with the centre of mass in its place."""
     b, p = wp.tid()
-    r = polar_rotation(deformation_gradient(positions, nodes, gradients, b, p, p))
+    r = polar_rotation(matrix_at(points, positions, b, p))
     middle = wp.vec3d()
     for a in range(4):
-        middle += centre[p, a] * positions[b, nodes[p, a]]
+        middle += centre[p, a] * positions[b, points.nodes[p, a]]
     for a in range(4):
-        positions[b, nodes[p, a]] = middle + r * arms[p, a]
+        positions[b, points.nodes[p, a]] = middle + r * arms[p, a]

@@ -6,7 +6,7 @@ from types import ModuleType, SimpleNamespace
 import warp as wp
 
 from .modules import named_module
-from .points import deformation_gradient, green_strain
+from .points import MatrixPoints, green_strain, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,29 +16,25 @@ ZERO, HALF, TWO, FOUR = wp.float64(0.0), wp.float64(0.5), wp.float64(2.0), wp.fl
 
 @wp.kernel
 def strain(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
-    points_per_cell: int,
+    points: MatrixPoints,
     positions: wp.array2d[wp.vec3d],
     strain_out: wp.array2d[wp.mat33d],  # (B, P)
 ):
     """Green strain."""
     b, p = wp.tid()
-    strain_out[b, p] = green_strain(deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell))
+    strain_out[b, p] = green_strain(matrix_at(points, positions, b, p))
 
 
 @wp.kernel
 def strain_adjoint(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
-    points_per_cell: int,
+    points: MatrixPoints,
     positions: wp.array2d[wp.vec3d],
     adjoint_strain: wp.array2d[wp.mat33d],  # (B, P)
     stress_out: wp.array2d[wp.mat33d],  # (B, P) adjoint of F
 ):
     """As dE = sym(F^T dF), the adjoint of F is F sym(adjoint E)."""
     b, p = wp.tid()
-    f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
+    f = matrix_at(points, positions, b, p)
     w = adjoint_strain[b, p]
     stress_out[b, p] = f * (HALF * (w + wp.transpose(w)))
 
@@ -112,16 +108,20 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     response, slopes, elastic_tangent, moduli = law.response, law.slopes, law.tangent, law.moduli
     mu_of, lambda_of = (moduli(*(wp.float64(pair[i]) for pair in law.LAME)) for i in (0, 1))
 
+    @wp.struct
+    class Values:
+        """Values of a step."""
+
+        stiffness: wp.array2d[moduli]  # (B, P) moduli times the point's volumes [J]
+        viscosity: wp.array[wp.vec2d]  # (B) c and d of `energies.viscosity`, -
+        strain_offset: wp.array2d[wp.mat33d]  # (B, P) W there
+        dilation_offset: wp.array2d[wp.float64]  # (B, P) w there
+
     @wp.kernel(module=module, launch_bounds=BOUNDS)
     def local_step(
         active: wp.array[int],  # (B) zero: skip the environment
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[wp.vec3d],
-        stiffness: wp.array2d[moduli],  # (B, P) moduli times the point's volumes [J]
-        viscosity: wp.array[wp.vec2d],  # (B) c and d of `energies.viscosity`, -
-        strain_offset: wp.array2d[wp.mat33d],  # (B, P) W there
-        dilation_offset: wp.array2d[wp.float64],  # (B, P) w there
-        points_per_cell: int,
+        points: MatrixPoints,
+        values: Values,
         positions: wp.array2d[wp.vec3d],
         stress_out: wp.array2d[wp.mat33d],
         energy_out: wp.array2d[wp.float64],  # (B, P) [J]
@@ -129,13 +129,13 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         b, p = wp.tid()
         if active[b] == 0:
             return
-        f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-        m = stiffness[b, p]
+        f = matrix_at(points, positions, b, p)
+        m = values.stiffness[b, p]
         energy, stress = response(f, m)
-        c = viscosity[b]
+        c = values.viscosity[b]
         if c[0] + c[1] > ZERO:
             lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-            added = viscous_response(f, lame, c, strain_offset[b, p], dilation_offset[b, p])
+            added = viscous_response(f, lame, c, values.strain_offset[b, p], values.dilation_offset[b, p])
             energy += added[0]
             stress += added[1]
         stress_out[b, p] = stress
@@ -145,37 +145,29 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     def tangent(
         active: wp.array[int],
         clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[wp.vec3d],
-        stiffness: wp.array2d[moduli],
-        viscosity: wp.array[wp.vec2d],
-        strain_offset: wp.array2d[wp.mat33d],
-        dilation_offset: wp.array2d[wp.float64],
-        points_per_cell: int,
+        points: MatrixPoints,
+        values: Values,
         positions: wp.array2d[wp.vec3d],
         tangent_out: wp.array3d[wp.mat33d],
     ):
         b, p = wp.tid()
         if active[b] == 0:
             return
-        f = deformation_gradient(positions, nodes, gradients, b, p, p / points_per_cell)
-        m = stiffness[b, p]
+        f = matrix_at(points, positions, b, p)
+        m = values.stiffness[b, p]
         out = tangent_out[b, p]
         elastic_tangent(f, m, clamp[b] != 0, out)
-        c = viscosity[b]
+        c = values.viscosity[b]
         if c[0] + c[1] > ZERO:
             lame = wp.vec2d(wp.dot(mu_of, m), wp.dot(lambda_of, m))
-            add_viscous_tangent(f, lame, c, strain_offset[b, p], dilation_offset[b, p], clamp[b] != 0, out)
+            add_viscous_tangent(
+                f, lame, c, values.strain_offset[b, p], values.dilation_offset[b, p], clamp[b] != 0, out
+            )
 
     @wp.kernel(module=module)
     def adjoint(
-        nodes: wp.array2d[int],
-        gradients: wp.array2d[wp.vec3d],
-        stiffness: wp.array2d[moduli],
-        viscosity: wp.array[wp.vec2d],
-        strain_offset: wp.array2d[wp.mat33d],
-        dilation_offset: wp.array2d[wp.float64],
-        points_per_cell: int,
+        points: MatrixPoints,
+        values: Values,
         positions: wp.array2d[wp.vec3d],
         carried: wp.array[moduli],  # (P) volumes that the points carry for each modulus [m^3]
         direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
@@ -186,13 +178,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
     ):
         """dL/dtheta = -z . d(internal residual)/dtheta = -dP/dtheta : grad z, at fixed positions."""
         b, p = wp.tid()
-        cell = p / points_per_cell
-        f = deformation_gradient(positions, nodes, gradients, b, p, cell)
-        dz = deformation_gradient(direction, nodes, gradients, b, p, cell)
-        m = stiffness[b, p]
+        f = matrix_at(points, positions, b, p)
+        dz = matrix_at(points, direction, b, p)
+        m = values.stiffness[b, p]
         shape = wp.dot(mu_of, m)
         bulk = wp.dot(lambda_of, m)
-        c = viscosity[b]
+        c = values.viscosity[b]
         # A stiffness of zero (nu = 0) has a derivative too, so only the volumes decide what is skipped.
         result = -slopes(f, dz, m, carried[p])
         rise = wp.transpose(f) * dz
@@ -202,12 +193,12 @@ def solid_kernels(law: ModuleType) -> SimpleNamespace:
         dilation = wp.trace(strain)
         left, by_volume = wp.mat33d(), ZERO
         if c[0] + c[1] > ZERO:  # Without viscosity the offsets are not set.
-            left = c[0] * strain - strain_offset[b, p]
-            by_volume = (c[1] * dilation - dilation_offset[b, p]) * swelling
+            left = c[0] * strain - values.strain_offset[b, p]
+            by_volume = (c[1] * dilation - values.dilation_offset[b, p]) * swelling
         by_shape = TWO * wp.ddot(left, rise)
         viscosity_out[b, p] = -wp.vec2d(TWO * shape * wp.ddot(strain, rise), bulk * dilation * swelling)
         stiffness_out[b, p] = result - by_shape * mu_of - by_volume * lambda_of
         strain_out[b, p] = (TWO * shape) * rise
         dilation_out[b, p] = bulk * swelling
 
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint)
+    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, Values=Values)

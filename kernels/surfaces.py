@@ -11,7 +11,7 @@ second derivatives
 import warp as wp
 
 from .contact import INFINITE, KEPT, ONE, TWO, UNDEFINED, ZERO, barrier, slide_tangent, smoothed
-from .points import line_at
+from .points import VectorPoints, vector_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -509,14 +509,13 @@ def grip_tangents(
 @wp.kernel
 def interpolate(
     vertices: wp.array[int],  # (P) of the surface
-    nodes: wp.array2d[int],
-    weights: wp.array2d[wp.float64],
+    points: VectorPoints,
     field: wp.array2d[wp.vec3d],  # (B, N) at control vertices
     field_out: wp.array2d[wp.vec3d],  # (B, N)
 ):
     """Sets a field at the vertices of a surface from that at control vertices, and leaves it elsewhere."""
     b, p = wp.tid()
-    field_out[b, vertices[p]] = line_at(field, nodes, weights, b, p, p)
+    field_out[b, vertices[p]] = vector_at(points, field, b, p)
 
 
 @wp.kernel

@@ -10,7 +10,7 @@ The guide before each segment adds the friction of `bristle`, which depends on t
 import warp as wp
 
 from .axial import thread_pull
-from .points import deformation_gradient
+from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,15 +31,10 @@ def direction_of(line: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def segment(
-    positions: wp.array2d[wp.vec3d],
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
-    anchors: wp.array[wp.mat33d],
-    b: int,
-    p: int,
+    points: MatrixPoints, positions: wp.array2d[wp.vec3d], anchors: wp.array[wp.mat33d], b: int, p: int
 ) -> wp.mat33d:
     """Returns F of a segment; ends that are fixed in the world are in ``anchors`` (P)."""
-    return deformation_gradient(positions, nodes, gradients, b, p, p) + anchors[p]
+    return matrix_at(points, positions, b, p) + anchors[p]
 
 
 @wp.func
@@ -55,8 +50,7 @@ def bristle(slide: wp.float64, hold: wp.float64, drop: wp.float64, rise: wp.floa
 @wp.kernel
 def pull(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     anchors: wp.array[wp.mat33d],
     first: wp.array[int],  # (T + 1) first segment of each tendon
     rest: wp.array[wp.mat33d],  # (P) F of the undeformed body
@@ -87,7 +81,7 @@ def pull(
     length = wp.float64(0.0)
     for k in range(first[t + 1] - first[t]):
         p = first[t + 1] - 1 - k  # from the end, as friction depends on the length beyond a guide
-        own = wp.length(segment(positions, nodes, gradients, anchors, b, p) * c)
+        own = wp.length(segment(points, positions, anchors, b, p) * c)
         length += own
         longer += own - wp.length(rest[p] * c)
         slide = length - beyond[b, p]
@@ -105,8 +99,7 @@ def pull(
 @wp.kernel
 def local_step(
     active: wp.array[int],  # (B) zero: skip the environment
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     anchors: wp.array[wp.mat33d],
     first: wp.array[int],
     tendon: wp.array[int],  # (P)
@@ -126,7 +119,7 @@ def local_step(
         return
     t = tendon[p]
     c = along[b, t]
-    line = segment(positions, nodes, gradients, anchors, b, p) * c
+    line = segment(points, positions, anchors, b, p) * c
     energy = commanded[b, t] * wp.length(line) + friction[b, p][0]
     if p == first[t]:
         energy += stiffness[b, t] * spring[b, t][0]
@@ -138,8 +131,7 @@ def local_step(
 def tangent(
     active: wp.array[int],
     clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
     along: wp.array2d[wp.vec3d],
@@ -155,7 +147,7 @@ def tangent(
     if active[b] == 0:
         return
     c = along[b, tendon[p]]
-    line = segment(positions, nodes, gradients, anchors, b, p) * c
+    line = segment(points, positions, anchors, b, p) * c
     length = wp.length(line)
     stiffness = ZERO
     if length > ZERO:
@@ -174,8 +166,7 @@ def tangent(
 
 @wp.kernel
 def directions(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
     along: wp.array2d[wp.vec3d],
@@ -185,14 +176,13 @@ def directions(
     """Derivative u c^T of the length of each segment by F, with the unit vector u along the segment."""
     b, p = wp.tid()
     c = along[b, tendon[p]]
-    line = segment(positions, nodes, gradients, anchors, b, p) * c
+    line = segment(points, positions, anchors, b, p) * c
     direction_out[b, p] = wp.outer(direction_of(line), c)
 
 
 @wp.kernel
 def adjoint(
-    nodes: wp.array2d[int],
-    gradients: wp.array2d[wp.vec3d],
+    points: MatrixPoints,
     anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
     rest: wp.array[wp.mat33d],
@@ -209,8 +199,8 @@ def adjoint(
     b, p = wp.tid()
     t = tendon[p]
     c = along[b, t]
-    f = segment(positions, nodes, gradients, anchors, b, p)
-    dz = deformation_gradient(direction, nodes, gradients, b, p, p)
+    f = segment(points, positions, anchors, b, p)
+    dz = matrix_at(points, direction, b, p)
     line, moved = f * c, dz * c
     u, u_rest = direction_of(line), direction_of(rest[p] * c)
     shorter = -wp.dot(u, moved)

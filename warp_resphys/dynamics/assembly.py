@@ -105,7 +105,7 @@ class HessianAssembly:
         self._overwritten = solver.overwrites
         commands = []
         for s, tangent, offset in zip(p.sets, p.tangents, pattern.offsets, strict=True):
-            inputs = [active, s.gradients, s.points_per_cell, warp_view(tangent, wp.mat33d)]
+            inputs = [active, s.points, warp_view(tangent, wp.mat33d)]
             kernel, threads = kernels.cell_blocks, s.nodes_per_cell
             if p.by_cells or s.width == 1:
                 pairs = np.stack(np.tril_indices(s.nodes_per_cell), axis=1).astype(np.int32)

@@ -40,7 +40,7 @@ class Corotation:
             operators = p.upload(np.einsum("cq,cqki->cki", volumes / mean, source.gradients), wp.vec3d)
             gradient = warp_view(p.zeros(s.cells, 3, 3), wp.mat33d)
             commands += [
-                p.record(kernels.cell_gradients, (p.batch, s.cells), [s.nodes, operators, positions], [gradient]),
+                p.record(kernels.cell_gradients, (p.batch, s.cells), [s.points, operators, positions], [gradient]),
                 p.record(kernels.sum_at_vertices, shape, [s.start, s.incident, s.nodes_per_cell, gradient], [total]),
             ]
         held = np.zeros(shape[1], dtype=np.int32)

@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import InputError
+from ..kernels.points import MatrixPoints, VectorPoints
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Constants, Mass
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import ImplicitStage, State
-from .launcher import Launcher, warp_view
+from .launcher import Launcher, struct_of, warp_view
 
 Values = Mapping[str, torch.Tensor | None]
 Adjoint = Callable[[], dict[str, torch.Tensor]]  # computes derivatives by values, by name
@@ -134,9 +135,8 @@ class PointSet:
         nodes_per_cell: K.
         n_points: P = C Q.
         n_vertices: N.
-        nodes: (C, K).
-        width: components of an operator: 3, or 1 if the energy is a function of a vector (``kernels.points``).
-        gradients: (P, K) operators.
+        width: components of an operator: 3, or 1 if the energy is a function of a vector.
+        points: the points on the device (``kernels.points``).
         start: (N + 1) first entry of each vertex in ``incident``.
         incident: cell K + local node, for every cell of a vertex.
     """
@@ -150,9 +150,11 @@ class PointSet:
         entries = np.flatnonzero(np.abs(points.gradients).sum(axis=(1, 3)).ravel() > 0.0)
         order = entries[np.argsort(vertex[entries], kind="stable")]
         start = np.searchsorted(vertex[order], np.arange(n_vertices + 1))
-        self.nodes = launcher.upload(points.nodes.astype(np.int32), int)
+        nodes = launcher.upload(points.nodes.astype(np.int32), int)
         shape = (-1, self.nodes_per_cell) if self.width == 1 else (-1, self.nodes_per_cell, 3)
-        self.gradients = launcher.upload(points.gradients.reshape(shape), wp.float64 if self.width == 1 else wp.vec3d)
+        kind, scalar = (VectorPoints, wp.float64) if self.width == 1 else (MatrixPoints, wp.vec3d)
+        operators = launcher.upload(points.gradients.reshape(shape), scalar)
+        self.points = struct_of(kind, nodes=nodes, operators=operators, per_cell=self.points_per_cell)
         self.start = launcher.upload(start.astype(np.int32), int)
         self.incident = launcher.upload(order.astype(np.int32), int)
 

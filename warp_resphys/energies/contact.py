@@ -582,7 +582,7 @@ class ContactTerm(Term):
         stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
         area = warp_view(self._area, wp.float64)
         obstacles = self._obstacles(values)
-        return [s.nodes, s.gradients, area, obstacles, stiffness, friction, s.points_per_cell, positions]
+        return [s.points, area, obstacles, stiffness, friction, positions]
 
     @override
     def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor]:
@@ -591,7 +591,7 @@ class ContactTerm(Term):
     @override
     def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
         own, (s,) = self.launcher, self.sets
-        inputs = [warp_view(own.active, wp.int32), s.nodes, s.gradients, self._obstacles(values), s.points_per_cell]
+        inputs = [warp_view(own.active, wp.int32), s.points, self._obstacles(values)]
         inputs += [origin, positions]
         return [own.record(kernels.bound, (own.batch, s.n_points, self._count), inputs, [share])]
 

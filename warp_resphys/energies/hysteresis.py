@@ -153,7 +153,7 @@ class HysteresisTerm(StrainTerm):
             warp_view(sliders, wp.vec2d),
             warp_view(plastic[:, :, s.own], wp.mat33d),
         ]
-        return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
+        return [s.points, *views, positions]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

@@ -102,18 +102,18 @@ class Launcher:
         """
         outputs, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
         if not self.by_cells and (s.points_per_cell == 1 or s.n_points < _MANY_POINTS):
-            inputs = [s.nodes, s.gradients, s.points_per_cell, s.start, s.incident, stress]
+            inputs = [s.points, s.start, s.incident, stress]
             return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, outputs)
         forces = [warp_view(self.zeros(s.cells * s.nodes_per_cell, 3), wp.vec3d)]
         cells, active = (self.batch, s.cells * s.nodes_per_cell), warp_view(self.active, wp.int32)
         return LaunchSequence(
-            self.record(kernels.cell_forces, cells, [active, s.gradients, s.points_per_cell, stress], forces),
+            self.record(kernels.cell_forces, cells, [active, s.points, stress], forces),
             self.record(points.gather_cells, (self.batch, out.shape[1]), [s.start, s.incident, *forces], outputs),
         )
 
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
         """Returns a launch that computes a set's stress from its tangent (B, P, blocks) and a direction (B, N)."""
-        inputs = [s.nodes, s.gradients, s.points_per_cell, tangent, direction]
+        inputs = [s.points, tangent, direction]
         kernel = points.line_tangent_product if s.width == 1 else points.tangent_product
         return self.record(kernel, (self.batch, s.n_points), inputs, [stress])
 

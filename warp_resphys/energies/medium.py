@@ -170,7 +170,7 @@ class MediumTerm(Term):
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         *places, coefficients = (value_of(values, name) for name in self.shapes)
         views = [warp_view(place, wp.vec3d) for place in places]
-        return [s.nodes, s.gradients, *views, warp_view(coefficients, wp.vec4d), s.points_per_cell, positions]
+        return [s.points, *views, warp_view(coefficients, wp.vec4d), positions]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

@@ -27,11 +27,12 @@ from typing_extensions import override
 
 from ..fem.elements import Points, physical_gradients
 from ..io.errors import InputError
+from ..kernels.points import PartValues
 from ..kernels.pointwise import pointwise_kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter
 from .base import Adjoint, Energy, PointSet, Term, Values, value_of
-from .launcher import Launcher, warp_view
+from .launcher import Launcher, struct_of, warp_view
 
 
 @dataclass(frozen=True)
@@ -115,8 +116,8 @@ class ReadingTerm(PartTerm):
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         pointers = [value_of(values, name).data_ptr() for name in self._shapes for _ in self._columns[name]]
         addresses = self.launcher.upload(np.array(pointers, dtype=np.uint64), wp.uint64)
-        read = [addresses, self._sizes, self._column]
-        return [s.nodes, s.gradients, self.weights, *read, *self._extra, s.points_per_cell, positions]
+        where = {"addresses": addresses, "sizes": self._sizes, "places": self._column}
+        return [s.points, struct_of(PartValues, weights=self.weights, **where), *self._extra, positions]
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:

@@ -96,7 +96,7 @@ class PressureTerm(PartTerm):
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        return [s.nodes, s.gradients, self.weights, self.part, *self.views(values), s.points_per_cell, positions]
+        return [s.points, self.weights, self.part, *self.views(values), positions]
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -108,7 +108,7 @@ class PressureTerm(PartTerm):
         own, (s,) = self.launcher, self.sets
         out = own.zeros(self.n_points)
         views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
-        inputs = [s.nodes, s.gradients, self.weights, s.points_per_cell, *views]
+        inputs = [s.points, self.weights, *views]
         command = own.record(kernels.adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
 
         def differentiate() -> dict[str, torch.Tensor]:

@@ -126,7 +126,7 @@ class PointInertiaTerm(Term):
 
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        return [s.nodes, s.gradients, *self._views(values), s.points_per_cell, positions]
+        return [s.points, *self._views(values), positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
@@ -142,7 +142,7 @@ class PointInertiaTerm(Term):
         own, (s,) = self.launcher, self.sets
         by_inertia, by_target = own.zeros(self.n_points), own.zeros(self.n_points, 3)
         fields = [warp_view(field, wp.vec3d) for field in (positions, direction)]
-        inputs = [s.nodes, s.gradients, *self._views(values), s.points_per_cell, *fields]
+        inputs = [s.points, *self._views(values), *fields]
         outputs = [warp_view(by_inertia, wp.float64), warp_view(by_target, wp.vec3d)]
         command = own.record(kernels.slopes, (own.batch, self.n_points), inputs, outputs)
 
@@ -189,7 +189,7 @@ class RigidityTerm(SolidTerm):
     @override
     def improve_start(self, positions: Any) -> None:
         (s,), own = self.sets, self.launcher
-        inputs = [s.nodes, s.gradients, self._centre, self._arms]
+        inputs = [s.points, self._centre, self._arms]
         own.launch(own.record(kernels.straighten, (own.batch, 1), inputs, [positions]))
 
 

@@ -32,7 +32,7 @@ from .base import (
     WholeCells,
     value_of,
 )
-from .launcher import Launcher, warp_view
+from .launcher import Launcher, struct_of, warp_view
 from .materials import Material
 from .viscosity import GreenStrain, StrainTerm, Viscosity
 
@@ -250,7 +250,7 @@ class SolidTerm(StrainTerm):
         self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
         self._moduli = len(material.rules)
         self._carried = carried
-        self._lanes = dict[PointSet, tuple[Any, Any, int] | None]()
+        self._lanes = dict[PointSet, Any]()
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
         stiff = self._curvature > 0.0
         self._stiff: torch.Tensor | slice = slice(None) if bool(stiff.all()) else stiff  # a slice copies nothing
@@ -265,13 +265,9 @@ class SolidTerm(StrainTerm):
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         stiffness, viscosity, strain, dilation = (value_of(values, name) for name in ("stiffness", *VISCOUS))
-        views = [
-            warp_view(stiffness[:, s.own], self._vector),
-            warp_view(viscosity, wp.vec2d),
-            warp_view(strain[:, s.own], wp.mat33d),
-            warp_view(dilation[:, s.own], wp.float64),
-        ]
-        return [s.nodes, s.gradients, *views, s.points_per_cell, positions]
+        at_points = {"strain_offset": strain, "dilation_offset": dilation, "stiffness": stiffness}
+        own = {name: value[:, s.own] for name, value in at_points.items()}
+        return [s.points, struct_of(self._kernels.Values, viscosity=viscosity, **own), positions]
 
     @override
     def whole_cells(self, s: PointSet, values: Values, positions: Any) -> WholeCells | None:
@@ -279,13 +275,13 @@ class SolidTerm(StrainTerm):
             return None
         if s not in self._lanes:
             self._lanes[s] = self._lane_arrays(s)
-        if (arrays := self._lanes[s]) is None:
+        if (cells := self._lanes[s]) is None:
             return None
         own = lanes.cell_kernels(self._law)
-        return WholeCells(own.step, own.tangent, [*self._arguments(s, values, positions), *arrays])
+        return WholeCells(own.step, own.tangent, [*self._arguments(s, values, positions), cells])
 
-    def _lane_arrays(self, s: PointSet) -> tuple[Any, Any, int] | None:
-        """Returns the last inputs of `kernels.lanes` for a set.
+    def _lane_arrays(self, s: PointSet) -> Any:
+        """Returns the `kernels.lanes.LaneCells` of a set.
 
         None where cells have less than two points without a volume term before the others.
         """
@@ -301,7 +297,9 @@ class SolidTerm(StrainTerm):
         together = gradients[:, chosen].reshape(s.cells, groups, width, nodes, 3).transpose(0, 1, 3, 4, 2)
         by_nodes = np.pad(gradients.reshape(-1, nodes, 3), ((0, 0), (0, -nodes % width), (0, 0)))
         by_nodes = by_nodes.reshape(s.n_points, -1, width, 3).swapaxes(2, 3)
-        return self.launcher.upload(together, lanes.lanes), self.launcher.upload(by_nodes, lanes.lanes), count
+        arrays = {"together": together, "by_nodes": by_nodes}
+        uploaded = {name: self.launcher.upload(array, lanes.lanes) for name, array in arrays.items()}
+        return struct_of(lanes.LaneCells, **uploaded, shape_points=count)
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:

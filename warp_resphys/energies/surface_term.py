@@ -129,7 +129,7 @@ class SurfaceTerm(Term):
             return field
         out = torch.zeros_like(field) if out is None else out
         (s,), own = self.sets, self.launcher
-        inputs = [self._list.vertex_array, s.nodes, s.gradients, warp_view(field.contiguous(), wp.vec3d)]
+        inputs = [self._list.vertex_array, s.points, warp_view(field.contiguous(), wp.vec3d)]
         own.launch(own.record(kernels.interpolate, (own.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]))
         return out
 

@@ -310,7 +310,7 @@ class TendonTerm(PartTerm):
         else:
             zeros, ones = self.launcher.zeros(s.n_points), self.launcher.zeros(self.count) + 1.0
             bristles, *friction = (warp_view(own, wp.float64) for own in (ones, *(zeros,) * 4))
-        runs = [s.nodes, s.gradients, self._anchors, self._first, self._rest, first, second]
+        runs = [s.points, self._anchors, self._first, self._rest, first, second]
         inputs = [active, *runs, tension, contraction, stiffness, self._toe, *friction, bristles, positions]
         outputs = [*self._pull, warp_view(self._spring, wp.vec3d), warp_view(self._friction, wp.vec3d)]
         return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
@@ -318,13 +318,13 @@ class TendonTerm(PartTerm):
     @override
     def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
         tension, _, stiffness, *_ = self.views(values)
-        runs = [s.nodes, s.gradients, self._anchors, self._first, self.part]
+        runs = [s.points, self._anchors, self._first, self.part]
         forces = [warp_view(own, wp.vec3d) for own in (self._spring, self._friction)]
         return [*runs, tension, stiffness, *self._pull, *forces, positions]
 
     @override
     def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [s.nodes, s.gradients, self._anchors, self.part, *self._pull, positions]
+        return kernels.tangent, [s.points, self._anchors, self.part, *self._pull, positions]
 
     @override
     def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
@@ -334,7 +334,7 @@ class TendonTerm(PartTerm):
             return None
         own, (s,) = self.launcher, self.sets
         if self._directions is None:
-            inputs = [s.nodes, s.gradients, self._anchors, self.part, self._pull[0], positions]
+            inputs = [s.points, self._anchors, self.part, self._pull[0], positions]
             out = [warp_view(self._direction, wp.mat33d)]
             self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
         own.launch(self._directions)
@@ -366,7 +366,7 @@ class TendonTerm(PartTerm):
         views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
         shorter = own.zeros(s.n_points)
         by_offset, longer, at_rest = (own.zeros(s.n_points, 2) for _ in range(3))
-        inputs = [s.nodes, s.gradients, self._anchors, self.part, self._rest, *self._pull, *views]
+        inputs = [s.points, self._anchors, self.part, self._rest, *self._pull, *views]
         outputs = [warp_view(shorter, wp.float64), *(warp_view(x, wp.vec2d) for x in (by_offset, longer, at_rest))]
         launches = [
             *self.before(values, views[0], warp_view(own.active, wp.int32)),

@@ -132,7 +132,7 @@ class StrainTerm(Term):
             own.record(
                 kernels.strain,
                 (own.batch, s.n_points),
-                [s.nodes, s.gradients, s.points_per_cell, view],
+                [s.points, view],
                 [warp_view(out[:, s.own], wp.mat33d)],
             )
             for s in self.sets
@@ -170,7 +170,7 @@ class StrainTerm(Term):
         place, commands = warp_view(at, wp.vec3d), []
         for s in self.sets:
             direction, view = (warp_view(values[:, s.own], wp.mat33d) for values in (along, stress))
-            inputs = [s.nodes, s.gradients, s.points_per_cell, place, direction]
+            inputs = [s.points, place, direction]
             commands.append(own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view]))
             commands.append(own.gather(s, view, out))
         recorded = own.capture(*commands)

@@ -6,11 +6,12 @@ by one around the mean motion of the piece, other pairs by another around the me
 
 import warp as wp
 
-from .surfaces import EDGE_EDGE, VERTEX_TRIANGLE, Corners, apart, nearest
+from .surfaces import EDGE_EDGE, Corners, apart, nearest
 
 wp.set_module_options({"enable_backward": False})
 
 FLAT = wp.constant(wp.float64(1e-9))  # sine of the angle below which an edge is parallel to a triangle
+NOTHING = wp.constant(wp.float64(0.0))
 SAFE = wp.constant(wp.float32(1.0 + 1e-6))  # boxes are in float32
 
 
@@ -48,6 +49,24 @@ def upper(x: wp.vec3d, r: wp.float64) -> wp.vec3:
     return -lower(-x, r)
 
 
+@wp.func
+def low_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> wp.vec3:
+    """Lower corner of the box of all places where a primitive may be, widened by more."""
+    low = lower(sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more)
+    for a in range(1, nodes.shape[0]):
+        low = wp.min(low, lower(sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more))
+    return low
+
+
+@wp.func
+def high_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> wp.vec3:
+    """Upper corner of that box."""
+    high = upper(sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more)
+    for a in range(1, nodes.shape[0]):
+        high = wp.max(high, upper(sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more))
+    return high
+
+
 @wp.kernel
 def boxes(
     sweep: Sweep,
@@ -59,14 +78,8 @@ def boxes(
     """Boxes of all places where a primitive may be."""
     b, k = wp.tid()
     i = b * nodes.shape[0] + k
-    v = nodes[k, 0]
-    low, high = lower(sweep.origin[b, v], sweep.outer[b, v]), upper(sweep.origin[b, v], sweep.outer[b, v])
-    for a in range(1, nodes.shape[1]):
-        v = nodes[k, a]
-        low = wp.min(low, lower(sweep.origin[b, v], sweep.outer[b, v]))
-        high = wp.max(high, upper(sweep.origin[b, v], sweep.outer[b, v]))
-    lower_out[i] = low
-    upper_out[i] = high
+    lower_out[i] = low_corner(sweep, b, nodes[k], NOTHING)
+    upper_out[i] = high_corner(sweep, b, nodes[k], NOTHING)
     group_out[i] = b
 
 
@@ -86,62 +99,37 @@ def may_touch(sweep: Sweep, b: int, kind: int, v: wp.vec4i) -> bool:
     return nearest(kind, 0, x).d < most
 
 
-@wp.func
-def keep(pair_keys: PairKeys, key: wp.int64):
-    """Stores the key of a pair."""
-    slot = wp.atomic_add(pair_keys.count, 0, 1)
-    if slot < pair_keys.keys.shape[0]:
-        pair_keys.keys[slot] = key
-
-
 @wp.kernel
-def vertex_triangle_pairs(
-    hierarchy: wp.uint64,
+def close_pairs(
+    kind: int,
+    hierarchy: wp.uint64,  # of the second primitives
     sweep: Sweep,
-    vertices: wp.array[int],  # (P)
-    triangles: wp.array2d[int],  # (T, 3)
+    first: wp.array2d[int],  # (P, 1) vertices, or (E, 2) edges
+    second: wp.array2d[int],  # (T, 3) triangles, or (E, 2) edges
+    offset: wp.int64,  # number of pairs of another kind, which come before
     per_environment: wp.int64,  # number of all conceivable pairs of an environment
     pair_keys: PairKeys,
 ):
-    """Pairs of a vertex and a triangle."""
-    b, p = wp.tid()
-    v = vertices[p]
-    x, r = sweep.origin[b, v], sweep.outer[b, v] + sweep.reach
-    query = wp.bvh_query_aabb(hierarchy, lower(x, r), upper(x, r), wp.bvh_get_group_root(hierarchy, b))
-    hit = wp.int32(0)
-    count = triangles.shape[0]
-    while wp.bvh_query_next(query, hit):
-        t = hit - b * count
-        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        if v != i and v != j and v != k and may_touch(sweep, b, VERTEX_TRIANGLE, wp.vec4i(v, i, j, k)):
-            keep(pair_keys, wp.int64(b) * per_environment + wp.int64(p) * wp.int64(count) + wp.int64(t))
-
-
-@wp.kernel
-def edge_edge_pairs(
-    hierarchy: wp.uint64,
-    sweep: Sweep,
-    edges: wp.array2d[int],  # (E, 2)
-    first: wp.int64,  # number of pairs of a vertex and a triangle, which come before
-    per_environment: wp.int64,
-    pair_keys: PairKeys,
-):
-    """Pairs of edges."""
-    b, e = wp.tid()
-    i, j = edges[e, 0], edges[e, 1]
-    xi, xj = sweep.origin[b, i], sweep.origin[b, j]
-    ri, rj = sweep.outer[b, i] + sweep.reach, sweep.outer[b, j] + sweep.reach
-    low, high = wp.min(lower(xi, ri), lower(xj, rj)), wp.max(upper(xi, ri), upper(xj, rj))
+    """Pairs of a vertex and a triangle, or of edges, without a vertex in common."""
+    b, i = wp.tid()
+    own = first[i]
+    low, high = low_corner(sweep, b, own, sweep.reach), high_corner(sweep, b, own, sweep.reach)
     query = wp.bvh_query_aabb(hierarchy, low, high, wp.bvh_get_group_root(hierarchy, b))
     hit = wp.int32(0)
-    count = edges.shape[0]
+    count = second.shape[0]
     while wp.bvh_query_next(query, hit):
-        f = hit - b * count
-        if f > e:
-            k, m = edges[f, 0], edges[f, 1]
-            if i != k and i != m and j != k and j != m and may_touch(sweep, b, EDGE_EDGE, wp.vec4i(i, j, k, m)):
-                key = wp.int64(e) * wp.int64(count) + wp.int64(f)
-                keep(pair_keys, wp.int64(b) * per_environment + first + key)
+        j = hit - b * count
+        other = second[j]
+        v = wp.vec4i(own[0], other[0], other[1], other[other.shape[0] - 1])
+        distinct = v[0] != v[1] and v[0] != v[2] and v[0] != v[3]
+        if kind == EDGE_EDGE:
+            v = wp.vec4i(own[0], own[1], other[0], other[1])
+            distinct = j > i and v[0] != v[2] and v[0] != v[3] and v[1] != v[2] and v[1] != v[3]
+        if distinct and may_touch(sweep, b, kind, v):
+            slot = wp.atomic_add(pair_keys.count, 0, 1)
+            if slot < pair_keys.keys.shape[0]:
+                key = wp.int64(i) * wp.int64(count) + wp.int64(j)
+                pair_keys.keys[slot] = wp.int64(b) * per_environment + offset + key
 
 
 @wp.func
@@ -163,8 +151,7 @@ def crossings(
     b, e = wp.tid()
     i, j = edges[e, 0], edges[e, 1]
     x, y = sweep.origin[b, i], sweep.origin[b, j]
-    none = wp.float64(0.0)
-    low, high = wp.min(lower(x, none), lower(y, none)), wp.max(upper(x, none), upper(y, none))
+    low, high = low_corner(sweep, b, edges[e], NOTHING), high_corner(sweep, b, edges[e], NOTHING)
     query = wp.bvh_query_aabb(hierarchy, low, high, wp.bvh_get_group_root(hierarchy, b))
     hit = wp.int32(0)
     while wp.bvh_query_next(query, hit):
@@ -174,8 +161,8 @@ def crossings(
             p, q, r = sweep.origin[b, k], sweep.origin[b, m], sweep.origin[b, n]
             from_x, from_y = side(x, p, q, r), side(y, p, q, r)
             flat = FLAT * wp.length(wp.cross(q - p, r - p)) * wp.length(y - x)
-            if from_x * from_y <= none and wp.max(wp.abs(from_x), wp.abs(from_y)) > flat:
+            if from_x * from_y <= NOTHING and wp.max(wp.abs(from_x), wp.abs(from_y)) > flat:
                 u, v, w = side(p, x, y, q), side(q, x, y, r), side(r, x, y, p)
-                if (u >= none and v >= none and w >= none) or (u <= none and v <= none and w <= none):
+                if (u >= NOTHING and v >= NOTHING and w >= NOTHING) or (u <= NOTHING and v <= NOTHING and w <= NOTHING):
                     wp.atomic_add(count_out, b, 1)
                     wp.atomic_min(edge_out, b, e)

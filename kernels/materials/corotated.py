@@ -217,13 +217,6 @@ def rotation_blocks(r: wp.mat33d, scaled: wp.mat33d, shape: wp.float64, out: wp.
 
 
 @wp.func
-def rotation_tangent(f: wp.mat33d, shape: wp.float64, out: wp.array[wp.mat33d]):
-    """Writes the blocks of the shape term, 2 mu (dF - dR), for det F > 0."""
-    r = polar_rotation(f)
-    rotation_blocks(r, TWO * shape * turning(f, r), shape, out)
-
-
-@wp.func
 def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
     """Writes the blocks of dP/dF, by singular values unless the rotation suffices."""
     if clamp or m[1] != ZERO or wp.determinant(f) < SMALLEST_STRETCH_SUM:
@@ -234,4 +227,5 @@ def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
         normal, flip, twist = second_derivatives(s, d, m[0], m[1])
         spectral_blocks(u, v, normal, flip, twist, clamp, out)
     else:
-        rotation_tangent(f, m[0], out)
+        r = polar_rotation(f)  # of the shape term, 2 mu (dF - dR)
+        rotation_blocks(r, TWO * m[0] * turning(f, r), m[0], out)

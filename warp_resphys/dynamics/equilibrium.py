@@ -1,7 +1,7 @@
 """Differentiable minimisation of an incremental potential, with an implicit adjoint."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -139,16 +139,46 @@ def equilibrium(
     Returns:
         The last iterate, and the solver's report, which says whether it converged (`check_converged`).
     """
-    values = {name: terms.values[name] for name in workspace.potential.terms.values}
-    names, main = tuple(values), (terms.target, terms.inertia, terms.force)
-    tensors = (start, fixed_positions, *main, *values.values())
+    solve = _Solve(workspace, purpose, settings, follows, tuple(workspace.potential.terms.values))
+    values = (terms.values[name] for name in solve.names)
+    tensors = (start, fixed_positions, terms.target, terms.inertia, terms.force, *values)
     needs_grad = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors[1:])
     # Forward-mode differentiation also calls the function, which raises torch's error for it.
     if needs_grad or forward_ad._current_level >= 0:
-        reports: list[SolveReport] = []
-        x: torch.Tensor = _Equilibrium.apply(workspace, purpose, settings, follows, reports, names, *tensors)
-        return x, reports[0]
-    return _solve_shards(workspace, purpose, settings, follows, names, tensors)
+        x: torch.Tensor = _Equilibrium.apply(solve, *tensors)
+        assert solve.report is not None
+        return x, solve.report
+    return solve(tensors)
+
+
+@dataclass
+class _Solve:
+    """A solve of a batch, with one thread per shard."""
+
+    workspace: Workspace
+    purpose: str
+    settings: SolverSettings
+    follows: torch.Tensor | None
+    names: tuple[str, ...]  # of the values
+    report: SolveReport | None = None
+
+    def __call__(self, inputs: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, SolveReport]:
+        """Returns the minimiser and the report for a start, fixed positions and terms."""
+        tensors = [None if tensor is None else tensor.detach() for tensor in inputs]
+        # Solvers are made here and not in the threads, because Warp captures the launches of all threads.
+        parts = [(rows, own, own.solver(self.purpose, self.settings)) for rows, own in self.workspace.parts]
+
+        def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
+            rows, own, solver = part
+            own_follows = None if self.follows is None else self.follows[rows]
+            return _solve(own, solver, own_follows, self.names, *(_rows(tensor, rows) for tensor in tensors))
+
+        assert tensors[0] is not None
+        with threads_for(tensors[0][0].numel(), len(parts)):
+            results = in_threads(solve, parts)
+        x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
+        self.report = SolveReport.of([report for _, report in results])
+        return x, self.report
 
 
 class _Equilibrium(torch.autograd.Function):
@@ -165,23 +195,10 @@ class _Equilibrium(torch.autograd.Function):
 
     @override
     @staticmethod
-    def forward(
-        ctx: Any,
-        workspace: Workspace,
-        purpose: str,
-        settings: SolverSettings,
-        follows: torch.Tensor | None,
-        reports: list[SolveReport],
-        names: tuple[str, ...],
-        start: torch.Tensor,
-        fixed_positions: torch.Tensor,
-        *terms: torch.Tensor | None,
-    ) -> torch.Tensor:
-        tensors = (start, fixed_positions, *terms)
-        x, report = _solve_shards(workspace, purpose, settings, follows, names, tensors)
-        reports.append(report)
-        ctx.workspace, ctx.names, ctx.settings = workspace, names, settings
-        ctx.save_for_backward(x, *terms)
+    def forward(ctx: Any, solve: _Solve, *tensors: torch.Tensor | None) -> torch.Tensor:
+        x, _ = solve(tensors)
+        ctx.solve = solve
+        ctx.save_for_backward(x, *tensors[2:])
         return x
 
     @override
@@ -190,51 +207,26 @@ class _Equilibrium(torch.autograd.Function):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
         x, saved = x.detach(), [None if tensor is None else tensor.detach() for tensor in saved]
-        needed = ctx.needs_input_grad[7:]
+        needed, solve = ctx.needs_input_grad[2:], ctx.solve
 
-        types = (torch.float32, torch.float64) if ctx.settings.factors == "single" else (torch.float64,)
+        types = (torch.float32, torch.float64) if solve.settings.factors == "single" else (torch.float64,)
         parts = [
-            (rows, own, [own.hessian(ctx.settings.linear_solver, dtype) for dtype in types])
-            for rows, own in ctx.workspace.parts
+            (rows, own, [own.hessian(solve.settings.linear_solver, dtype) for dtype in types])
+            for rows, own in solve.workspace.parts
         ]
         for _, own, _ in parts:
             own.potential.prepare_adjoint()
 
         def differentiate(part: tuple[slice, Workspace, list[ExactHessian]]) -> tuple[torch.Tensor | None, ...]:
             rows, own, hessians = part
-            return _adjoint(own, hessians, ctx.names, needed, *(_rows(t, rows) for t in (gradient, x, *saved)))
+            return _adjoint(own, hessians, solve.names, needed, *(_rows(t, rows) for t in (gradient, x, *saved)))
 
         try:
             with threads_for(gradient[0].numel(), len(parts)):
                 gradients = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
-        return (*([None] * 7), *map(_join_gradients, (None, *saved), zip(*gradients, strict=True)))
-
-
-def _solve_shards(
-    workspace: Workspace,
-    purpose: str,
-    settings: SolverSettings,
-    follows: torch.Tensor | None,
-    names: tuple[str, ...],
-    inputs: Sequence[torch.Tensor | None],
-) -> tuple[torch.Tensor, SolveReport]:
-    """Returns the minimiser and the report of a batch, with one thread per shard."""
-    tensors = [None if tensor is None else tensor.detach() for tensor in inputs]
-    # Solvers are made here and not in the threads, because Warp captures the launches of all threads.
-    parts = [(rows, own, own.solver(purpose, settings)) for rows, own in workspace.parts]
-
-    def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
-        rows, own, solver = part
-        own_follows = None if follows is None else follows[rows]
-        return _solve(own, solver, own_follows, names, *(_rows(tensor, rows) for tensor in tensors))
-
-    assert tensors[0] is not None
-    with threads_for(tensors[0][0].numel(), len(parts)):
-        results = in_threads(solve, parts)
-    x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
-    return x, SolveReport.of([report for _, report in results])
+        return (None, None, *map(_join_gradients, (None, *saved), zip(*gradients, strict=True)))
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:

@@ -13,56 +13,9 @@ from ..kernels import line_search
 from ..kernels import minimisation as kernels
 from ..kernels.lbfgs import lbfgs_kernels
 from ..linalg.tiled import TiledSolver
-from .assembly import HessianAssembly
 from .hessian import ExactHessian, HessianApproximation
 
 _PERTURBATIONS = 7  # random sign patterns for rounding checks
-
-
-class RecordedFactors:
-    """`hessian.ExactHessian` as recorded launches, with clamping where the Hessian is indefinite.
-
-    Args:
-        potential: potential without `low_rank` columns. `factorise` works on the environments in its
-            ``tangent_active``, and leaves only those set whose factor is not finite.
-        assembly: assembly of the Hessian in the solver's layout.
-        linear: the solver.
-        clamped: (B,) environments whose factor is of a clamped matrix.
-        right: (B, F, 3) residuals [N] that `solve` overwrites with displacements [m], in the order of the solver.
-
-    Attributes:
-        commands: all launches.
-    """
-
-    def __init__(
-        self,
-        potential: IncrementalPotential,
-        assembly: HessianAssembly,
-        linear: TiledSolver,
-        clamped: torch.Tensor,
-        right: torch.Tensor,
-    ) -> None:
-        p, b = potential, potential.batch
-        self._again = warp_view(torch.zeros(1, dtype=torch.int32, device=p.device), wp.int32)
-        masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
-        mark = p.record(kernels.mark_clamped, (b,), masks, [warp_view(clamped, wp.bool)])
-        solver = linear.record_factor(assembly.values, p.tangent_active, clamped)
-        self._factorise = [mark, p.tangent_launches, solver.clear, assembly.launches, solver.factor, solver.check]
-        self._repeat = p.record_blocks(kernels.request_clamped, 1, masks, [self._again])
-        self._solve = linear.record_solve(assembly.values, right.flatten(1))
-        self.commands = [*self._factorise, self._repeat, self._solve]
-
-    def factorise(self) -> None:
-        """Launches a factorisation at the potential's positions, and a clamped one where it failed.
-
-        Factors are not finite where the clamped matrix is not positive definite either.
-        """
-        issue(*self._factorise, self._repeat)
-        wp.capture_if(self._again, lambda: issue(*self._factorise))
-
-    def solve(self) -> None:
-        """Launches a solve."""
-        issue(self._solve)
 
 
 class Summary(NamedTuple):
@@ -177,18 +130,24 @@ class Minimiser:
         p, h, parts = self._potential, self._hessian, self._parts
         assert isinstance(h, ExactHessian)
         assert isinstance(h.linear, TiledSolver)
-        factors = RecordedFactors(p, h.assembly, h.linear, h.clamped, self._right)
+        # The factorisation works on the environments in `tangent_active`, and leaves only those set whose factor is not
+        # finite, to be factorised again with clamping; with that it is not finite where it fails.
+        again = warp_view(torch.zeros(1, dtype=torch.int32, device=p.device), wp.int32)
+        masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
+        mark = p.record(kernels.mark_clamped, (p.batch,), masks, [warp_view(h.clamped, wp.bool)])
+        solver = h.linear.record_factor(h.assembly.values, p.tangent_active, h.clamped)
+        factors = [mark, p.tangent_launches, solver.clear, h.assembly.launches, solver.factor, solver.check]
+        repeat = p.record_blocks(kernels.request_clamped, 1, masks, [again])
+        solve_factor = h.linear.record_solve(h.assembly.values, self._right.flatten(1))
         conditions = (warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields)))
         active, directions, requests, checks = conditions
 
         def factorise() -> None:
-            issue(self._select)
-            factors.factorise()
+            issue(self._select, *factors, repeat)
+            wp.capture_if(again, lambda: issue(*factors))
 
         def set_direction() -> None:
-            issue(self._project)
-            factors.solve()
-            issue(*parts.set_direction)
+            issue(self._project, solve_factor, *parts.set_direction)
 
         def advance() -> None:
             wp.capture_if(requests, factorise)
@@ -201,7 +160,7 @@ class Minimiser:
             wp.capture_while(active, advance)
 
         commands = [*parts.begin, *parts.evaluate, self._select, self._project, *parts.set_direction]
-        self._loop = p.capture_calls(solve, [*commands, self._check_rounding, *factors.commands])
+        self._loop = p.capture_calls(solve, [*commands, self._check_rounding, *factors, repeat, solve_factor])
 
     def minimise(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> None:
         """Minimises the potential; on a GPU with tiled factors, without synchronisation.

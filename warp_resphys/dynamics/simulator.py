@@ -116,8 +116,16 @@ class Simulator:
             raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
         self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
         placed = place_energies(body, self.material)
-        if any(item.energy.is_barrier for item in placed):
-            self._check_barriers()
+        barriers = any(item.energy.is_barrier for item in placed)  # through which states must not pass
+        if barriers and self.integrator == "midpoint":
+            raise InputError(
+                "integrator is midpoint, which extrapolates from the middle of a step and may penetrate: with contact, "
+                "choose implicit_euler or bdf2."
+            )
+        if barriers and settings.name == "projective_dynamics":
+            raise InputError(
+                "solver is projective_dynamics, whose constant matrix knows no contact: choose quasi_newton."
+            )
         where = (body, self._coordinates, self.rest_positions, self.method, self.time_step)
         self._energies = energies = EnergySet(placed, *where)
         eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
@@ -134,18 +142,6 @@ class Simulator:
         self._attached_mass = self.tensor(body.attached_mass)
         warn_of_implausible(body, self.materials, self.gravity, on_cpu=self.rest_positions.device.type == "cpu")
         self._built = True
-
-    def _check_barriers(self) -> None:
-        """Raises InputError for settings by which states would pass through barriers."""
-        if self.integrator == "midpoint":
-            raise InputError(
-                "integrator is midpoint, which extrapolates from the middle of a step and may penetrate: with contact, "
-                "choose implicit_euler or bdf2."
-            )
-        if self.settings.name == "projective_dynamics":
-            raise InputError(
-                "solver is projective_dynamics, whose constant matrix knows no contact: choose quasi_newton."
-            )
 
     def __repr__(self) -> str:
         """Body, names of the materials' laws, time step, integrator, dtype and device."""

@@ -95,7 +95,12 @@ def read_law(name: str) -> dict[str, Any]:
             )
         if (unit := units.get(key, unit_of(key))) != unit_of(key):
             raise DataFileError(f"{path}: units.{key} is {unit!r}: a law has {unit_of(key)!r} there.")
-    if "stretches" in known and not _is_range(known["stretches"]):
+    match known.get("stretches", [1.0, 1.0]):
+        case [float() | int() as low, float() | int() as high]:
+            ordered = bool not in (type(low), type(high)) and 0.0 < low <= high < math.inf
+        case _:
+            ordered = False
+    if not ordered:
         raise DataFileError(
             f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
         )
@@ -107,14 +112,6 @@ def unit_of(name: str) -> str:
     """Unit of a constant of a law."""
     words = {*name.split("_")}
     return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
-
-
-def _is_range(values: object) -> bool:
-    """Whether these are two stretches in order."""
-    match values:
-        case [float() | int() as low, float() | int() as high]:
-            return bool not in (type(low), type(high)) and 0.0 < low <= high < math.inf
-    return False
 
 
 def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:

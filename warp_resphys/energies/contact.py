@@ -36,7 +36,6 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import InputError, MeshError, listed
 from ..kernels import contact as kernels
@@ -251,6 +250,9 @@ class BoundContact(BoundEnergy):
         (points,) = site.points
         like, obstacles = site.rest_positions, tuple(contact.obstacles.values())
         assert isinstance(points, ContactPoints)
+        if len(site.body.symmetry) or len(site.body.glued):
+            what = "symmetry planes" if len(site.body.symmetry) else "glued vertices"
+            raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
         self._vertices = torch.as_tensor(points.nodes[:, 0], device=like.device)
         self._area = site.tensor(points.areas)
         self._factor = site.tensor(points.factors)  # (P,) of friction
@@ -266,7 +268,6 @@ class BoundContact(BoundEnergy):
             self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
         self._free = (~torch.isin(self._vertices, self._fixed)).to(self._area)  # (P,) zero at fixed vertices
-        self._check_body(site.body)
         rigid = [self._rigid_part(site, name) for name in site.body.controls]
         self._rigid = [(surface, within) for surface, within in rigid if len(surface)]  # others are out of reach
         self._check_start(like)
@@ -500,12 +501,6 @@ class BoundContact(BoundEnergy):
         pose = self._pose(Inputs(), constants, state.batch)
         gaps, _ = self._shapes.distances(state.q[:, self._vertices], pose)
         return self._pushed_out(q, pose, gaps)
-
-    def _check_body(self, body: Body) -> None:
-        """Raises InputError for a body whose vertices contact cannot move on their own."""
-        if len(body.symmetry) or len(body.glued):
-            what = "symmetry planes" if len(body.symmetry) else "glued vertices"
-            raise InputError(f"a body with {what} has no contact with obstacles: leave one of them out.")
 
     def _check_start(self, rest: torch.Tensor) -> None:
         """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""

@@ -47,13 +47,6 @@ from .viscosity import GreenStrain, StrainTerm
 PLASTIC_STRAIN: Final = "plastic_strain"
 
 
-def stuck_share(trial: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:
-    """Returns min(1, e / |A|) (B, K, P, 1, 1) for strains A (B, K, P, 3, 3) and yield strains (1 or B, K)."""
-    square, limits = trial.square().sum((-2, -1), keepdim=True), limit[..., None, None, None]
-    slides = square > limits.square()
-    return torch.where(slides, limits / torch.where(slides, square, 1.0).sqrt(), 1.0)
-
-
 @dataclass(frozen=True)
 class Hysteresis(Energy):
     """The sliders of a solid, whose constants are those of its material.
@@ -127,7 +120,11 @@ class BoundHysteresis(BoundEnergy):
         """Returns the plastic strains (B, K, P, 3, 3) at positions (B, N, 3) from those before."""
         strain = partial(GreenStrain.apply, step.term)
         trial = strain(q)[:, None].to(plastic.dtype) - plastic
-        return plastic + (1.0 - stuck_share(trial, step.constants.value("sliders")[..., 1])) * trial
+        square = trial.square().sum((-2, -1), keepdim=True)
+        limits = step.constants.value("sliders")[..., 1, None, None, None]
+        slides = square > limits.square()
+        stuck = torch.where(slides, limits / torch.where(slides, square, 1.0).sqrt(), 1.0)  # min(1, e / |A|)
+        return plastic + (1.0 - stuck) * trial
 
 
 class HysteresisTerm(StrainTerm):

@@ -206,17 +206,20 @@ class PairList:
             piece=self._piece_array,
             reach=self.reach,
         )
-        triangles, edges = self._hierarchy(motion, self._triangle_array), self._hierarchy(motion, self._edge_array)
         size = len(surface.vertices) * len(surface.triangles)
-        total = size + len(surface.edges) ** 2
+        total, vertices = size + len(surface.edges) ** 2, self.vertex_array.reshape((-1, 1))
+        faces, edges = self._triangle_array, self._edge_array
+        searches = (  # by `kernels.surfaces.VERTEX_TRIANGLE` and `EDGE_EDGE`
+            (self._hierarchy(motion, faces), vertices, faces, 0),
+            (self._hierarchy(motion, edges), edges, edges, size),
+        )
         while True:
             count = torch.zeros(1, device=own.device, dtype=torch.int32)
             keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
             pair_keys = struct_of(broad_phase.PairKeys, count=count, keys=keys)
-            inputs = [triangles.id, motion, self.vertex_array, self._triangle_array, wp.int64(total), pair_keys]
-            own.launch(own.record(broad_phase.vertex_triangle_pairs, (own.batch, len(surface.vertices)), inputs, []))
-            inputs = [edges.id, motion, self._edge_array, wp.int64(size), wp.int64(total), pair_keys]
-            own.launch(own.record(broad_phase.edge_edge_pairs, (own.batch, len(surface.edges)), inputs, []))
+            for kind, (tree, first, second, offset) in enumerate(searches):
+                inputs = [kind, tree.id, motion, first, second, wp.int64(offset), wp.int64(total), pair_keys]
+                own.launch(own.record(broad_phase.close_pairs, (own.batch, first.shape[0]), inputs, []))
             if (needed := int(count)) <= self._capacity:
                 break
             self._capacity = 2 * needed  # The list is made again.

@@ -132,11 +132,6 @@ class BoundTendons(BoundEnergy):
         """Returns the tensions (B, T) of the springs [N]."""
         return values["tendon_stiffness"] * thread_pull(geometry.longer + values["tendon_contraction"], self._toe)
 
-    def _slack(self, tension: torch.Tensor, geometry: Geometry, values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the tensions (B, P) of segments that have been pulled from slack by (B, T) [N]."""
-        decay = values["tendon_friction"][:, self._part] * geometry.turns
-        return tension[:, self._part] * torch.exp(-(decay @ self._beyond.mT))
-
     def _before(self, tension: torch.Tensor, segments: torch.Tensor) -> torch.Tensor:
         """Returns the tension (B, P) before each guide [N]."""
         before = torch.nn.functional.pad(segments[:, :-1], (1, 0))
@@ -174,7 +169,8 @@ class BoundTendons(BoundEnergy):
         """Returns friction that does not change with the slide, which makes both bounds equal to it."""
         here = self._geometry(q, values)
         tension = values["tendon_tension"] + self._spring(here, values)
-        segments = self._slack(tension, here, values)
+        decay = values["tendon_friction"][:, self._part] * here.turns
+        segments = tension[:, self._part] * torch.exp(-(decay @ self._beyond.mT))  # pulled from slack
         friction = segments - self._before(tension, segments)
         return dict(zip(STEP_VALUES, (friction, -friction, friction, here.beyond), strict=True))
 

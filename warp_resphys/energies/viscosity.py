@@ -114,13 +114,9 @@ def _scale(values: torch.Tensor, tensors: torch.Tensor) -> torch.Tensor:
 class StrainTerm(Term):
     """A term of a solid, with the Green strain at its points."""
 
-    def strain(self, positions: torch.Tensor) -> torch.Tensor:
-        """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3)."""
-        return self._strain(positions)
-
     @cached_property
-    def _strain(self) -> Callable[[torch.Tensor], torch.Tensor]:
-        """`strain`, recorded at its first use.
+    def strain(self) -> Strain:
+        """Returns the Green strain (B, P, 3, 3) at positions (B, N, 3), by launches recorded at its first use.
 
         On a CPU, the last results serve again, and must not be changed in place: with branches of Prony, a step needs
         the strain at its end, where the next one begins, and BDF2 looks back by two steps.
@@ -157,13 +153,9 @@ class StrainTerm(Term):
 
         return strain
 
-    def strain_adjoint(self, positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
-        """Returns the vector-Jacobian product (B, N, 3) of `strain` with (B, P, 3, 3)."""
-        return self._strain_adjoint(positions, adjoint)
-
     @cached_property
-    def _strain_adjoint(self) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-        """`strain_adjoint`, recorded at its first use."""
+    def strain_adjoint(self) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+        """Returns the vector-Jacobian product (B, N, 3) of `strain` at positions with (B, P, 3, 3)."""
         own = self.launcher
         at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.sets[0].n_vertices, 3)
         along, stress = own.zeros(self.n_points, 3, 3), own.zeros(self.n_points, 3, 3)

@@ -212,8 +212,11 @@ def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
     own = _one_hot(volumes)
     nothing = scipy.sparse.csr_array((m, m))
     cells = SolidPoints(mesh.cells, gradients, own, own if full else nothing)
-    sets = (cells,) if full else (cells, _vertex_patches(mesh, gradients[:, 0], quarter))
-    return Discretisation(sets, volumes[:, 0], quarter, quarter)
+    if full:
+        return Discretisation((cells,), volumes[:, 0], quarter, quarter)
+    nodes, operator = mean_gradients(mesh.cells, gradients[:, 0], quarter)
+    patches = SolidPoints(nodes, operator[:, None], scipy.sparse.csr_array((n, m)), quarter)
+    return Discretisation((cells, patches), volumes[:, 0], quarter, quarter)
 
 
 def mean_gradients(
@@ -245,12 +248,6 @@ def mean_gradients(
     nodes[row, place] = column
     padded[row, place] = operator
     return nodes, padded
-
-
-def _vertex_patches(mesh: Mesh, gradients: Array, quarter: scipy.sparse.csr_array) -> SolidPoints:
-    """Returns one point per vertex, with the mean gradient operator of the cells around it."""
-    nodes, operator = mean_gradients(mesh.cells, gradients, quarter)
-    return SolidPoints(nodes, operator[:, None], scipy.sparse.csr_array((len(nodes), len(mesh.cells))), quarter)
 
 
 def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -134,4 +134,7 @@ class Scene(Body):
                 given[name] = sample.new_zeros(shape)
             whole = torch.cat([given[name] for name in self.bodies], axis)
             fields[key] = whole if tensors else whole.numpy()
-        return Inputs.of_bodies(by_body).replace(**fields)
+        named = {f"{name}_{key}": value for name, own in by_body.items() for key, value in own.actuation.items()}
+        out = Inputs(**named)
+        out.plain |= {f"{name}_{key}" for name, own in by_body.items() for key in own.plain & own.actuation.keys()}
+        return out.replace(**fields)

@@ -33,9 +33,11 @@ class SparseSolver(LinearSolver):
 
     @override
     def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
-        if (cholespy := _cholespy()) is not None:
-            return _Cholmod(self, values, partial(self._cholmod, cholespy), idle, before)
-        return _SuperLU(self, values, self._lu, idle, before)
+        try:
+            import cholespy
+        except ModuleNotFoundError:  # wheels exist for some platforms only
+            return _SuperLU(self, values, self._lu, idle, before)
+        return _Cholmod(self, values, partial(self._cholmod, cholespy), idle, before)
 
     def _lu(self, number: int, values: torch.Tensor) -> Any:
         try:
@@ -67,15 +69,6 @@ class _Cholmod(SeparateFactors):
             solution = torch.empty_like(right)
             factor.solve(right, solution)
             part.copy_(solution.mT)
-
-
-def _cholespy() -> Any:
-    """Returns the cholespy module, or None if it is not installed (wheels exist for some platforms only)."""
-    try:
-        import cholespy
-    except ModuleNotFoundError:
-        return None
-    return cholespy
 
 
 @contextmanager

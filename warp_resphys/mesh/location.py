@@ -54,11 +54,18 @@ def _located(
     element: Element, nodes: FloatArray, low: FloatArray, high: FloatArray, points: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """The fields of the `Location` of points (P, 3) in cells (M, K, 3) with the corners (M, 3) of their boxes."""
-    near = [_nearby(low, high, point) for point in points]
+    near, last = list[IntArray](), min(_CANDIDATES, len(nodes)) - 1
+    for point in points:  # cells whose boxes are nearest
+        away = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
+        near.append(np.flatnonzero(away <= np.partition(away, last)[last]))
     cells, ends = np.concatenate(near), np.cumsum([len(own) for own in near])
     targets = np.repeat(points, np.diff(ends, prepend=0), axis=0)
     place = _reference_coordinates(element, nodes[cells], targets)
-    values, _ = element.shape(_clip_to_cell(element, place))
+    within = np.clip(place, -1.0, 1.0)
+    if element.is_simplex:
+        barycentric = np.maximum(np.column_stack([1.0 - place.sum(axis=1), place]), 0.0)
+        within = barycentric[:, 1:] / barycentric.sum(axis=1, keepdims=True)
+    values, _ = element.shape(within)
     distances = np.linalg.norm(np.einsum("ck,cki->ci", values, nodes[cells]) - targets, axis=1)
     best = [own[np.argmin(distances[own])] for own in np.split(np.arange(ends[-1]), ends[:-1])]
     cells, distances = cells[best], distances[best]
@@ -68,13 +75,6 @@ def _located(
     size = np.linalg.norm(high[cells] - low[cells], axis=1)
     outside = np.where(distances > 1e-9 * size, distances, 0.0)
     return cells, weights, gradients, np.where(error > 1e-6 * size, np.inf, outside), distances
-
-
-def _nearby(low: FloatArray, high: FloatArray, point: FloatArray) -> IntArray:
-    """The cells whose boxes are nearest to a point."""
-    distance = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
-    last = min(_CANDIDATES, len(distance)) - 1
-    return np.flatnonzero(distance <= np.partition(distance, last)[last])
 
 
 def _reference_coordinates(element: Element, nodes: Array, points: Array) -> Array:
@@ -91,11 +91,3 @@ def _reference_coordinates(element: Element, nodes: Array, points: Array) -> Arr
         if not len(left):
             break
     return place
-
-
-def _clip_to_cell(element: Element, place: Array) -> Array:
-    """Returns reference coordinates (C, 3), moved to the boundary of the reference cell if outside."""
-    if not element.is_simplex:
-        return np.clip(place, -1.0, 1.0)
-    barycentric = np.maximum(np.column_stack([1.0 - place.sum(axis=1), place]), 0.0)
-    return np.asarray(barycentric[:, 1:] / barycentric.sum(axis=1, keepdims=True))

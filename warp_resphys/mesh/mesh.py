@@ -181,7 +181,14 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
     unused = np.bincount(cells.ravel(), minlength=count) == 0
     _refuse(unused, "vertices", "belong to no cell; reading with drop_unreferenced leaves them out")
     if not cracks:
-        _refuse(_coincident(vertices), "vertices", "lie on another one, a crack between cells; merge or glue them")
+        offsets = vertices - vertices[0]
+        most = np.nextafter(COINCIDENT_DISTANCE * float(np.linalg.norm(np.ptp(offsets, axis=0))), np.inf)
+        _, nearest = cKDTree(offsets).query(offsets, k=2, distance_upper_bound=most)
+        _refuse(
+            np.asarray(nearest.min(axis=1) < np.arange(count)),
+            "vertices",
+            "lie on another one, a crack between cells; merge or glue them",
+        )
     volumes, determinants = _normalised_volumes(mesh)
     _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat; remove them or mesh the body anew")
     _refuse(determinants < DEGENERATE_VOLUME, "cells", "are inverted or folded; reorder or move their nodes")
@@ -369,14 +376,6 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
             volumes += weights[number] * determinants
         smallest = np.minimum(smallest, determinants)
     return volumes, smallest * weights.sum()
-
-
-def _coincident(vertices: FloatArray) -> NDArray[np.bool_]:
-    """Marks duplicate vertices, (N,): those that coincide with a vertex of lower index."""
-    offsets = vertices - vertices[0]
-    distance = COINCIDENT_DISTANCE * float(np.linalg.norm(np.ptp(offsets, axis=0)))
-    _, nearest = cKDTree(offsets).query(offsets, k=2, distance_upper_bound=np.nextafter(distance, np.inf))
-    return np.asarray(nearest.min(axis=1) < np.arange(len(vertices)))
 
 
 def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:

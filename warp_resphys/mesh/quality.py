@@ -3,7 +3,7 @@
 import numpy as np
 
 from .elements import ELEMENTS
-from .mesh import FloatArray, IntArray, Mesh
+from .mesh import FloatArray, Mesh
 
 
 def scaled_jacobian(mesh: Mesh) -> FloatArray:
@@ -15,7 +15,8 @@ def scaled_jacobian(mesh: Mesh) -> FloatArray:
     """
     linear = ELEMENTS[mesh.element.linear]
     corners = mesh.vertices[mesh.cells[:, : linear.nodes]]
-    spokes = np.stack([_spokes(linear.edges, corner) for corner in range(linear.nodes)])  # (corners, 3)
+    both = np.concatenate([linear.edges, linear.edges[:, ::-1]])
+    spokes = np.stack([both[both[:, 0] == corner, 1] for corner in range(linear.nodes)])  # (corners, 3)
     edges = corners[:, spokes] - corners[:, : linear.nodes, None]  # (M, corners, 3 edges, 3)
     spanned = np.einsum("qki,mkj->mqij", linear.shape(linear.shape.nodes)[1], corners)
     sizes = np.linalg.norm(edges, axis=-1).prod(axis=-1)
@@ -23,12 +24,6 @@ def scaled_jacobian(mesh: Mesh) -> FloatArray:
     if linear.nodes == 4:  # constant Jacobian, sqrt(1/2) of the product for a regular tetrahedron
         return np.asarray(np.sqrt(2.0) * np.linalg.det(spanned[:, 0]) / sizes.max(axis=1))
     return np.asarray((np.linalg.det(spanned) / lengths).min(axis=1))
-
-
-def _spokes(edges: IntArray, corner: int) -> IntArray:
-    """Returns the corners (3,) connected to a corner by edges."""
-    own = edges[(edges == corner).any(axis=1)]
-    return np.where(own[:, 0] == corner, own[:, 1], own[:, 0])
 
 
 def cell_volumes(mesh: Mesh) -> FloatArray:

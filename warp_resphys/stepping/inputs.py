@@ -90,13 +90,6 @@ class Inputs:
         out.plain |= self.plain & fields.keys()
         return out
 
-    @staticmethod
-    def of_bodies(parts: Mapping[str, "Inputs"]) -> "Inputs":
-        """Returns the inputs of all bodies' energies, with names that begin with those of the bodies."""
-        out = Inputs(**{f"{name}_{key}": value for name, own in parts.items() for key, value in own.actuation.items()})
-        out.plain |= {f"{name}_{key}" for name, own in parts.items() for key in own.plain & own.actuation.keys()}
-        return out
-
     @property
     def fields(self) -> dict[str, torch.Tensor]:
         """All fields that are set, by name."""

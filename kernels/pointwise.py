@@ -19,7 +19,6 @@ from typing import Any
 
 import warp as wp
 
-from .matrices import symmetric_eigen
 from .modules import named_module
 from .points import MatrixPoints, PartValues, VectorPoints, matrix_at, value_reader, vector_at
 
@@ -74,12 +73,12 @@ def without_negative_eigenvalues(h: mat99) -> mat99:
 
 
 @wp.func
-def write_blocks(hessian: mat99, clamp: bool, out: wp.array[wp.mat33d]):
-    """Writes the six blocks of a second derivative whose rows and columns are ordered by column and row of F."""
+def write_blocks(hessian: mat99, columns: int, clamp: bool, out: wp.array[wp.mat33d]):
+    """Writes the blocks of a second derivative by F, or by its first column, ordered by column and row of F."""
     hessian = HALF * (hessian + wp.transpose(hessian))
     if clamp:
         hessian = without_negative_eigenvalues(hessian)
-    for m in range(3):
+    for m in range(columns):
         for n in range(m + 1):
             block = wp.mat33d()
             for i in range(3):
@@ -96,6 +95,7 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
     # Unrolled, the loops below would take minutes to compile.
     wp.set_module_options({"max_unroll": 1}, module)
     line = shape is wp.vec3d
+    columns = wp.constant(1 if line else 3)
     see, points_type, inner = (vector_at, VectorPoints, wp.dot) if line else (matrix_at, MatrixPoints, wp.ddot)
     read_values = value_reader(vector)
 
@@ -141,80 +141,50 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
             result = (-values.weights[p] / (TWELVE * h)) * result
         values_out[b, p] = result
 
-    tangent = (_line_tangent if line else _tangent)(density, vector, module, read_values)
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)
+    @wp.func(module=module)
+    def moved(f: shape, j: int, n: int, by: wp.float64) -> shape:
+        """Returns f with a change of the entry in row j and column n."""
+        if wp.static(line):
+            f[j] = f[j] + by
+        else:
+            f[j, n] = f[j, n] + by
+        return f
 
-
-def _line_tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> Any:
-    """Returns the tangent kernel for a vector, with one block."""
+    @wp.func(module=module)
+    def entry(stress: shape, j: int, n: int) -> wp.float64:
+        """Returns the entry in row j and column n."""
+        if wp.static(line):
+            value = stress[j]
+        else:
+            value = stress[j, n]
+        return value
 
     @wp.kernel(module=module)
     def tangent(
         active: wp.array[int],
         clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        points: VectorPoints,
+        points: points_type,
         values: PartValues,
         size: wp.float64,
         positions: wp.array2d[wp.vec3d],
-        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
+        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6), or (B, P, 1) for a vector
     ):
         b, p = wp.tid()
         if active[b] == 0:
             return
         v = read_values(values, b, p)
-        x = vector_at(points, positions, b, p)
-        h = STEP * size
-        rows = wp.mat33d()
-        for n in range(3):
-            slope = wp.vec3d()
-            for k in range(4):
-                moved = x
-                moved[n] = x[n] + OFFSETS[k] * h
-                stress, _by_values = wp.grad(density)(moved, v)
-                slope += SHARES[k] * stress
-            for i in range(3):
-                rows[n, i] = slope[i]
-        block = (HALF * values.weights[p] / (TWELVE * h)) * (rows + wp.transpose(rows))
-        if clamp[b] != 0:
-            q, e = symmetric_eigen(block)
-            positive = wp.diag(wp.vec3d(wp.max(e[0], ZERO), wp.max(e[1], ZERO), wp.max(e[2], ZERO)))
-            block = q * positive * wp.transpose(q)
-        tangent_out[b, p, 0] = block
-
-    return tangent
-
-
-def _tangent(density: Any, vector: Any, module: wp.Module, read_values: Any) -> Any:
-    """Returns the tangent kernel for a matrix, with six blocks."""
-
-    @wp.kernel(module=module)
-    def tangent(
-        active: wp.array[int],
-        clamp: wp.array[int],
-        points: MatrixPoints,
-        values: PartValues,
-        size: wp.float64,
-        positions: wp.array2d[wp.vec3d],
-        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
-    ):
-        b, p = wp.tid()
-        if active[b] == 0:
-            return
-        v = read_values(values, b, p)
-        f = matrix_at(points, positions, b, p)
+        f = see(points, positions, b, p)
         scale = values.weights[p] / (TWELVE * STEP * size)
         hessian = mat99()
-        for n in range(3):
+        for n in range(columns):
             for j in range(3):
-                slope = wp.mat33d()
+                slope = shape()
                 for k in range(4):
-                    moved = f
-                    moved[j, n] = f[j, n] + OFFSETS[k] * STEP * size
-                    stress, _by_values = wp.grad(density)(moved, v)
+                    stress, _by_values = wp.grad(density)(moved(f, j, n, OFFSETS[k] * STEP * size), v)
                     slope += SHARES[k] * stress
-                for m in range(3):
+                for m in range(columns):
                     for i in range(3):
-                        hessian[3 * n + j, 3 * m + i] = scale * slope[i, m]
-        write_blocks(hessian, clamp[b] != 0, tangent_out[b, p])
+                        hessian[3 * n + j, 3 * m + i] = scale * entry(slope, i, m)
+        write_blocks(hessian, columns, clamp[b] != 0, tangent_out[b, p])
 
-    return tangent
+    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)

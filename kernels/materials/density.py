@@ -105,7 +105,7 @@ def density_law(name: str, energy_density: Any, volume_energy: Any) -> Law:
                 for c in range(3):
                     for i in range(3):
                         hessian[3 * n + j, 3 * c + i] = slope[i, c] / (TWELVE * STEP)
-        write_blocks(hessian, clamp, out)
+        write_blocks(hessian, 3, clamp, out)
 
     lame = ((0.0, 0.0), (0.0, 0.0), (1.0, 0.0), (0.0, 1.0), *((0.0, 0.0),) * count)
     return Law(name, lame, moduli, response, slopes, tangent)

@@ -153,7 +153,7 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
     @wp.func(module=module)
     def entry(stress: shape, j: int, n: int) -> wp.float64:
         """Returns the entry in row j and column n."""
-        if wp.static(line):
+        if wp.static(line):  # noqa: SIM108  # Warp has no other branches that are left out.
             value = stress[j]
         else:
             value = stress[j, n]

@@ -25,7 +25,7 @@ import warp as wp
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import MarkerMap
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.reconstruction import make_reconstructor
 from warp_resphys.learning.rollout import Rollout, closed_loop
 from warp_resphys.settings.learning import NetworkSettings
@@ -104,7 +104,7 @@ print(f"largest resultant force on the body: {force.sum(2).norm(dim=-1).max():.2
 # %%
 samples = [series[:STEPS, train].flatten(0, 1) for series in (motion.q, motion.v, force)]
 network = NetworkSettings(position_modes=4, velocity_modes=4, force_modes=8, layers=2, width=64, activation="silu")
-model = build_model(network, simulator.rest_positions, *samples)
+model = build_model(ResidualForce, network, simulator.rest_positions, *samples)
 
 q, v, f = samples
 with torch.no_grad():

@@ -14,7 +14,7 @@ from warp_resphys.control.polynomials import Polynomial, powers
 from warp_resphys.control.reduced_force import Evaluator
 from warp_resphys.control.reference import Path
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.rollout import Range
 from warp_resphys.settings.control import LimitsOfInputs
 from warp_resphys.settings.learning import NetworkSettings
@@ -105,7 +105,9 @@ class TestEvaluator:
         samples = torch.randn(20, 4, 3, dtype=torch.float64)
         config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 5, "blocks": blocks,
                   "layers": 2, "width": 16, "activation": activation}  # fmt: skip
-        network = build_model(NetworkSettings(**config), samples[0], samples, samples, samples, samples[:, 0]).double()
+        network = build_model(
+            ResidualForce, NetworkSettings(**config), samples[0], samples, samples, samples, samples[:, 0]
+        ).double()
         network.fit_linear(torch.randn(40, 8), torch.randn(40, 5), 0.1)
         inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
         range_ = Range.of(torch.randn(30, 8, dtype=torch.float64))

@@ -9,7 +9,7 @@ import torch
 from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, best_order, powers
 from warp_resphys.control.reduced import ReducedModel
 from warp_resphys.control.reduced_force import ReducedForce
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.rollout import Range
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
@@ -32,7 +32,7 @@ def model(request):
 
     conditions = torch.randn(20, PARTS * (1 + len(FILTERS)), dtype=torch.float64)
     samples = torch.randn(20, 6, 3, dtype=torch.float64)
-    network = build_model(NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions)
+    network = build_model(ResidualForce, NetworkSettings(**NETWORK), samples[0], samples, samples, samples, conditions)
     network = network.double().requires_grad_(False)
     missed, times = (torch.ones(1, 2, dtype=torch.float64), (0.02, 0.3)) if request.param == "bdf2" else (None, ())
     seen = np.zeros((6, 2 * MODES))

@@ -15,7 +15,7 @@ from warp_resphys.experiment.experiment import at_steps
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.replay import Replay, Start, Windows
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.stepping.inputs import Inputs
@@ -116,7 +116,7 @@ def network(seed=0, **changes):
     rest = simulator().rest_positions
     q, v, force = (1e-2 * torch.randn(12, *rest.shape, dtype=torch.float64) for _ in range(3))
     return build_model(
-        NetworkSettings(**{**NETWORK, **changes}), rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)
+        ResidualForce, NetworkSettings(**{**NETWORK, **changes}), rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)
     ).double()
 
 
@@ -274,6 +274,7 @@ class TestWindows:
         real, trials, start, windows = self.released("implicit_euler")
         torch.manual_seed(0)
         model = build_model(
+            ResidualForce,
             NetworkSettings(**NETWORK),
             torch.as_tensor(MESH.vertices),
             windows.q.flatten(0, 1),

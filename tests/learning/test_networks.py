@@ -11,7 +11,7 @@ from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
-from warp_resphys.learning.networks import NextState, ResidualForce, SkipMLP, build_model, build_next_state, restore
+from warp_resphys.learning.networks import NextState, ResidualForce, SkipMLP, build_model, restore
 from warp_resphys.learning.rollout import LearnedPredictor, Range
 from warp_resphys.settings.learning import NetworkSettings
 
@@ -37,7 +37,7 @@ def field(samples, vertices=6, rank=None, seed=0):
 def built(kind):
     torch.manual_seed(0)
     rest, q, v, force = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2), field(40, seed=3)
-    return build_model(KINDS[kind], rest, rest + q, v, force), rest + q, v, force
+    return build_model(ResidualForce, KINDS[kind], rest, rest + q, v, force), rest + q, v, force
 
 
 class TestSkipMLP:
@@ -135,11 +135,12 @@ class TestResidualForce:
 class TestActuation:
     LOADS = torch.tensor([[0.0, 0.0], [0.05, 0.0], [0.1, 0.0]], dtype=torch.float64).repeat(14, 1)[:40]
 
-    def built(self, build=build_model, **changes):
+    def built(self, kind=ResidualForce, **changes):
         torch.manual_seed(0)
         rest, q, v = field(1, seed=5)[0], field(40, seed=1), field(40, seed=2)
-        fields = (rest, rest + q, v, *([field(40, seed=3)] if build is build_model else []))
-        return build(KINDS["reduced"].changed(**changes), *fields, self.LOADS), rest + q, v
+        force = field(40, seed=3) if kind is ResidualForce else None
+        model = build_model(kind, KINDS["reduced"].changed(**changes), rest, rest + q, v, force, self.LOADS)
+        return model, rest + q, v
 
     def test_it_is_in_units_of_its_size_and_none_stays_zero(self):
         coded = actuation_coder(self.LOADS).encode(self.LOADS)
@@ -147,9 +148,9 @@ class TestActuation:
         assert not coded[0].any()
         assert not coded[:, 1].any()
 
-    @pytest.mark.parametrize(("kind", "build"), [(ResidualForce, build_model), (NextState, build_next_state)])
-    def test_round_trip_in_double_precision(self, tmp_path, kind, build):
-        model, q, v = self.built(build)
+    @pytest.mark.parametrize("kind", [ResidualForce, NextState])
+    def test_round_trip_in_double_precision(self, tmp_path, kind):
+        model, q, v = self.built(kind)
         model = model.double().eval()
         write_checkpoint(tmp_path / "model.safetensors", "test", model.state_dict(), model.description())
         again = restore(kind, *read_checkpoint(tmp_path / "model.safetensors", "test"))
@@ -158,9 +159,9 @@ class TestActuation:
                 assert torch.equal(one, other)
             assert not torch.equal(model.predict(q, v, self.LOADS)[0], model.predict(q, v, 2.0 * self.LOADS)[0])
 
-    @pytest.mark.parametrize("build", [build_model, build_next_state])
-    def test_inputs_outside_the_training_range_are_clamped(self, build):
-        model, q, v = self.built(build)
+    @pytest.mark.parametrize("kind", [ResidualForce, NextState])
+    def test_inputs_outside_the_training_range_are_clamped(self, kind):
+        model, q, v = self.built(kind)
         model = model.double().eval()
         with torch.no_grad():
             held = Range.of(model.encode(q, v, self.LOADS))
@@ -217,7 +218,9 @@ def test_a_network_without_velocity_inputs_is_restored_with_its_dual_modes():
     q, v, force = (1e-3 * torch.randn(20, n, 3, generator=random, dtype=torch.float64) for _ in range(3))
     sizes = {"position_modes": 3, "velocity_modes": 0, "force_modes": 2}
     config = NetworkSettings(**sizes, blocks=1, layers=1, width=8, activation="silu")
-    model = build_model(config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
+    model = (
+        build_model(ResidualForce, config, rest, rest + q, v, force, stiffness=RestStiffness(simulator)).double().eval()
+    )
     torch.testing.assert_close(model(rest + q, v), model(rest + q, 10.0 * v))
     assert not torch.equal(model(rest + 2.0 * q, v), model(rest + q, v))
     again = restore(ResidualForce, model.state_dict(), model.description())

@@ -7,7 +7,7 @@ import torch
 
 from warp_resphys import State
 from warp_resphys.experiment.models import Learned
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.rollout import LearnedPredictor, Range
 from warp_resphys.settings.learning import NetworkSettings
 
@@ -29,7 +29,7 @@ def trained():
     torch.manual_seed(0)
     (u, by_u), (v, by_v), (force, _) = motion(3, 1), motion(2, 2), motion(4, 3)
     rest = torch.rand(VERTICES, 3, dtype=torch.float64)
-    model = build_model(REDUCED, rest, rest + u, v, force).double().eval()
+    model = build_model(ResidualForce, REDUCED, rest, rest + u, v, force).double().eval()
     return model, rest + u, v, by_u, by_v
 
 

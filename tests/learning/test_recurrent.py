@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.rollout import LearnedPredictor
 from warp_resphys.learning.training import Samples, SequenceTrainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
@@ -60,7 +60,7 @@ def trained(recurrent):
     torch.manual_seed(0)
     train, held_out = series(1), series(2)
     model = build_model(
-        NetworkSettings(**{**NETWORK, "recurrent": recurrent}), REST, train.q, train.v, train.outputs[0]
+        ResidualForce, NetworkSettings(**{**NETWORK, "recurrent": recurrent}), REST, train.q, train.v, train.outputs[0]
     )
     trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TrainerSettings(**TRAINER), 0)
     while not trainer.finished:
@@ -114,7 +114,7 @@ def test_an_interrupted_training_goes_on_with_the_same_losses():
 
     def trainer():
         torch.manual_seed(0)
-        model = build_model(NetworkSettings(**NETWORK), REST, train.q, train.v, train.outputs[0])
+        model = build_model(ResidualForce, NetworkSettings(**NETWORK), REST, train.q, train.v, train.outputs[0])
         return SequenceTrainer(
             model, train, held_out, lambda _: 0.0, TrainerSettings(**{**TRAINER, "epochs": 6, "noise": 1e-3}), 0
         )

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.learning.networks import build_next_state
+from warp_resphys.learning.networks import NextState, build_model
 from warp_resphys.learning.rollout import DIVERGENCE_DISTANCE, LearnedPredictor, Rollout, closed_loop
 from warp_resphys.settings.learning import NetworkSettings
 
@@ -47,7 +47,7 @@ def linear_model(system, kind):
     """Its linear part fitted, its network silent."""
     torch.manual_seed(0)
     now, following = (system.state(z) for z in system.samples())
-    model = build_next_state(NETWORKS[kind], REST, *now)
+    model = build_model(NextState, NETWORKS[kind], REST, *now)
     model.fit_linear(model.encode(*now), model.encode_outputs(following[0] - REST, following[1]), 1e-6)
     model.remainder.zero_()
     return model.eval()

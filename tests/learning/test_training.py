@@ -6,7 +6,7 @@ import torch
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.networks import build_model
+from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
@@ -46,7 +46,9 @@ def rollout_error(model):
 
 def trainer(seed=0, error=rollout_error, **settings):
     torch.manual_seed(seed)
-    model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.outputs[0])
+    model = build_model(
+        ResidualForce, NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, TRAIN.outputs[0]
+    )
     return Trainer(model, TRAIN, VALIDATION, error, TrainerSettings(**{**CONFIG, **settings}), seed)
 
 
@@ -174,7 +176,7 @@ def test_outputs_are_weighted_by_their_deviation(exponent, smallest):
     """With the power one, the validation loss is the squared error of the forces themselves, in units of theirs."""
     forces = TRAIN.outputs[0] * torch.tensor([1.0, 1.0, 1.0, 0.1])[:, None]
     torch.manual_seed(0)
-    model = build_model(NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces)
+    model = build_model(ResidualForce, NETWORK, torch.zeros(4, 3, dtype=torch.float64), TRAIN.q, TRAIN.v, forces)
     data = [replace(samples, outputs=(forces[: len(samples.q)],)) for samples in (TRAIN, VALIDATION)]
     run = Trainer(model, *data, rollout_error, TrainerSettings(**{**CONFIG, "scale_weight": exponent}), 0)
     loss = run.run_epoch()["validation_loss"]

@@ -14,7 +14,7 @@ from ..io.files import read_array, read_hdf5, resume_checkpoint, write_checkpoin
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
-from ..learning.networks import ResidualForce, StateMap, build_model, build_next_state
+from ..learning.networks import ResidualForce, StateMap, build_model
 from ..learning.replay import Replay, Windows
 from ..learning.rollout import Range
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
@@ -125,11 +125,10 @@ def new_network(experiment: Experiment, model: str, train: Samples, settings: Tr
     if not experiment.moving(experiment.settings.split.train):
         network = _limited(network, len(train.q), model)
     torch.manual_seed(settings.seed)
-    if model == SIMFREE:
-        return build_next_state(network, rest, train.q, train.v, train.actuation)
-    by_displacement = network.kind == "reduced" and network.force_basis == "displacement"
+    by_displacement = model != SIMFREE and network.kind == "reduced" and network.force_basis == "displacement"
     stiffness = RestStiffness(experiment.model_simulator(model)) if by_displacement else None
-    return build_model(network, rest, train.q, train.v, train.outputs[0], train.actuation, stiffness)
+    force = None if model == SIMFREE else train.outputs[0]
+    return build_model(kind_of(model)[0], network, rest, train.q, train.v, force, train.actuation, stiffness)
 
 
 def _limited(network: NetworkSettings, poses: int, model: str) -> NetworkSettings:

@@ -202,7 +202,7 @@ def fit_force(
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         fields = samples.q, samples.v, samples.outputs[0], samples.actuation
-        model = build_model(network, simulator.rest_positions, *fields)
+        model = build_model(ResidualForce, network, simulator.rest_positions, *fields)
     trained = Trainer(model, samples, samples, rollout_error, trainer, seed)
     while not trained.finished:
         trained.run_epoch()

@@ -287,23 +287,28 @@ class NextState(StateMap):
         return [self.rest + displacement, velocity], hidden
 
 
+Model = TypeVar("Model", bound=StateMap)
+
+
 def build_model(
+    kind: type[Model],
     settings: NetworkSettings,
     rest: torch.Tensor,
     q: torch.Tensor,
     v: torch.Tensor,
-    force: torch.Tensor,
+    force: torch.Tensor | None = None,
     actuation: torch.Tensor | None = None,
     stiffness: RestStiffness | None = None,
-) -> ResidualForce:
-    """Returns an untrained residual force, with coders from training samples.
+) -> Model:
+    """Returns an untrained model, with coders from training samples.
 
     Args:
+        kind: `ResidualForce`, or `NextState`, which has the same coders for inputs and outputs.
         settings: kind and size of the network.
         rest: (N, 3) rest positions [m].
         q: (S, N, 3) positions [m].
         v: (S, N, 3) velocities [m/s].
-        force: (S, N, 3) residual forces [N].
+        force: (S, N, 3) residual forces [N]; None for a next state.
         actuation: (S, A) further inputs of the network, or None.
         stiffness: of the body at rest, for a ``reduced`` network with modes of the static displacements; with modes of
             the forces themselves if None.
@@ -311,40 +316,21 @@ def build_model(
     Raises:
         InputError: sizes that do not fit the samples.
     """
-    position, velocity = _state_coders(settings, q - rest, v)
-    if settings.kind == "reduced":
-        modes = settings.force_modes
-        coder = pod_coder(force, modes) if stiffness is None else displacement_coder(force, stiffness, modes)
+    reduced, modes = settings.kind == "reduced", (settings.position_modes, settings.velocity_modes)
+    position, velocity = (
+        (pod_coder(field, count) if count else empty_coder(field)) if reduced else nodal_coder(field)
+        for field, count in zip((q - rest, v), modes, strict=True)
+    )
+    if force is None:
+        coders = copy.deepcopy([position, velocity])
+    elif not reduced:
+        coders = [nodal_coder(force)]
+    elif stiffness is None:
+        coders = [pod_coder(force, settings.force_modes)]
     else:
-        coder = nodal_coder(force)
+        coders = [displacement_coder(force, stiffness, settings.force_modes)]
     actuated = None if actuation is None else actuation_coder(actuation)
-    return ResidualForce(rest, position, velocity, {"force": coder}, settings, actuated)
-
-
-def build_next_state(
-    settings: NetworkSettings,
-    rest: torch.Tensor,
-    q: torch.Tensor,
-    v: torch.Tensor,
-    actuation: torch.Tensor | None = None,
-) -> NextState:
-    """Returns an untrained next-state network with the same coders for inputs and outputs; see `build_model`."""
-    position, velocity = _state_coders(settings, q - rest, v)
-    outputs = dict(zip(NextState.fields, copy.deepcopy((position, velocity)), strict=True))
-    actuated = None if actuation is None else actuation_coder(actuation)
-    return NextState(rest, position, velocity, outputs, settings, actuated)
-
-
-def _state_coders(settings: NetworkSettings, u: torch.Tensor, v: torch.Tensor) -> tuple[Coder, Coder]:
-    """Coders of displacements and velocities."""
-    if settings.kind == "reduced":
-        pairs = ((u, settings.position_modes), (v, settings.velocity_modes))
-        position, velocity = (pod_coder(field, modes) if modes else empty_coder(field) for field, modes in pairs)
-        return position, velocity
-    return nodal_coder(u), nodal_coder(v)
-
-
-Model = TypeVar("Model", bound=StateMap)
+    return kind(rest, position, velocity, dict(zip(kind.fields, coders, strict=True)), settings, actuated)
 
 
 def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description: Mapping[str, Any]) -> Model:

@@ -68,12 +68,6 @@ class Start:
         shift = None if self.shift is None else self.shift[pick]
         return replace(self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift)
 
-    def to(self, like: torch.Tensor) -> "Start":
-        """The start on the device and in the precision of a tensor."""
-        shift = None if self.shift is None else self.shift.to(like)
-        state = self.state.map(lambda t: t.to(like))
-        return replace(self, state=state, delay=self.delay.to(like), shift=shift)
-
     def shifted(self, markers: torch.Tensor) -> torch.Tensor:
         """(..., R, T, M, 3) true marker positions, from those of bound markers [m]."""
         return markers if self.shift is None else markers + self.shift[:, None]

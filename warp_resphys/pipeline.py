@@ -71,27 +71,8 @@ from .report.verdict import verdict
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
 from .settings.run import RunSettings
-from .settings.stages import (
-    BaselinesStage,
-    DriveStage,
-    EvaluateStage,
-    IdentifyLawStage,
-    IdentifyStage,
-    ImportStage,
-    LaboratoryStage,
-    LearningStage,
-    MeshCheckStage,
-    PlanStage,
-    PlayedSettings,
-    ReconstructStage,
-    ReduceStage,
-    ReportStage,
-    ShapesStage,
-    SimulateStage,
-    TimeStage,
-    TrainStage,
-)
-from .settings.trials import Split, Trial
+from .settings.stages import LEARNING, NETWORKS, LaboratoryStage, PlayedSettings, ReportStage, StageSettings
+from .settings.trials import ReadingSettings, Split, Trial
 
 log = logging.getLogger(__name__)
 
@@ -134,11 +115,12 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
     """
     files, trials, data = files_read(run, run), trials_of(run), run.recorded
     if data is None:
-        simulated = SimulateStage.of(run, files=files_read(run, run, run.target), trials=trials)
+        simulated = StageSettings.reading(run, "target", "data", files=files_read(run, run, run.target), trials=trials)
         return [Stage("simulate", simulate, (DATASET,), simulated)]
     stages, upstream = list[Stage](), tuple[str, ...]()
     learned = None if folds_of(run) is not None else split_of(run).train + split_of(run).validation
-    imported = ImportStage.of(run, files=files, trials=trials, learned=learned)
+    own = {"data": ReadingSettings.of(data), "files": files, "trials": trials, "learned": learned}
+    imported = StageSettings.reading(run, "payload_at", "simulation", "markers", **own)
     if run.is_laboratory:
         stages.append(_laboratory_stage("laboratory", run, trials))
         upstream = ("laboratory",)
@@ -191,21 +173,24 @@ def learning_stages(
     common = {"files": files_read(run, run), "shared": shared, "acquired": acquired, "split": split}
     stages: list[Stage] = []
 
-    def add(name: str, work: Work, outputs: tuple[str, ...], settings: LearningStage, *upstream: str) -> None:
+    def of(*keys: str, **values: Any) -> StageSettings:
+        return StageSettings.reading(run, *LEARNING, *keys, **common, **values)
+
+    def add(name: str, work: Work, outputs: tuple[str, ...], settings: StageSettings, *upstream: str) -> None:
         stages.append(Stage(name, work, outputs, settings, (*needs, *upstream)))
 
     if run.identify is not None:
-        before = IdentifyStage.of(run, **common).model_copy(update={"with_law": False})
+        before = of("identify", "seed").model_copy(update={"with_law": False})
         stages.append(Stage("identify", identify, (IDENTIFICATION,), before))
     if run.law is not None:
         given = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
-        of_law = IdentifyLawStage.of(run, **common)
+        of_law = of(*needs, "law", "name")
         of_law = of_law.model_copy(update={"files": of_law.files | given})
         add("identify_law", identify_law, (LAW_FILE,), of_law)
         needs = (*needs, "identify_law")
     if run.shapes:
         assert run.data.steps is not None
-        others = ShapesStage.of(run, **common, steps=run.data.steps)
+        others = of("target", "shapes", steps=run.data.steps)
         bodies = [own for shape in run.shapes.values() for own in (shape, shape.target_body)]
         others = others.model_copy(update={"files": {**others.files, **files_read(run, *bodies)}})
         add("shapes", try_shapes, (SHAPES,), others)
@@ -213,12 +198,12 @@ def learning_stages(
     learned = []
     for model in [model for model in run.models if model in LEARNED and model != SIMFREE]:
         first, second = f"reconstruct_{model}", f"train_{model}"
-        forces = ReconstructStage.of(run, **common, model=model, reconstructed=reconstructed)
+        forces = of("reconstruction", model=model, reconstructed=reconstructed)
         add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), forces)
-        trained = TrainStage.of(run, **common, model=model, training=run.training(model))
+        trained = of(*NETWORKS, model=model, training=run.training(model))
         add(second, train, (weights_file(model), training_file(model)), trained, first)
         learned.append(stages[-1].name)
-    trained = TrainStage.of(run, **common, model=SIMFREE, training=run.training(SIMFREE))
+    trained = of(*NETWORKS, model=SIMFREE, training=run.training(SIMFREE))
     if run.markers is None and run.target is not None:
         # With observed states, a network that replaces the simulator does not depend on it.
         without = {"simulation": run.target.material, "identified": None, "with_law": False}
@@ -226,16 +211,18 @@ def learning_stages(
     outputs = (weights_file(SIMFREE), training_file(SIMFREE))
     add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
     learned.append("train_simfree")
-    tested = {**common, "groups": test_groups(run, split)}
+    groups = test_groups(run, split)
     calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
-    work, evaluated = partial(evaluate, workers=workers), EvaluateStage.of(run, **tested, calibration=calibration)
-    add("evaluate", work, (ROLLOUTS, ERRORS), evaluated, *learned, "reconstruct_resphys")
+    keys = (*NETWORKS, "published", "correct_uncorrected", "horizons")
+    evaluated = of(*keys, groups=groups, calibration=calibration)
+    add("evaluate", partial(evaluate, workers=workers), (ROLLOUTS, ERRORS), evaluated, *learned, "reconstruct_resphys")
+    targets = () if run.target is None else ("target",)
     if run.timing:
-        add("time", time_models, (TIMES,), TimeStage.of(run, **tested), *learned)
+        add("time", time_models, (TIMES,), of(*NETWORKS, *targets, groups=groups), *learned)
     if run.mesh_check is not None:
-        add("mesh_check", check_mesh, (MESH_CHECK,), MeshCheckStage.of(run, **tested))
+        add("mesh_check", check_mesh, (MESH_CHECK,), of(*NETWORKS, "mesh_check", groups=groups))
     if run.control is not None:
-        stages += control_stages(run, run.control, common, workers)
+        stages += control_stages(run, run.control, of, workers)
     last = tuple(stage.name for stage in stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive"))
     shown = ReportStage(config=run, acquired=acquired)
     stages.append(Stage("report", make_report, (REPORT,), shown, last))
@@ -243,32 +230,31 @@ def learning_stages(
 
 
 def control_stages(
-    run: RunSettings, control: ControlSettings, common: Mapping[str, Any], workers: Workers
+    run: RunSettings, control: ControlSettings, of: Callable[..., StageSettings], workers: Workers
 ) -> list[Stage]:
     """Returns the stages of control: plans on the models, and with a simulated laboratory, driven motions.
 
     Args:
         run: settings that `check_run` accepts.
         control: its group ``control``.
-        common: settings that all stages of the split share.
+        of: makes the settings of a stage of the split.
         workers: of the driven motions.
     """
     stages, last = list[Stage](), control.models[-1]
     figures = FigureSettings.of(control)
     for model in reversed(control.models):  # The last model must reach the paths, so it is checked first.
         first = f"reduce_{model}"
-        reduced = ReduceStage.of(run, **common, model=model, reduction=control.reduction)
+        reduced = of("seed", model=model, reduction=control.reduction)
         stages.append(Stage(first, reduce_robot, (reduced_file(model),), reduced, ("evaluate",)))
         tables = [plan_table(model, motion) for motion in motions_of(control)]
-        planned = PlanStage.of(run, **common, model=model, figures=figures, plan=control.plan, must_reach=model == last)
+        planned = of(model=model, figures=figures, plan=control.plan, must_reach=model == last)
         stages.append(Stage(f"plan_{model}", plan_motions, (plans_file(model), *tables), planned, (first,)))
     if run.laboratory is None:
         return stages
     played, needs = _played(run), tuple(stage.name for stage in stages)
-    own = {"model": last, "figures": figures, "feedback": control.feedback, "played": played}
-    settings = BaselinesStage.of(run, **common, **own)
+    settings = of(model=last, figures=figures, feedback=control.feedback, played=played)
     stages.append(Stage("baselines", fit_baselines, (BASELINES,), settings, ("evaluate",)))
-    driven = DriveStage.of(run, **common, played=played)
+    driven = of("control", played=played)
     work = partial(drive, workers=workers)
     stages.append(Stage("drive", work, (DRIVEN, CONTROL), driven, (*needs, "baselines")))
     return stages

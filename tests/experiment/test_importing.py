@@ -26,7 +26,8 @@ from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import ImportStage, PlayedSettings
+from warp_resphys.settings.stages import PlayedSettings, StageSettings
+from warp_resphys.settings.trials import ReadingSettings
 from warp_resphys.stepping.inputs import Inputs
 
 ROOT = Path(__file__).parents[2]
@@ -167,7 +168,8 @@ class Shelf:
 
     def bring_in(self):
         run = parse(RunSettings, self.config)
-        stage = ImportStage.of(run, files={}, trials=trials_of(run), learned=self.learned)
+        own = {"data": ReadingSettings.of(run.data), "trials": trials_of(run), "learned": self.learned}
+        stage = StageSettings.reading(run, "payload_at", "simulation", "markers", files={}, **own)
         import_recordings(StageContext("import", self.folder, "", stage))
         with read_hdf5(self.folder / DATASET, "dataset") as file:
             return {name: file[name][()] for name in file} | dict(file.attrs)

@@ -24,7 +24,7 @@ from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
-from warp_resphys.settings.stages import EvaluateStage, TrainStage
+from warp_resphys.settings.stages import LEARNING, NETWORKS, StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED)
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
@@ -104,7 +104,7 @@ def test_the_reconstruction_reaches_the_smoothed_markers(finished):
 
 
 def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
-    stage = stage_of(finished, "train_resphys", TrainStage)
+    stage = stage_of(finished, "train_resphys", StageSettings)
     assert stage.force_frame == "corotated"
     assert read_checkpoint(finished / "resphys.safetensors", "residual force")[1]["force_frame"] == "corotated"
     learned = {}
@@ -221,8 +221,9 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     lost[1, 3:] = np.nan
     left = {"resphys": np.array([-1, 3])}
     own = {"horizons": (0.02, 0.04), "split": {"train": [], "validation": [], "test": ["a", "b"]}}
+    keys = ("published", "correct_uncorrected")
     own |= {"files": {}, "shared": ".", "acquired": "", "groups": {"1": ["a", "b"]}, "calibration": []}
-    stage = EvaluateStage.of(settings("experiment=sopra"), **own)
+    stage = StageSettings.reading(settings("experiment=sopra"), *LEARNING, *NETWORKS, *keys, **own)
     experiment = Experiment(stage, tmp_path)
     about = (np.tile(0.01 * np.arange(5), (2, 1)), observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
     experiment.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
@@ -236,7 +237,7 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
 
 def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(finished):
     """The stored variance beside roll-outs with parameters that are drawn from a narrowed posterior."""
-    experiment = Experiment(stage_of(finished, "evaluate", EvaluateStage), finished)
+    experiment = Experiment(stage_of(finished, "evaluate", StageSettings), finished)
     identified = experiment.identification("sysid")
     names, uncertainty = [*identified["parameters"]], identified["uncertainty"]
     deviation = 1e-3 * np.array([uncertainty["deviation"][name] for name in names])

@@ -21,7 +21,7 @@ from ..report.driven_film import DrivenBodies
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..settings.control import ControlSettings
-from ..settings.stages import BaselinesStage, DriveStage, PlanStage, ReduceStage
+from ..settings.stages import StageSettings
 from .baselines import fit_linear
 from .controllers import (
     Controller,
@@ -66,7 +66,7 @@ def reduce_robot(context: StageContext) -> None:
     Raises:
         InputError, ConvergenceError: the model cannot be reduced, see `reduction.reduce`.
     """
-    settings: ReduceStage = context.settings
+    settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
     check_plannable(robot)
     with Progress(context.name, settings.reduction.total, "samples") as progress:
@@ -81,7 +81,7 @@ def plan_motions(context: StageContext) -> None:
         InputError: the robot cannot reach a path, and ``must_reach`` is set.
         ConvergenceError: the robot diverges on a plan.
     """
-    settings: PlanStage = context.settings
+    settings: StageSettings = context.settings
     model, plan = settings.model, settings.plan
     robot = load(context.run_dir, model, settings.device)
     task = Task(settings.figures, robot)
@@ -112,7 +112,7 @@ def fit_baselines(context: StageContext) -> None:
     Raises:
         InputError: too few frames of the trials show all markers.
     """
-    settings: BaselinesStage = context.settings
+    settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
     task, driven, data = Task(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
     assert driven.high is not None
@@ -157,7 +157,7 @@ def _series(data: Dataset, name: str, driven: str, time_step: float) -> tuple[Fl
 
 def drive(context: StageContext, workers: Workers = ALONE) -> None:
     """Drives all motions on the simulated laboratory with all controllers, and writes the result."""
-    settings: DriveStage = context.settings
+    settings: StageSettings = context.settings
     control = settings.control
     controllers = controllers_of(control)
     robot = load(context.run_dir, control.models[-1], settings.device)
@@ -188,7 +188,7 @@ def controllers_of(control: ControlSettings) -> list[str]:
 
 
 def receding_controllers(
-    settings: DriveStage, folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
+    settings: StageSettings, folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
 ) -> list[Controller]:
     """Returns the receding-horizon controllers, on the reduced models and finally on the linear model.
 
@@ -213,7 +213,7 @@ def receding_controllers(
 
 def _driven(part: TrialPart, report: Report) -> Arrays:
     """One motion with all controllers, each on a body of its own: points, inputs and computing times."""
-    settings: DriveStage = part.context.settings
+    settings: StageSettings = part.context.settings
     control, folder, (name,) = settings.control, part.context.run_dir, part.names
     robot = load(folder, control.models[-1], settings.device)
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
@@ -282,7 +282,7 @@ def _names(task: Task, seconds: float) -> list[str]:
     return [motion_name(path.name, seconds) for path in task.paths]
 
 
-def driven_settings(folder: Path) -> DriveStage:
+def driven_settings(folder: Path) -> StageSettings:
     """Returns the settings with which controllers have driven the laboratory of a run.
 
     Raises:
@@ -293,7 +293,7 @@ def driven_settings(folder: Path) -> DriveStage:
         raise InputError(
             f"no motion was driven in {folder}: name a finished run of an experiment with control, as sopra_control."
         )
-    return parse(DriveStage, finished_record(folder, "drive")["settings"])
+    return parse(StageSettings, finished_record(folder, "drive")["settings"])
 
 
 def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float = np.inf) -> DrivenBodies:

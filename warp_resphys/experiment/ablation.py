@@ -21,7 +21,7 @@ from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..settings.run import RunSettings
-from ..settings.stages import AblationStage, ReportStage
+from ..settings.stages import ReportStage, StageSettings
 from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
@@ -40,12 +40,14 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
 
     Args:
         run: settings with the group ``ablation``.
-        files: of the bodies, see `settings.stages.SimulationStage`.
+        files: of the bodies, see `settings.stages.StageSettings`.
     """
     assert run.ablation is not None
     own = run.ablation
     workers = workers_for(run.parallel, own.processes, run.device).at_most(len(own.counts))
-    settings = AblationStage.of(run, files=files, counts=own.counts, draws=own.draws, modes=own.modes)
+    keys = ("target", "simulation", "data", "reconstruction", "seed")
+    drawn = {"counts": own.counts, "draws": own.draws, "modes": own.modes}
+    settings = StageSettings.reading(run, *keys, files=files, **drawn)
     return [
         Stage("generate", generate_motion, (MOTION,), settings),
         Stage("ablation", partial(ablate, workers=workers), (DRAWS, SUMMARY), settings, ("generate",)),
@@ -66,7 +68,7 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
 
 def generate_motion(context: StageContext) -> None:
     """Writes motion.h5: q (T + 1, N, 3) from the held state on, by the target and the uncorrected simulator."""
-    settings: AblationStage = context.settings
+    settings: StageSettings = context.settings
     data = settings.data
     target, simulation = build_target(settings, settings.target), build_simulator(settings, settings.simulation)
     with torch.no_grad():
@@ -116,7 +118,7 @@ def _from_markers(part: TrialPart, report: Report) -> Arrays:
 
     The mean distances (draws, T) of all vertices and of the markers, and the marker sets.
     """
-    settings: AblationStage = part.context.settings
+    settings: StageSettings = part.context.settings
     count, draws = part.more, settings.draws
     simulator = build_simulator(settings, settings.simulation)
     motion, like = simulator.tensor(read_motion(part.context.run_dir)[0]), simulator.rest_positions

@@ -18,16 +18,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.stages import Stage
 from ..learning.reconstruction import make_reconstructor
 from ..report.page import duration_text
-from ..settings.stages import (
-    EvaluateStage,
-    IdentifyStage,
-    LearningStage,
-    MeshCheckStage,
-    ReconstructStage,
-    ReportStage,
-    TimeStage,
-    TrainStage,
-)
+from ..settings.stages import ReportStage, StageSettings
 from .experiment import MODELS, Experiment
 from .models import SIMFREE
 from .trials import evenly
@@ -54,7 +45,7 @@ def announcement(
         times: factor of the duration, as of several folds.
     """
     folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
-    own = {one.name: one.settings for one in stages if isinstance(one.settings, LearningStage)}
+    own = {one.name: one.settings for one in stages if isinstance(one.settings, StageSettings)}
     experiments = {name: Experiment(settings, folder, "count") for name, settings in own.items()}
     works = {name: work for name, one in experiments.items() if (work := work_of(one)) is not None}
     amount = times * sum(steps + _RECONSTRUCTION * forces for steps, forces, _ in works.values())
@@ -75,7 +66,7 @@ def announcement(
     others = [one.name for one in stages if one.name not in seconds and not isinstance(one.settings, ReportStage)]
     without = f", without {', '.join(others)}" if others else ""
     shorter = ["a coarser mesh", "fewer or shorter trials"]
-    most = max((len(one.identify.parameters) for one in own.values() if isinstance(one, IdentifyStage)), default=0)
+    most = max((len(one.identify.parameters) for one in own.values() if one.reads("identify")), default=0)
     shorter += [f"fewer of the {number_of(most, 'parameter')} of identify.parameters"] if most > 1 else []
     shorter += [] if quick else ["or at first budget=quick"]
     took = f"about {duration_text(sum(seconds.values()))} more for {vertices:,} vertices"
@@ -86,33 +77,32 @@ def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
     """Returns the numbers of steps and of reconstructed steps of single trials, and the time of other training [s]."""
     settings = experiment.settings
     train, judged = settings.split.train, settings.split.validation or settings.split.train
-    match settings:
-        case IdentifyStage(identify=wanted):
-            names = train if wanted.trials is None else evenly(train, wanted.trials)
-            evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
-            searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-            each = {model: evaluations * (1.0 + _VARIED * len(own)) for model, own in searches.items() if own}
-            return sum(number * steps_of(experiment, m, names) for m, number in each.items()), 0.0, 0.0
-        case ReconstructStage():
-            return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
-        case TrainStage(model=model, training=training):
-            trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
-            looped, loop, trainer = 0.0, training.in_the_loop, training.trainer
-            if loop is not None:
-                held_out = loop.start == "zero" and loop.hold_out and not settings.split.validation
-                looped = (loop.epochs + 1) * (_ITERATION * trained + rolled) * (len(train) if held_out else 1)
-                if loop.start == "zero":
-                    return looped, 0.0, 0.0
-            replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
-            return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
-        case EvaluateStage():
-            tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
-            return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
-        case (
-            TimeStage() | MeshCheckStage()
-        ):  # Three rows, one trial at a time, which takes twice as long; a finer mesh.
-            times = 6.0 if isinstance(settings, TimeStage) else 1.0 + settings.mesh_check**3
-            return times * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
+    if settings.reads("reconstructed"):
+        return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
+    if settings.reads("training"):
+        model, training = settings.model, settings.training
+        trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
+        looped, loop, trainer = 0.0, training.in_the_loop, training.trainer
+        if loop is not None:
+            held_out = loop.start == "zero" and loop.hold_out and not settings.split.validation
+            looped = (loop.epochs + 1) * (_ITERATION * trained + rolled) * (len(train) if held_out else 1)
+            if loop.start == "zero":
+                return looped, 0.0, 0.0
+        replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
+        return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
+    if settings.reads("calibration"):
+        tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
+        return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
+    if settings.reads("groups"):  # by a finer mesh; or three rows, one trial at a time, which takes twice as long
+        times = 1.0 + settings.mesh_check**3 if settings.reads("mesh_check") else 6.0
+        return times * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
+    if settings.reads("identify") and not settings.reads("law"):
+        wanted = settings.identify
+        names = train if wanted.trials is None else tuple(evenly(train, wanted.trials))
+        evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
+        searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
+        each = {model: evaluations * (1.0 + _VARIED * len(own)) for model, own in searches.items() if own}
+        return sum(number * steps_of(experiment, m, names) for m, number in each.items()), 0.0, 0.0
     return None
 
 
@@ -122,16 +112,16 @@ def steps_of(experiment: Experiment, model: str, names: Sequence[str]) -> float:
     time_step, total = experiment.settings_of("simulation" if kind == "law" else kind).time_step, 0.0
     for batch in experiment.batches(names):
         limits = [float(experiment.trials(batch).times.max()), settings.trial_seconds]
-        limits += [settings.identify.seconds] if isinstance(settings, IdentifyStage) else []
+        limits += [settings.identify.seconds] if settings.reads("identify") else []
         seconds = min(limit for limit in limits if limit is not None)
         total += len(batch) * max(math.ceil(seconds / time_step - 1e-6), 1)
     return total
 
 
-def _parts(settings: LearningStage) -> int:
+def _parts(settings: StageSettings) -> int:
     """Number of parts of a stage that workers can do at the same time."""
-    names = settings.reconstructed if isinstance(settings, ReconstructStage) else ()
-    names = settings.groups["1"] if isinstance(settings, EvaluateStage) else names
+    names = settings.reconstructed if settings.reads("reconstructed") else ()
+    names = settings.groups["1"] if settings.reads("calibration") else names
     return max(math.ceil(len(names) / (settings.batch or len(names) or 1)), 1)
 
 
@@ -145,7 +135,6 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
         simulator = replace(simulator, time_step=1e6, integrator="implicit_euler")
     state, method, seconds = simulator.rest_state(len(names)), None, list[float]()
     if reconstructed:
-        assert isinstance(settings, ReconstructStage)
         method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
         method = method.with_constants(constants)
     support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None] * torch.ones_like(state.q)

@@ -19,7 +19,7 @@ from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
-from ..settings.stages import EvaluateStage, MeshCheckStage, TimeStage
+from ..settings.stages import StageSettings
 from .build import finer
 from .experiment import LEARNED, Experiment
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, reconstruction_file
@@ -38,7 +38,7 @@ _FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over
 
 def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, the observed points of every model's roll-outs of the test trials, and errors.json."""
-    settings: EvaluateStage = context.settings
+    settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
     compared = experiment.models
     names = [name for group in settings.groups.values() for name in group]
@@ -167,7 +167,6 @@ def summary(
         left: by model, (R,) the step at which a trial left the training range, or -1.
     """
     settings, dataset = experiment.settings, experiment.dataset
-    assert isinstance(settings, EvaluateStage)
     names, every = groups["1"], [name for group in groups.values() for name in group]
     count, step = len(names), settings.time_step
     points = counted(experiment, every)
@@ -240,7 +239,7 @@ def _reconstructed(context: StageContext, names: Sequence[str]) -> FloatArray:
 
 
 def _over_time(
-    settings: EvaluateStage,
+    settings: StageSettings,
     test: Mapping[str, FloatArray],
     observed: FloatArray,
     errors: Mapping[str, Sequence[FloatArray]],
@@ -282,7 +281,7 @@ def time_models(context: StageContext) -> None:
     the target has its mesh and time step, the simulator with the learned force, and the network alone. Trials run one
     at a time, once, after the first steps of the first trial, which load kernels.
     """
-    settings: TimeStage = context.settings
+    settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
     names = experiment.moving(settings.groups["1"])
     simulator = experiment.model_simulator("resphys")
@@ -322,7 +321,7 @@ def check_mesh(context: StageContext) -> None:
 
     The finer mesh uses the parameters that were identified on the original mesh.
     """
-    settings: MeshCheckStage = context.settings
+    settings: StageSettings = context.settings
     times, parts = settings.mesh_check, settings.parts
     refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
     other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})

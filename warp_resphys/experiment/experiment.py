@@ -26,9 +26,9 @@ from ..learning.parameters import split_name
 from ..learning.placement import PlacedMarkers, placement_of
 from ..learning.release import begin_inputs, estimate_release
 from ..learning.replay import Replay, Start, later
-from ..settings.body import MaterialSettings, SimulatorSettings, TargetSettings
-from ..settings.run import PublishedSettings, models_of
-from ..settings.stages import EvaluateStage, LearningStage, NetworkStage, ShapesStage, TestStage, TimeStage
+from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.run import models_of
+from ..settings.stages import StageSettings
 from ..stepping.state import State
 from .build import bound_markers, build_body, build_simulator, marker_view_of
 from .files import (
@@ -73,7 +73,7 @@ class Experiment:
         on_failure: whether a failed step raises an error (``raise``) or is counted (``count``).
     """
 
-    settings: LearningStage
+    settings: StageSettings
     folder: Path
     on_failure: str = "raise"
 
@@ -82,7 +82,7 @@ class Experiment:
         """Dataset of the trials, including trials with scaled inputs if the stage tests them."""
         shared = self.folder / self.settings.shared
         dataset = read_dataset(shared / DATASET)
-        if isinstance(self.settings, TestStage) and len(self.settings.groups) > 1:
+        if self.settings.reads("groups") and len(self.settings.groups) > 1:
             dataset = dataset.joined(read_dataset(shared / SCALED_DATASET))
         return dataset
 
@@ -114,33 +114,23 @@ class Experiment:
         settings, identified = self.settings, self.settings.identified
         own: dict[str, Any] = {"gravity": tuple(self.dataset.gravity.tolist())}
         if kind == "published":
-            published = self._published
+            published = settings.published
+            assert published is not None
             own |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
         elif kind in ("identified", LAW) and identified is not None and identified.integrator is not None:
             own |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
-        chosen = target_settings(settings, self._target) if kind == "target" else SimulatorSettings.of(settings)
+        chosen = target_settings(settings, settings.target) if kind == "target" else SimulatorSettings.of(settings)
         return chosen.model_copy(update=own)
 
     def material_of(self, kind: str) -> MaterialSettings:
         """Material of a simulator of some kind, see `simulator`."""
         if kind == "published":
-            return self._published.simulation
+            assert self.settings.published is not None
+            return self.settings.published.simulation
         if kind == LAW:
             law = read_json(self.folder / LAW_FILE)
             return MaterialSettings(model=law["model"], **law["constants"])
-        return self._target.material if kind == "target" else self.settings.simulation
-
-    @property
-    def _target(self) -> TargetSettings:
-        assert isinstance(self.settings, TimeStage | ShapesStage)
-        assert self.settings.target is not None
-        return self.settings.target
-
-    @property
-    def _published(self) -> PublishedSettings:
-        assert isinstance(self.settings, EvaluateStage)
-        assert self.settings.published is not None
-        return self.settings.published
+        return self.settings.target.material if kind == "target" else self.settings.simulation
 
     @property
     def like(self) -> torch.Tensor:
@@ -268,7 +258,6 @@ class Experiment:
     def models(self) -> list[str]:
         """Names of the models that are compared; the law is one of them if it helps on the validation trials."""
         settings = self.settings
-        assert isinstance(settings, EvaluateStage)
         return models_of(settings.published, settings.identified, settings.correct_uncorrected, self.has_law)
 
     @property
@@ -301,7 +290,6 @@ class Experiment:
             (`base_movement`). (R, A) for static poses, under steady inputs.
         """
         _, inputs, resting = replay.prepare(parameters)
-        assert isinstance(self.settings, NetworkStage)
         actuation, constant = self.settings.actuation, list[torch.Tensor]()
         if self.settings.payload_at is not None and (payload or actuation.sees_payload):
             rows = self.dataset.rows(replay.trials.names)

@@ -20,7 +20,7 @@ from ..learning.parameters import Bounds, Prior, configured_parameters, own_name
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from ..settings.learning import IdentifySettings, LawSettings, RangeSettings
-from ..settings.stages import IdentifyStage
+from ..settings.stages import StageSettings
 from .experiment import MODELS, Experiment
 from .files import IDENTIFICATION, RESTING
 from .trials import evenly
@@ -43,7 +43,7 @@ def identify(context: StageContext) -> None:
     training trials. Releases are estimated again with the identified parameters, which are then refined. An interrupted
     run keeps its finished searches.
     """
-    settings: IdentifyStage = context.settings
+    settings: StageSettings = context.settings
     wanted, names = settings.identify, settings.split.train
     experiment, kept = Experiment(settings, context.run_dir), Checkpoint(context)
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
@@ -81,7 +81,6 @@ def _identified(
 ) -> dict[str, Any]:
     """Identifies the parameters of a model; returns its content of identification.json."""
     settings = experiment.settings
-    assert isinstance(settings, IdentifyStage)
     wanted, simulator = settings.identify, experiment.simulator(MODELS[model][0])
     bounds, replays = _bounds(experiment, search, names), experiment.replays(simulator, names)
     nuisances = _nuisances(experiment, placed=model == "sysid")
@@ -165,7 +164,6 @@ def _of_first_frames(
     Everything else is as identified. Values that these frames do not show stay near the mean of their prior.
     """
     settings, values, deviations = experiment.settings, dict[str, float](), dict[str, float]()
-    assert isinstance(settings, IdentifyStage)
     wanted = {name: bounds_of(limits) for name, limits in search.items() if limits.per == "trial"}
     names = [name for name in settings.split.names if name not in learned and experiment.begins(name) in RESTING]
     shared = experiment.identification(model)
@@ -194,7 +192,6 @@ def bounds_of(settings: RangeSettings) -> Bounds:
 def _nuisances(experiment: Experiment, placed: bool = False) -> dict[str, Any]:
     """Arguments of a `Misfit`: delays, which observed coordinates are independent, and how markers may be placed."""
     settings = experiment.settings
-    assert isinstance(settings, IdentifyStage)
     labels, bound = experiment.dataset.labels, experiment.dataset.bound
     result: dict[str, Any] = {"delay": settings.release.delay, "shares": independent(labels)}
     wanted, markers = settings.identify.placement, settings.markers
@@ -251,7 +248,7 @@ class Checkpoint:
         return sum(len(records) for found in self.parts.values() for records in found["history"])
 
 
-def _seconds(settings: IdentifyStage, replays: Replays) -> float | None:
+def _seconds(settings: StageSettings, replays: Replays) -> float | None:
     """Duration from the beginning of each trial that is used [s]; None for whole trials."""
     limits, fraction = [settings.trial_seconds, settings.identify.seconds], settings.train_fraction
     if fraction < 1.0:

@@ -27,7 +27,7 @@ from ..learning.law import VISCOSITIES, KnownMotion, LawClass, WeakForm, fit_cla
 from ..learning.misfit import Misfit
 from ..learning.parameters import Bounds
 from ..learning.replay import Replay
-from ..settings.stages import IdentifyLawStage
+from ..settings.stages import StageSettings
 from .experiment import LAW, Experiment
 from .files import LAW_FILE
 from .identify import Checkpoint, Found, IsLast, refined_searches, search_parameters
@@ -50,7 +50,7 @@ def identify_law(context: StageContext) -> None:
     Raises:
         DataFileError: the file of the law is missing, damaged or of another version.
     """
-    settings: IdentifyLawStage = context.settings
+    settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
     search = _LawSearch(context, experiment)
     content = search.run() if settings.law.file is None else search.given(settings.law.file)

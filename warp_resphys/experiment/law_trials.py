@@ -20,7 +20,6 @@ from ..learning.parameters import Bounds, Prior
 from ..learning.replay import Replay, Start
 from ..learning.uncertainty import redundancy
 from ..settings.body import MaterialSettings
-from ..settings.stages import IdentifyLawStage
 from .build import build_simulator
 from .experiment import LAW, Experiment
 from .identify import bounds_of
@@ -95,7 +94,6 @@ class LawTrials:
 
     def __init__(self, experiment: Experiment) -> None:
         settings = experiment.settings
-        assert isinstance(settings, IdentifyLawStage)
         self.experiment, self.settings, split = experiment, settings, settings.split
         self.checked, self.learned = split.validation or split.train, split.train
         if not split.validation and len(split.train) >= _HELD_OUT:

@@ -19,7 +19,7 @@ from ..learning.replay import Replay, Windows
 from ..learning.rollout import Range
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
-from ..settings.stages import NetworkStage, TrainStage
+from ..settings.stages import StageSettings
 from .build import choose_device
 from .experiment import LAW, Experiment
 from .files import STATIC, reconstruction_file, training_file, weights_file
@@ -162,7 +162,6 @@ def _range_of(experiment: Experiment, model: str, network: StateMap, train: Samp
 
     A force on the law of the material fades out beyond it.
     """
-    assert isinstance(experiment.settings, NetworkStage)
     if not experiment.settings.range_guard:
         return None
     with torch.no_grad():
@@ -230,7 +229,7 @@ def train(context: StageContext) -> None:
 
     An interrupted training resumes.
     """
-    settings: TrainStage = context.settings
+    settings: StageSettings = context.settings
     model = settings.model
     trainer, learned = trainer_of(Experiment(settings, context.run_dir), model, settings.training)
     checkpoint = context.run_dir / f"{context.name}.safetensors"

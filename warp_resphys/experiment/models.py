@@ -18,7 +18,6 @@ from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.replay import Start
 from ..learning.rollout import LearnedPredictor, Range, Rollout
-from ..settings.stages import TestStage
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment
 from .files import GIVEN, weights_file
@@ -213,5 +212,4 @@ def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> C
 
 def learned_of(experiment: Experiment, model: str) -> Learned | None:
     """Trained network of a model in this run; None for models without a network."""
-    assert isinstance(experiment.settings, TestStage)
     return load(experiment.folder, model, experiment.like.device) if model in LEARNED else None

@@ -12,7 +12,6 @@ from ..data.rigid_bodies import as_markers
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage
-from ..settings.stages import EvaluateStage
 from .experiment import Experiment
 from .files import ROLLOUTS, Dataset, read_dataset, since_change
 from .models import SIMFREE
@@ -78,7 +77,6 @@ def intervals_of(
     intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
     """
     settings, dataset = experiment.settings, experiment.dataset
-    assert isinstance(settings, EvaluateStage)
     test, observed = settings.groups["1"], dataset.observed[dataset.rows(names)]
     target, rest = counted(experiment, test), _rest(dataset)
     learned = [row for row, name in enumerate(names) if name in settings.split.train]

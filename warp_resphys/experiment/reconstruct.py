@@ -10,7 +10,7 @@ from ..io.files import atomic_hdf5, create, write_json
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors
 from ..learning.reconstruction import follow, make_reconstructor, without_ringing
-from ..settings.stages import ReconstructStage
+from ..settings.stages import StageSettings
 from .experiment import Experiment
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
@@ -26,7 +26,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     markers are stored in single precision, which rounds positions to 1e-8 m. The summary has the distance between
     reconstructed and observed points.
     """
-    settings: ReconstructStage = context.settings
+    settings: StageSettings = context.settings
     experiment, model = Experiment(settings, context.run_dir), settings.model
     parts: list[TrialPart] = []
     for number, names in enumerate(experiment.batches(settings.reconstructed)):
@@ -46,7 +46,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
 
 def _of_trials(part: TrialPart, report: Report) -> Arrays:
     """Reconstruction of trials that begin in the same way: states, forces, and mean distances (R, K + 1) [mm]."""
-    settings: ReconstructStage = part.context.settings
+    settings: StageSettings = part.context.settings
     experiment = Experiment(settings, part.context.run_dir)
     simulator = without_ringing(experiment.model_simulator(settings.model), experiment.observe)
     replay = experiment.replay(simulator, part.names, settings.model)

@@ -22,7 +22,7 @@ from ..mesh.mesh import select_vertices
 from ..settings.body import BodySettings, SimulatorSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.shapes import ShapeSettings
-from ..settings.stages import ShapesStage
+from ..settings.stages import StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
@@ -42,7 +42,7 @@ def try_shapes(context: StageContext) -> None:
         ConvergenceError: the target of a shape fails.
         InputError: inputs do not fit a shape.
     """
-    settings: ShapesStage = context.settings
+    settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
     kept, results = Checkpoint(context), {}
     with Progress(context.name, len(settings.shapes), "bodies") as progress:
@@ -81,7 +81,7 @@ def check_shape(shape: ShapeSettings) -> None:
             raise InputError("held.at selects fixed vertices only: hang the weight on vertices that can move.")
 
 
-def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSettings) -> dict[str, Any]:
+def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSettings) -> dict[str, Any]:
     """Result of a shape, which its target holds or inflates, and releases."""
     target, mesh = _target(settings, shape), build_body(BodySettings.of(shape)).mesh
     seen = vertices_in(target.body.mesh, mesh).to(target.rest_positions)
@@ -107,7 +107,7 @@ def _compared(experiment: Experiment, settings: ShapesStage, shape: ShapeSetting
     return result
 
 
-def _target(settings: ShapesStage, shape: ShapeSettings) -> Simulator:
+def _target(settings: StageSettings, shape: ShapeSettings) -> Simulator:
     """Returns the simulator of the target of a shape."""
     target, body = settings.target, shape.target_body
     own = {key: getattr(body, key) for key in BodySettings.model_fields} | {"physics": target.physics}

@@ -32,7 +32,7 @@ from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.poses import twisted
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.stages import PlayedSettings, SimulateStage
+from ..settings.stages import PlayedSettings, StageSettings
 from ..settings.trials import (
     HeldSettings,
     MotionSettings,
@@ -132,7 +132,7 @@ def vertices_in(mesh: Mesh, other: Mesh) -> Observation:
 
 def simulate(context: StageContext) -> None:
     """Writes dataset.h5: positions and velocities (R, T + 1, N, 3) of all trials, starting from the held state."""
-    settings: SimulateStage = context.settings
+    settings: StageSettings = context.settings
     trials, data = settings.trials, settings.data
     frames, names = data.steps + 1, tuple(trial.name for trial in trials)
     times, points = settings.time_step * np.arange(frames, dtype=np.float64), whole_mesh(settings).vertices
@@ -231,7 +231,7 @@ def played(
 
 def _free_motion(part: TrialPart, report: Report) -> Arrays:
     """Positions and velocities of all vertices of released bodies, or of bodies with a moving base."""
-    settings: SimulateStage = part.context.settings
+    settings: StageSettings = part.context.settings
     target, seen = build_target(settings, settings.target), list[tuple[torch.Tensor, torch.Tensor]]()
     trials = [trial for trial in settings.trials if trial.name in part.names]
     begin = initial_state(target.simulator, settings.data, trials)

@@ -29,7 +29,7 @@ from ..mesh.mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.stages import EvaluateStage
+from ..settings.stages import StageSettings
 from ..settings.trials import MarkerSettings
 
 log = logging.getLogger(__name__)
@@ -215,8 +215,8 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
                     f"{folder} is unfinished: the settings of '{needed}' changed; run its command again."
                 )
             log.info("%s is not evaluated yet: errors and prediction intervals of %s are not known", folder, model)
-            return Experiment(parse(EvaluateStage, settings), folder)
-    return Experiment(parse(EvaluateStage, finished_record(folder, _EVALUATE)["settings"]), folder)
+            return Experiment(parse(StageSettings, settings), folder)
+    return Experiment(parse(StageSettings, finished_record(folder, _EVALUATE)["settings"]), folder)
 
 
 def describe(folder: Path, model: str) -> Description:
@@ -233,7 +233,6 @@ def describe(folder: Path, model: str) -> Description:
     """
     experiment = finished_experiment(folder, model)
     settings = experiment.settings
-    assert isinstance(settings, EvaluateStage)
     models = experiment.models
     if model not in models:
         raise InputError(f"the model is {model!r}: {folder} has {listed(models)}.")

@@ -1,14 +1,14 @@
-"""Settings of the stages of a run: a class for each, with a field for every group or key that it may read.
+"""Settings of the stages of a run: for each, the keys that it reads, and what the pipeline derives from the run for it.
 
-The fingerprint of a stage is that of its settings. A stage cannot read other settings, so that no dependency of a file
-is forgotten. `Settings.of` copies the fields that `RunSettings` has by the same name; the pipeline adds the others.
+The fingerprint of a stage is that of its settings. A stage cannot read keys that the pipeline does not name for it, so
+that no dependency of a file is forgotten.
 """
 
-from typing import Annotated, Any
+from typing import Any, Final, Self
 
-from pydantic import Field
+from pydantic import ConfigDict, Field, model_validator
 
-from ..io.settings import Many, Settings, Vector
+from ..io.settings import Many, Settings, Vector, setting
 from .body import MaterialSettings, SimulatorSettings, SolveSettings, TargetSettings
 from .control import ControlSettings, FeedbackSettings, FigureSettings, PlanSettings, ReductionSettings
 from .learning import (
@@ -21,7 +21,6 @@ from .learning import (
     TrainingSettings,
 )
 from .mesh import PlaceSettings
-from .pictures import PictureData
 from .run import PublishedSettings, RunSettings
 from .shapes import ShapeSettings
 from .trials import (
@@ -29,26 +28,15 @@ from .trials import (
     MarkerSettings,
     PlaySettings,
     ReadingSettings,
-    ReleaseFromLoad,
-    SimulatedData,
     Split,
     Trial,
 )
 
-
-class SimulationStage(SimulatorSettings):
-    """Settings of every simulation of a run."""
-
-    payload_at: PlaceSettings | None
-    files: dict[str, str]  # SHA-256 of the files that bodies and their motions are read from, by path
-
-
-class SimulateStage(SimulationStage):
-    """Trials of a simulation that stands in for the real body, with all vertices observed."""
-
-    target: TargetSettings
-    data: Annotated[SimulatedData, Field(discriminator="kind")]
-    trials: Many[Trial]
+LEARNING: Final = (  # keys of all stages of a split, beside those of the simulator
+    *("payload_at", "simulation", "markers", "release", "force_frame", "train_fraction", "trial_seconds", "identified"),
+    *("with_law", "batch"),
+)
+NETWORKS: Final = ("actuation", "range_guard")  # and of all with networks
 
 
 class PlayedSettings(Settings):
@@ -74,171 +62,77 @@ class LaboratoryStage(PlayedSettings):
     batch: int | None
 
 
-class ImportStage(SimulationStage):
-    """Recordings that are transformed into the frame of the body."""
-
-    simulation: MaterialSettings
-    markers: MarkerSettings
-    data: ReadingSettings
-    trials: Many[Trial]
-    learned: Many[str] | None  # names of the trials of training and validation; None for a cross-validation
-
-
-class PictureStage(SimulatorSettings):
-    """Pictures of bodies, at rest or released."""
-
-    simulation: MaterialSettings
-    data: PictureData
-    files: dict[str, str]  # SHA-256 of all files that are read, by path
-    seed: int
-
-
-class IdentifyPicturesStage(PictureStage):
-    """Identification of a material from pictures."""
-
-    identify: IdentifySettings
-
-
-class LearningStage(SimulationStage):
-    """Settings of all stages of a split."""
-
-    simulation: MaterialSettings
-    markers: MarkerSettings | None
-    release: ReleaseSettings
-    force_frame: str
-    train_fraction: float
-    trial_seconds: float | None
-    identified: IdentifiedSettings | None
-    with_law: bool  # whether the law of the material is identified
-    batch: int | None
-    shared: str  # folder of the dataset, from that of the split
-    acquired: str  # fingerprint of the stage that wrote the dataset
-    split: Split
-
-
-class IdentifyStage(LearningStage):
-    """Identification."""
-
-    identify: IdentifySettings
-    seed: int
-
-
-class IdentifyLawStage(LearningStage):
-    """Identification of the material's law."""
-
-    law: LawSettings
-    identify: IdentifySettings | None
-    name: str
-
-
-class ShapesStage(LearningStage):
-    """Other bodies with the identified material."""
-
-    target: TargetSettings
-    shapes: dict[str, ShapeSettings]
-    steps: int
-
-
-class ReconstructStage(LearningStage):
-    """Reconstruction of the forces on a model's simulator."""
-
-    model: str
-    reconstruction: ReconstructionSettings
-    reconstructed: Many[str]  # names of the trials
-
-
-class NetworkStage(LearningStage):
-    """Settings of all stages with networks."""
-
-    actuation: ActuationSettings
-    range_guard: bool
-
-
-class TrainStage(NetworkStage):
-    """Training of a model."""
-
-    model: str
-    training: TrainingSettings
-
-
-class TestStage(NetworkStage):
-    """Settings of all stages with roll-outs of models."""
-
-    groups: dict[str, Many[str]]  # names of the test trials by scale of the inputs, ``1`` first
-
-
-class EvaluateStage(TestStage):
-    """Roll-outs of the test trials by all models."""
-
-    calibration: Many[str]  # names of the trials that prediction intervals come from
-    published: PublishedSettings | None
-    correct_uncorrected: bool
-    horizons: Many[float]
-
-
-class TimeStage(TestStage):
-    """Times of the models."""
-
-    target: TargetSettings | None
-
-
-class MeshCheckStage(TestStage):
-    """Comparison with a finer mesh."""
-
-    mesh_check: float
-
-
-class ReduceStage(LearningStage):
-    """A reduced model of a robot."""
-
-    model: str
-    reduction: ReductionSettings
-    seed: int
-
-
-class PlanStage(LearningStage):
-    """Plans of all motions on the reduced model of a robot."""
-
-    model: str
-    figures: FigureSettings
-    plan: PlanSettings
-    must_reach: bool  # whether the robot must be able to reach all figures
-
-
-class BaselinesStage(LearningStage):
-    """Controllers without a simulator."""
-
-    model: str  # of the robot
-    figures: FigureSettings
-    feedback: FeedbackSettings
-    played: PlayedSettings
-
-
-class DriveStage(LearningStage):
-    """Motions of the laboratory under all controllers."""
-
-    control: ControlSettings
-    played: PlayedSettings
-
-
-class AblationStage(SimulationStage):
-    """The motion of a marker ablation, and its reconstructions from random sets of markers."""
-
-    target: TargetSettings
-    simulation: MaterialSettings
-    data: ReleaseFromLoad
-    reconstruction: ReconstructionSettings
-    seed: int
-    counts: Many[int]
-    draws: int
-    modes: int | None
-
-
 class ReportStage(Settings):
     """A report, which shows the whole configuration."""
 
     config: RunSettings
     acquired: str = ""  # fingerprint of the stage that wrote the dataset, for the report of a split
-    folds: dict[str, Any] = Field(
-        default={}
-    )  # errors of the models of a cross-validation, by the trial that is left out
+    folds: dict[str, Any] = Field(default={})  # errors of the models of a cross-validation, by the left-out trial
+
+
+class StageSettings(SimulatorSettings):
+    """Settings of a stage that simulates: those of the simulator, and of the following the ones that it reads."""
+
+    model_config = ConfigDict(validate_default=False)
+
+    files: dict[str, str] = setting(None)  # SHA-256 of all files that are read, by path
+    name: str = setting(None)
+    seed: int = setting(None)
+    simulation: MaterialSettings = setting(None)
+    target: TargetSettings = setting(None)
+    published: PublishedSettings | None = setting(None)
+    payload_at: PlaceSettings | None = setting(None)
+    markers: MarkerSettings | None = setting(None)
+    data: Any = setting(None)  # of simulations, of recordings or of pictures
+    played: PlayedSettings = setting(None)
+    trials: Many[Trial] = setting(None)
+    learned: Many[str] | None = setting(None)  # names of the trials of training and validation; None with folds
+    split: Split = setting(None)
+    shared: str = setting(None)  # folder of the dataset, from that of the split
+    acquired: str = setting(None)  # fingerprint of the stage that wrote the dataset
+    steps: int = setting(None)
+    train_fraction: float = setting(None)
+    trial_seconds: float | None = setting(None)
+    batch: int | None = setting(None)
+    release: ReleaseSettings = setting(None)
+    identify: IdentifySettings = setting(None)
+    identified: IdentifiedSettings | None = setting(None)
+    law: LawSettings = setting(None)
+    with_law: bool = setting(None)  # whether the law of the material is identified
+    shapes: dict[str, ShapeSettings] = setting(None)
+    model: str = setting(None)
+    reconstruction: ReconstructionSettings = setting(None)
+    reconstructed: Many[str] = setting(None)  # names of the trials
+    force_frame: str = setting(None)
+    actuation: ActuationSettings = setting(None)
+    range_guard: bool = setting(None)
+    training: TrainingSettings = setting(None)
+    correct_uncorrected: bool = setting(None)
+    groups: dict[str, Many[str]] = setting(None)  # names of the test trials by scale of the inputs, ``1`` first
+    calibration: Many[str] = setting(None)  # names of the trials that prediction intervals come from
+    horizons: Many[float] = setting(None)
+    mesh_check: float = setting(None)
+    counts: Many[int] = setting(None)  # of markers
+    draws: int = setting(None)  # of sets of markers
+    modes: int | None = setting(None)
+    reduction: ReductionSettings = setting(None)
+    figures: FigureSettings = setting(None)
+    plan: PlanSettings = setting(None)
+    must_reach: bool = setting(None)  # whether the robot must be able to reach all figures
+    feedback: FeedbackSettings = setting(None)
+    control: ControlSettings = setting(None)
+
+    @model_validator(mode="after")
+    def _lacks_others(self) -> Self:
+        for name in type(self).model_fields.keys() - self.model_fields_set:
+            del self.__dict__[name]
+        return self
+
+    @classmethod
+    def reading(cls, run: RunSettings, *keys: str, **values: Any) -> Self:
+        """Returns settings with keys of a run and of its simulator, and ``values`` for what is derived."""
+        return cls(**{key: getattr(run, key) for key in (*SimulatorSettings.model_fields, *keys)}, **values)
+
+    def reads(self, key: str) -> bool:
+        """Whether the stage reads a key."""
+        return key in self.model_fields_set

@@ -15,7 +15,7 @@ from ...io.stages import StageContext
 from ...pictures.outlines import ClosedSurface
 from ...pictures.seen import Photo, SeenPose
 from ...settings.pictures import PictureData, PoseSettings, SimulatedCamera
-from ...settings.stages import PictureStage
+from ...settings.stages import StageSettings
 from ..build import build_body, build_simulator
 from .seen_poses import read_lenses, released_force, scene_file
 
@@ -36,7 +36,7 @@ def frame_files(data: PictureData, pose: PoseSettings) -> list[dict[str, str]]:
 
 def play_camera(context: StageContext) -> None:
     """Writes camera.json and of every frame of every pose a picture, a mask, and perhaps depths and tracked points."""
-    settings: PictureStage = context.settings
+    settings: StageSettings = context.settings
     data, played = settings.data, settings.data.simulated
     assert played is not None
     material = settings.simulation.changed(**{**settings.simulation.constants, **played.material})

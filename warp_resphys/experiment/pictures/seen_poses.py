@@ -38,7 +38,7 @@ from ...pictures.seen import Photo, SeenPose
 from ...pictures.tags import tag_poses
 from ...settings.body import MaterialSettings
 from ...settings.pictures import PictureData, PoseSettings
-from ...settings.stages import PictureStage
+from ...settings.stages import StageSettings
 from ..build import build_mesh, build_simulator
 
 log = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ def import_pictures(context: StageContext) -> None:
     Raises:
         DataFileError: a picture cannot be read, or does not show the body.
     """
-    settings: PictureStage = context.settings
+    settings: StageSettings = context.settings
     data = settings.data
     with atomic_hdf5(context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}) as file:
         for name, pose in data.poses.items():
@@ -241,7 +241,7 @@ class SeenPoses:
         InputError: values that do not fit.
     """
 
-    def __init__(self, settings: PictureStage, run_dir: Path) -> None:
+    def __init__(self, settings: StageSettings, run_dir: Path) -> None:
         self.settings, self.data, self.run_dir = settings, settings.data, run_dir
         self.lenses, self._poses = read_lenses(self.data), dict[str, SeenPose]()
         self._loaded: dict[str, dict[str, NDArray[Any]]] = {}  # arrays of each pose in pictures.h5, by name

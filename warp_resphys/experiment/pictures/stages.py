@@ -32,7 +32,7 @@ from ...report.identification_section import parameter_rows
 from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
 from ...settings.pictures import PictureData, PoseSettings
 from ...settings.run import RunSettings
-from ...settings.stages import IdentifyPicturesStage, PictureStage, ReportStage
+from ...settings.stages import ReportStage, StageSettings
 from ..build import build_mesh, simulation_device
 from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from ..identify import Checkpoint, bounds_of, search_parameters
@@ -65,7 +65,7 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
 
     Args:
         run: settings with ``data.kind: pictures``.
-        files: see `SimulationStage`.
+        files: see `StageSettings`.
 
     Raises:
         DataFileError: a file is missing.
@@ -74,7 +74,7 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     assert data is not None
     stages, upstream = list[Stage](), tuple[str, ...]()
     common = {"files": {**files, **picture_files(data)}, "data": data}
-    settings = PictureStage.of(run, **common)
+    settings = StageSettings.reading(run, "simulation", "seed", **common)
     if data.folder is None:
         of_poses = {own.folder: [SCENE, own.points] for own in data.poses.values()}
         for own in data.poses.values():
@@ -82,7 +82,7 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
         written = tuple(f"recordings/{folder}/{file}" for folder, files in of_poses.items() for file in files if file)
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
-    identified = IdentifyPicturesStage.of(run, **common)
+    identified = StageSettings.reading(run, "simulation", "seed", "identify", **common)
     laws = dict.fromkeys(law_file(data.poses[name].material or "") for name in data.train)
     stages.append(Stage("identify", identify_pictures, (IDENTIFICATION, *laws), identified, ("import",)))
     stages.append(Stage(COMPARE, compare_pictures, (DIFFERENCES, OUTLINES), identified, ("identify",)))
@@ -142,9 +142,7 @@ class _Plan:
         cameras: (4, 4) of poses whose standing cameras were chosen in the identification, by name and lens.
     """
 
-    def __init__(
-        self, settings: IdentifyPicturesStage, run_dir: Path, cameras: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, settings: StageSettings, run_dir: Path, cameras: Mapping[str, Any] | None = None) -> None:
         self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
         self._cameras = {
             name: {lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in own.items()}
@@ -263,7 +261,7 @@ def identify_pictures(context: StageContext) -> None:
     Raises:
         ConvergenceError: the simulation fails at every start.
     """
-    settings: IdentifyPicturesStage = context.settings
+    settings: StageSettings = context.settings
     wanted, kept = settings.identify, Checkpoint(context)
     plan = _Plan(settings, context.run_dir)
     poses = [plan.pose(name, {}) for name in settings.data.train]
@@ -301,7 +299,7 @@ def compare_pictures(context: StageContext) -> None:
     Raises:
         ConvergenceError: a pose has no equilibrium.
     """
-    settings: IdentifyPicturesStage = context.settings
+    settings: StageSettings = context.settings
     identified = read_json(context.run_dir / IDENTIFICATION)
     plan, shared = _Plan(settings, context.run_dir, identified["cameras"]), identified["sysid"]["parameters"]
     names = [*settings.data.train, *settings.data.test]
@@ -368,7 +366,7 @@ def report_pictures(context: StageContext) -> None:
     run: RunSettings = context.settings.config
     data = run.pictures
     assert data is not None
-    settings = PictureStage.of(run, files={}, data=data)
+    settings = StageSettings.reading(run, "simulation", "seed", files={}, data=data)
     poses = SeenPoses(settings, context.run_dir)
     identified = read_json(context.run_dir / IDENTIFICATION)["sysid"]
     start = dict(run.simulation.constants)

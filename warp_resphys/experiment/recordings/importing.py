@@ -22,7 +22,7 @@ from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between,
 from ...io.errors import DataFileError, InputError, number_of
 from ...io.files import write_json
 from ...io.stages import StageContext
-from ...settings.stages import ImportStage
+from ...settings.stages import StageSettings
 from ..build import bound_markers
 from ..files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
 from ..trials import evenly
@@ -53,7 +53,7 @@ def import_recordings(context: StageContext) -> None:
     training = [x.settings.name for x in observed] if settings.learned is None else settings.learned
     offsets = _offsets(observer, observed)
     bound = _bound(observer, observed, offsets, training)
-    bound_markers(settings.markers, observer.simulator.body.mesh, bound, observer.tracked)  # Refuses a far marker.
+    bound_markers(observer.markers, observer.simulator.body.mesh, bound, observer.tracked)  # Refuses a far marker.
     mountings = _mountings(observer, observed, bound, offsets, training)
     verticals, gravity = _verticals(observed, settings)
     shifts = _shifts(observer, observed, bound, offsets)
@@ -195,7 +195,7 @@ def _shifts(observer: Observer, observed: Sequence[Observed], bound: FloatArray,
     return np.where(shows_places[:, None, None], shifts, 0.0)
 
 
-def _verticals(observed: Sequence[Observed], settings: ImportStage) -> tuple[FloatArray | None, FloatArray]:
+def _verticals(observed: Sequence[Observed], settings: StageSettings) -> tuple[FloatArray | None, FloatArray]:
     """Returns the (R, 3) vertical of each recording in the frame of the body, and (3,) gravity there [m/s^2].
 
     Gravity has the mean of their directions, and the configured strength. Where the vertical is unknown, gravity is the
@@ -319,6 +319,7 @@ def _write_quality(
     Lengths are in millimetres, except positions in the frame of the body in metres.
     """
     settings, tracked = observer.settings, observer.tracked
+    assert settings.markers is not None
     reference, gap = list(settings.markers.reference), settings.data.longest_gap
     driven = [row for row, x in enumerate(observed) if not x.settings.is_released]
     shown = evenly(driven, _SHOWN) if driven else []

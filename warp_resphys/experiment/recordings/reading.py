@@ -16,7 +16,7 @@ from ...data.registration import assign, axes_rotation
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ...io.errors import DataFileError, InputError, listed
 from ...io.stages import StageContext
-from ...settings.stages import ImportStage
+from ...settings.stages import StageSettings
 from ...settings.trials import ReadingSettings, Trial
 from ...stepping.inputs import Inputs
 from ..actuators import drive_of
@@ -49,8 +49,10 @@ class Reader:
     """
 
     def __init__(self, context: StageContext) -> None:
-        settings: ImportStage = context.settings
-        self.settings, self.data, self.markers = settings, settings.data, settings.markers
+        settings: StageSettings = context.settings
+        assert settings.markers is not None
+        self.data: ReadingSettings = settings.data
+        self.settings, self.markers = settings, settings.markers
         self.simulator = build_simulator(settings, settings.simulation, payload_at=settings.payload_at)
         self.drive = drive_of(settings, self.simulator.body)
         self.tracked = list(self.markers.observed)

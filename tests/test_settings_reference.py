@@ -7,15 +7,18 @@ import pytest
 from jsonschema import Draft202012Validator, ValidationError
 from omegaconf import OmegaConf
 
+from support.configured import settings
 from warp_resphys.data.markers import KINDS
 from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.body import MASS_MODES
 from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
+from warp_resphys.io.settings import parse
 from warp_resphys.learning.networks import ACTIVATIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
 from warp_resphys.settings.control import Model
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.settings.reference import editor_schema, page
+from warp_resphys.settings.stages import StageSettings
 from warp_resphys.settings.trials import MarkerSettings
 from warp_resphys.stepping.integrators import INTEGRATORS
 
@@ -53,6 +56,16 @@ def test_choices_in_the_settings_are_those_in_the_code():
         (MarkerSettings, "bind", KINDS),
         (NetworkSettings, "activation", ACTIVATIONS),
     ]
-    for settings, key, words in pairs:
-        assert {*get_args(settings.model_fields[key].annotation)} == {*words}
+    for group, key, words in pairs:
+        assert {*get_args(group.model_fields[key].annotation)} == {*words}
     assert get_args(Model) == tuple(MODELS)
+
+
+def test_a_stage_has_the_keys_that_it_reads_alone():
+    run = settings()
+    stage = StageSettings.reading(run, "simulation", files={})
+    assert (stage.simulation, stage.mesh) == (run.simulation, run.mesh)
+    assert (stage.reads("simulation"), stage.reads("seed"), "seed" in stage.plain()) == (True, False, False)
+    with pytest.raises(AttributeError, match="seed"):
+        _ = stage.seed
+    assert parse(StageSettings, stage.plain()) == stage

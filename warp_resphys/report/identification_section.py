@@ -110,9 +110,7 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
         whole, owner = split_name(parameter)
         words, unit, factor = parameter_wording(whole)
         words += f", {owner}" * bool(owner)
-        deviation = deviations.get(parameter)
-        beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
-        cells = [Cell(digits(start.get(parameter), factor)), Cell(digits(value, factor, deviation), beside=beside)]
+        cells = [Cell(digits(start.get(parameter), factor)), identified_cell(value, factor, deviations.get(parameter))]
         cells += [Cell(digits(truth.get(parameter, truth.get(whole)), factor))] if truth else []
         cells.append(Cell("yes" if parameter in identified["at_bounds"] else ""))
         rows.append(Row(f"{words} [{unit}]" if unit else words, cells))
@@ -129,12 +127,8 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
     wording = {parameter: parameter_wording(parameter) for parameter in parameters}
     rows = []
     for owner in owners:
-        cells = []
-        for parameter, (_, _, factor) in wording.items():
-            name = own_name(parameter, owner)
-            deviation = deviations.get(name)
-            beside = f"± {factor * deviation:.{_decimals(factor * deviation)}f}" if deviation else ""
-            cells.append(Cell(digits(own.get(name), factor, deviation), beside=beside))
+        names = {own_name(parameter, owner): factor for parameter, (_, _, factor) in wording.items()}
+        cells = [identified_cell(own.get(name), factor, deviations.get(name)) for name, factor in names.items()]
         rows.append(Row(owner, cells))
     columns = [f"{words} [{unit}]" if unit else words for words, unit, _ in wording.values()]
     note = "Identified with the prior; of validation and test trials, from their first frames."
@@ -148,19 +142,20 @@ def parameter_wording(parameter: str) -> Wording:
     return words[0].upper() + words[1:], *next(fits, ("", 1.0))
 
 
+def identified_cell(value: float | None, factor: float, deviation: float | None) -> Cell:
+    """Return a value in its unit with its standard deviation, if that is known."""
+    beside = f"± {digits(deviation, factor, deviation)}" if deviation else ""
+    return Cell(digits(value, factor, deviation), beside=beside)
+
+
 def digits(value: float | None, factor: float, deviation: float | None = None) -> str:
     """Return a value in its unit, with two digits of its standard deviation, or with four digits without one."""
     if value is None:
         return NONE
     if not deviation:
         return f"{factor * value:.4g}".replace("-", MINUS)
-    text = f"{factor * value:.{_decimals(factor * deviation)}f}"
+    text = f"{factor * value:.{max(0, 1 - math.floor(math.log10(factor * deviation)))}f}"
     return text.replace("-", MINUS) if float(text) else text.lstrip("-")
-
-
-def _decimals(deviation: float) -> int:
-    """Number of decimals for two digits of a standard deviation."""
-    return max(0, 1 - math.floor(math.log10(deviation)))
 
 
 def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, float]) -> str:

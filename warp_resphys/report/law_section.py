@@ -10,7 +10,7 @@ from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from .data import FloatArray, RunReport
-from .identification_section import Wording, digits, parameter_wording
+from .identification_section import Wording, identified_cell, parameter_wording
 from .page import (
     NONE,
     Block,
@@ -140,8 +140,7 @@ def _terms_table(law: Mapping[str, Any]) -> PageTable:
         if not value and not deviation:  # Of a family of fibres that has no such part.
             continue
         (words, unit, factor), meaning = wording(name)
-        beside = f"± {digits(deviation, factor, deviation)}" if deviation else ""
-        cells = [Cell(digits(value, factor, deviation), beside=beside), Cell(unit or NONE)]
+        cells = [identified_cell(value, factor, deviation), Cell(unit or NONE)]
         cells += [Cell("yes" if name in bounds else "")] if bounds else []
         rows.append(Row(words, cells, small=meaning))
     return PageTable("Term", ["Identified", "Unit", *(["At a bound"] if bounds else [])], rows)

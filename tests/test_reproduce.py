@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -133,24 +132,3 @@ def test_a_robot_has_a_row_and_those_of_earlier_runs_keep_theirs(monkeypatch, tm
     assert "Tested on 2 trials, held out: " in page
     assert "A finer mesh moves the markers of the identified simulator by " in page
     assert json.loads(Path("out/robots.json").read_text()).keys() == {"sopra", *kept}
-
-
-@pytest.mark.slow
-def test_ctrl_c_stops_the_run_which_saves_its_state(tmp_path):
-    command = [
-        sys.executable,
-        "-c",
-        f"import runpy, signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        f"import sys; sys.path.insert(0, {str(SCRIPT.parent)!r}); sys.argv = ['reproduce.py', "
-        f"'beam_oscillation/default']; runpy.run_path({str(SCRIPT)!r}, run_name='__main__')",
-    ]
-    child = subprocess.Popen(command, cwd=tmp_path, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    for line in child.stderr:
-        if "simulate: " in line:
-            break
-    child.send_signal(2)
-    err = child.communicate(timeout=100)[1]
-    assert child.returncode == 130, err
-    assert "interrupted in stage" in err
-    assert "the same command continues from there" in err
-    assert "Traceback" not in err

@@ -105,27 +105,6 @@ def test_released_bodies_come_to_rest_where_the_training_ends_and_are_told_apart
     np.testing.assert_allclose(values["interpolation"], fake.dataset.observed[2:], atol=1e-3)
 
 
-def test_the_motion_of_a_base_is_an_input():
-    base = np.zeros((4, 2 * FRAMES + 1, 6))
-    base[:, :, 0] = np.array([1.0, 2.0, 3.0, 1.5])[:, None]
-    fake = experiment([1.0, 2.0, 3.0, 1.5], ("rest",) * 4, ["a", "b", "c"], inputs={}, base=base)
-    values, _ = without_physics(fake, ["d"])
-    np.testing.assert_allclose(values["interpolation"][0], fake.dataset.observed[3], atol=1e-6)
-
-
-def test_there_is_nothing_to_say_without_training_trials_of_the_kind():
-    fake = experiment([1.0, 2.0], ("rest", "released"), ["a"])
-    assert without_physics(fake, ["b"]) == ({}, {})
-
-
-@pytest.mark.parametrize("payload", [0.0, 0.05])
-def test_a_payload_distinguishes_trials(payload):
-    fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"], payload=payload * np.array([1.0, 2.0, 1.5]))
-    fake.dataset.inputs["pressure"][:] = 1.0
-    values, _ = without_physics(fake, ["c"])
-    assert ("interpolation" in values) == (payload > 0.0)
-
-
 def test_a_marker_of_other_trials_stays_at_rest():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.dataset.observed[:2, :, 1] = np.nan
@@ -141,3 +120,16 @@ def test_a_training_trial_can_be_predicted_without_itself():
     fitted, left_out = (without_physics(fake, ["c", "a"], left_out=out)[0]["interpolation"] for out in (False, True))
     np.testing.assert_allclose(fitted[0], fake.dataset.observed[2], atol=1e-5)
     np.testing.assert_allclose(left_out[0], fake.dataset.observed[2] - 0.3, atol=1e-5)
+
+
+@pytest.mark.parametrize("driven_by", ["payload", "base", None])
+def test_a_payload_and_the_motion_of_a_base_are_inputs(driven_by):
+    levels = np.array([1.0, 2.0, 3.0, 1.5])
+    base = np.zeros((4, 2 * FRAMES + 1, 6))
+    base[:, :, 0] = levels[:, None]
+    more = {"payload": {"payload": 0.05 * levels}, "base": {"base": base}}.get(driven_by, {})
+    values, _ = without_physics(experiment(levels, ("rest",) * 4, ["a", "b", "c"], inputs={}, **more), ["d"])
+    assert ("interpolation" in values) == (driven_by is not None)
+    if driven_by:
+        expected = experiment(levels, ("rest",) * 4, []).dataset.observed[3]
+        np.testing.assert_allclose(values["interpolation"][0], expected, atol=1e-6)

@@ -59,25 +59,20 @@ class MotionLoss:
         shares = [count / sum(counts) for count in counts]
         self._weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
 
-    def markers(self, model: ResidualForce | None) -> list[torch.Tensor]:
-        """Simulated markers (R, T, M, 3) of each group [m], with the force of the model; without a force if None.
+    def _errors(self, model: ResidualForce | None) -> list[torch.Tensor]:
+        """(R, T, M, 3) simulated less observed markers of each group [m], without a force if the model is None.
 
         Raises:
             ConvergenceError: the simulation fails.
         """
-        markers = []
+        errors = []
         for group in self._groups:
             force: Any = None
             if model is not None:
                 force = LearnedPredictor(model, group.context, None, group.frames, group.base)
             simulated = group.replay(group.start, self._parameters or None, force=force, windows=group.windows)
-            markers.append(simulated[0])
-        return markers
-
-    def _errors(self, model: ResidualForce | None) -> list[torch.Tensor]:
-        """(R, T, M, 3) simulated less observed markers of each group [m]."""
-        pairs = zip(self._groups, self.markers(model), strict=True)
-        return [group.replay.errors(markers[None])[0] for group, markers in pairs]
+            errors.append(group.replay.errors(simulated)[0])
+        return errors
 
     def __call__(self, model: ResidualForce | None) -> torch.Tensor:
         """Returns the loss, differentiable in the model's weights."""

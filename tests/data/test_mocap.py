@@ -1,12 +1,8 @@
-from pathlib import Path
-
 import ezc3d
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.processing import fill_gaps
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.release import find_release
 from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError
@@ -82,28 +78,6 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
 def test_unknown_unit(tmp_path, trajectory):
     with pytest.raises(DataFileError, match="positions in 'inch'"):
         read_recording(write_c3d(tmp_path / "inch.c3d", trajectory, "abc", unit="inch"))
-
-
-def test_fill_gaps_interpolates_a_swing_and_refuses_a_long_gap():
-    time = np.arange(100) / 100.0
-    swing = np.stack([np.sin(2 * np.pi * 7.0 * time), np.cos(2 * np.pi * 7.0 * time), time], axis=1)
-    positions = np.stack([swing, 2.0 * swing], axis=1)
-    gappy = positions.copy()
-    gappy[40:43, 1] = np.nan
-    gappy[98:, 0] = np.nan
-    recording = Recording(("a", "b"), gappy, 100.0, Path("swing.c3d"))
-    filled = fill_gaps(recording, longest=3).positions
-    np.testing.assert_allclose(filled[:98], positions[:98], atol=0.06)
-    np.testing.assert_array_equal(filled[98:, 0], np.stack([positions[97, 0]] * 2))
-    np.testing.assert_array_equal(recording.positions, gappy)
-    with pytest.raises(DataFileError, match="marker b is occluded in frames 40 to 42"):
-        fill_gaps(recording, longest=2)
-
-
-def test_never_seen_marker_is_refused():
-    positions = np.full((10, 1, 3), np.nan)
-    with pytest.raises(DataFileError, match=r"x\.c3d: marker a is seen in 0 of 10 frames"):
-        fill_gaps(Recording(("a",), positions, 100.0, Path("x.c3d")), longest=20)
 
 
 @pytest.mark.parametrize("release", [60.0, 60.5])

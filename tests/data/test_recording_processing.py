@@ -49,6 +49,8 @@ def test_masked_gaps_stay_and_short_ones_are_filled():
     np.testing.assert_array_equal(filled.positions[recording.seen], recording.positions[recording.seen])
     with pytest.raises(DataFileError, match=r"swing\.c3d: marker tip 2 is occluded in frames 150 to 169"):
         fill_gaps(recording, 5)
+    whole = fill_gaps(recording, 20)  # At the ends, with the nearest sample.
+    np.testing.assert_array_equal(whole.positions[:4, 2], np.stack([true[4, 2]] * 4))
     recording.positions[:, 3] = np.nan
     with pytest.raises(DataFileError, match=r"swing\.c3d: marker base 2 is seen in 0 of 300 frames"):
         fill_gaps(recording, 5, mask_long=True)

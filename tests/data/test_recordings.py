@@ -419,16 +419,6 @@ def test_damaged_and_foreign_files(tmp_path, positions):
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataFileError, match=r"cut\.npz is not a NumPy file of plain arrays"):
         read_recording(tmp_path / "cut.npz")
-    refused, expected = 0, read_recording(tmp_path / "swing.npz").positions
-    for at in range(0, len(whole), 97):  # Whatever is overwritten, there is one sentence, or the same recording.
-        (tmp_path / "spoilt.npz").write_bytes(whole[:at] + b"(" + whole[at + 1 :])
-        try:
-            result = read_recording(tmp_path / "spoilt.npz").positions
-        except DataFileError as error:
-            refused += "spoilt.npz" in str(error)
-        else:
-            np.testing.assert_array_equal(result, expected)
-    assert refused > 10
     np.save(tmp_path / "single.npy", positions)
     (tmp_path / "single.npy").rename(tmp_path / "single.npz")
     with pytest.raises(DataFileError, match="is a single array"):

@@ -190,14 +190,6 @@ def test_a_lens_sees_no_rays_where_it_cannot_be_undistorted():
     assert rays[2, :2].isnan().all()
 
 
-def test_a_scan_is_read_by_its_name(tmp_path):
-    points = scan(REST, 0.0, 50)
-    np.save(tmp_path / "scan.npy", 1e3 * points)
-    read, normals = wr.read_scan(str(tmp_path / "scan.npy"), unit=1e-3)
-    np.testing.assert_allclose(read, points)
-    assert normals is None
-
-
 def test_two_lenses_have_values_of_their_own(beam):
     """Two depth cameras, of which one has a longer lens than is assumed."""
     pose, q = beam

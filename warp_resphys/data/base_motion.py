@@ -130,12 +130,17 @@ def followed(markers: FloatArray, still: FloatArray, source: str | Path, what: s
             continue
         motion = kabsch(still[seen[frame]], markers[frame, seen[frame]])
         rotation[frame], translation[frame] = motion.rotation, motion.translation
+    from scipy.interpolate import make_smoothing_spline
+
     frames, known = np.arange(len(markers)), np.flatnonzero(enough)
     inside = np.clip(frames, known[0], known[-1])
     turned = Slerp(known, Rotation.from_matrix(rotation[known]))(inside) if len(known) > 1 else None
     matrices = np.broadcast_to(rotation[known[0]], rotation.shape) if turned is None else turned.as_matrix()
     moved = np.stack([np.interp(frames, known, x) for x in translation[known].T], axis=1)
-    return _smoothed(poses_of(matrices, moved))
+    poses, at = poses_of(matrices, moved), frames.astype(np.float64)
+    if len(poses) < 5:
+        return poses
+    return np.stack([make_smoothing_spline(at, x)(at) if np.ptp(x) > 0.0 else x for x in poses.T], axis=1)
 
 
 def in_frame(poses: FloatArray, frame: RigidTransform) -> FloatArray:
@@ -171,15 +176,6 @@ def check_steps(poses: FloatArray, points: FloatArray, source: str | Path, what:
             f"{source}: {what} jumps by {_MILLI * steps.max():.0f} mm in step {int(steps.argmax()) + 1}, more than a "
             "body follows without being torn: check the unit of the motion, or take a smaller time_step."
         )
-
-
-def _smoothed(poses: FloatArray) -> FloatArray:
-    from scipy.interpolate import make_smoothing_spline
-
-    if len(poses) < 5:
-        return poses
-    frames = np.arange(len(poses), dtype=np.float64)
-    return np.stack([make_smoothing_spline(frames, x)(frames) if np.ptp(x) > 0.0 else x for x in poses.T], axis=1)
 
 
 def _unwrapped(vectors: FloatArray) -> FloatArray:

@@ -259,7 +259,16 @@ def bind_markers(
     """
     points = np.asarray(positions, dtype=np.float64)
     kinds = [kind] * len(names) if isinstance(kind, str) else list(kind)
-    _check_markers(points, names, kinds)
+    if points.shape != (len(names), 3) or len(kinds) != len(names) or not len(names):
+        raise InputError(
+            f"{len(names)} markers are named, with {len(kinds)} kinds and positions {points.shape}: there must be a "
+            "kind and three coordinates for each, and one marker at least."
+        )
+    for name, point, kind in zip(names, points, kinds, strict=True):
+        if kind not in KINDS:
+            raise InputError(f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}.")
+        if not np.isfinite(point).all():
+            raise InputError(f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out.")
     feet = closest_points(mesh, points)
     worst = int(np.argmax(np.abs(feet.distances)))
     if abs(feet.distances[worst]) > largest_distance:
@@ -288,19 +297,6 @@ def bind_markers(
         parts.append(follow_vertices(mesh, near, points[number][None]))
         places.append([number])
     return JoinedMarkers.of(parts, places)
-
-
-def _check_markers(points: np.ndarray, names: Sequence[str], kinds: Sequence[str]) -> None:
-    if points.shape != (len(names), 3) or len(kinds) != len(names) or not len(names):
-        raise InputError(
-            f"{len(names)} markers are named, with {len(kinds)} kinds and positions {points.shape}: there must be a "
-            "kind and three coordinates for each, and one marker at least."
-        )
-    for name, point, kind in zip(names, points, kinds, strict=True):
-        if kind not in KINDS:
-            raise InputError(f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}.")
-        if not np.isfinite(point).all():
-            raise InputError(f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out.")
 
 
 def _on_triangles(

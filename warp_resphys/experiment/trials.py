@@ -1,6 +1,6 @@
 """Trials of an experiment: their names, how they begin, and their split into training, validation and test."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -156,21 +156,15 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
         if not lists[name] and not (name == "validation" and run.in_the_loop is not None):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
             raise InputError(f"{group}.{name} is empty: add at least one of {group}.trials{more}.")
-    _check_once(group, lists, run.train_fraction < 1.0)
-    return lists
-
-
-def _check_once(group: str, lists: Mapping[str, Sequence[str]], parted: bool) -> None:
-    """Refuses a trial in two splits, except a partly trained trial whose remainder is tested."""
     seen: dict[str, str] = {}
     for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
-        if trial in seen:
-            if parted and (seen[trial], name) == ("train", "test"):
-                continue
+        # The remainder of a partly trained trial is tested.
+        if trial in seen and not (run.train_fraction < 1.0 and (seen[trial], name) == ("train", "test")):
             other = seen[trial]
             where = f"twice in {group}.{name}" if other == name else f"in {group}.{other} and {group}.{name}"
             raise InputError(f"the trial '{trial}' is {where}: a trial belongs to one split only.")
-        seen[trial] = name
+        seen.setdefault(trial, name)
+    return lists
 
 
 def folds_of(run: RunSettings) -> dict[str, Split] | None:

@@ -321,6 +321,8 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
     Raises:
         DataFileError: it is missing or damaged, or has no points.
     """
+    import trimesh
+
     path, normals = Path(path), None
     try:
         if path.suffix == ".npy":
@@ -328,7 +330,14 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
         elif path.suffix == ".pcd":
             points = _pcd(path)
         elif path.suffix in _READ_BY_TRIMESH:
-            points, normals = _by_trimesh(path, seed)
+            if not path.is_file():
+                raise ValueError("there is no such file")
+            read: Any = trimesh.load(str(path), process=False)
+            read = read.to_mesh() if isinstance(read, trimesh.Scene) else read
+            points = np.asarray(read.vertices, dtype=np.float64)
+            if isinstance(read, trimesh.Trimesh) and len(read.faces):
+                points, faces = trimesh.sample.sample_surface(read, _SAMPLED, seed=seed)
+                points, normals = np.asarray(points, dtype=np.float64), np.asarray(read.face_normals[faces])
         else:
             known = ", ".join((".npy", ".pcd", *_READ_BY_TRIMESH))
             raise ValueError(f"its extension is none of {known}")
@@ -342,20 +351,6 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
     if not seen.any():
         raise DataFileError(f"{path} has no points: scan again, or leave data.poses.NAME.cloud out.")
     return unit * points[seen], None if normals is None else normals[seen]
-
-
-def _by_trimesh(path: Path, seed: int) -> tuple[FloatArray, FloatArray | None]:
-    import trimesh
-
-    if not path.is_file():
-        raise ValueError("there is no such file")
-    read: Any = trimesh.load(str(path), process=False)
-    if isinstance(read, trimesh.Scene):
-        read = read.to_mesh()
-    if isinstance(read, trimesh.Trimesh) and len(read.faces):
-        points, faces = trimesh.sample.sample_surface(read, _SAMPLED, seed=seed)
-        return np.asarray(points, dtype=np.float64), np.asarray(read.face_normals[faces], dtype=np.float64)
-    return np.asarray(read.vertices, dtype=np.float64), None
 
 
 def _pcd(path: Path) -> FloatArray:

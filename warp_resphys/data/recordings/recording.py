@@ -147,7 +147,17 @@ def to_recording(
         raise DataFileError(f"{path}: its first frame is at {raw.start} s: give the time of each frame, or no start.")
     if raw.turns is not None:
         names, positions, rest = _with_arms(names, positions, rest, raw.turns, path)
-    _check_span(positions, path)
+    seen = positions[np.isfinite(positions).all(axis=2)]
+    if not len(seen):
+        raise DataFileError(f"{path}: no marker is seen in any frame; check how it was exported.")
+    with np.errstate(over="ignore"):
+        span = float(np.ptp(seen, axis=0).max())
+    if not LEAST_SPAN <= span <= LARGEST_SPAN:  # as in a wrong unit
+        size = f"all markers lie within {1e3 * span:.2g} mm" if span < LEAST_SPAN else f"markers span {span:.3g} m"
+        raise DataFileError(
+            f"{path}: {size}, which no recording of a robot does; check the unit of its positions and set units to it "
+            "(m, cm or mm)."
+        )
     base = None
     if raw.base is not None:
         if raw.base.shape != (len(positions), 7):
@@ -189,21 +199,6 @@ def _with_arms(
         names = (*names, *new)
         rest = None if rest is None else np.concatenate([rest, np.full((3, 3), np.nan)])
     return names, positions, rest
-
-
-def _check_span(positions: FloatArray, path: Path) -> None:
-    """Checks that positions [m] have the size of a laboratory; they do not in a wrong unit."""
-    seen = positions[np.isfinite(positions).all(axis=2)]
-    if not len(seen):
-        raise DataFileError(f"{path}: no marker is seen in any frame; check how it was exported.")
-    with np.errstate(over="ignore"):
-        span = float(np.ptp(seen, axis=0).max())
-    if not LEAST_SPAN <= span <= LARGEST_SPAN:
-        size = f"all markers lie within {1e3 * span:.2g} mm" if span < LEAST_SPAN else f"markers span {span:.3g} m"
-        raise DataFileError(
-            f"{path}: {size}, which no recording of a robot does; check the unit of its positions and set units to it "
-            "(m, cm or mm)."
-        )
 
 
 def _names(raw: RawRecording, path: Path, given: Sequence[str] | None) -> tuple[str, ...]:

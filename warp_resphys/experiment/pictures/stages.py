@@ -7,7 +7,7 @@ of gravity, the clamps and the release are fitted to the pose, as nothing else s
 
 import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from ...pictures.motion import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
 from ...report.identification_section import parameter_rows
 from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
-from ...settings.pictures import PictureData, PoseSettings
+from ...settings.pictures import PictureData
 from ...settings.run import RunSettings
 from ...settings.stages import ReportStage, StageSettings
 from ..build import build_mesh, simulation_device
@@ -108,7 +108,11 @@ def check_pictures(run: RunSettings) -> None:
     assert wanted is not None
     read_lenses(data)
     for name, pose in data.poses.items():
-        if not (pose.outline or pose.points or pose.cloud or (pose.depth and _has_depth(data, pose))):
+        if data.folder is None:
+            deep = data.simulated is not None and data.simulated.depth is not None
+        else:
+            deep = any(frame.depth is not None for frame in scene_of(data, pose, Path()).frames)
+        if not (pose.outline or pose.points or pose.cloud or (pose.depth and deep)):
             raise InputError(f"data.poses.{name} has no outline, no points, no scan and no depth image: give one.")
         if pose.release is not None and pose.mesh is None:
             released_force(name, pose, build_mesh(run.mesh))
@@ -124,13 +128,6 @@ def check_pictures(run: RunSettings) -> None:
             raise InputError(f"identify.parameters.{name}.per is lens, and is not of a camera: take all or material.")
         if limits.per == "trial" and name not in _PLACED:
             raise InputError(f"identify.parameters.{name}.per is trial, which says nothing of others: take material.")
-
-
-def _has_depth(data: PictureData, pose: PoseSettings) -> bool:
-    """Whether a pose has depth images."""
-    if data.folder is None:
-        return data.simulated is not None and data.simulated.depth is not None
-    return any(frame.depth is not None for frame in scene_of(data, pose, Path()).frames)
 
 
 class _Plan:
@@ -338,27 +335,16 @@ def compare_pictures(context: StageContext) -> None:
 
 def summary_of(rows: Sequence[Mapping[str, Any]], data: PictureData) -> list[PictureResult]:
     """Returns the results of each pose: means over its pictures, by model."""
-    return [
-        PictureResult(
-            pose=name,
-            material=data.poses[name].material or "",
-            tested=name in data.test,
-            pictures=len({row["picture"] for row in rows if row["pose"] == name}),
-            **{
-                key: {
-                    model: _mean(row[key] for row in rows if (row["pose"], row["model"]) == (name, model))
-                    for model in MODELS
-                }
-                for key in ("outline_mm", "outline_px", "overlap", "cloud_mm", "points_mm")
-            },
-        )
-        for name in (*data.train, *data.test)
-    ]
-
-
-def _mean(values: Iterator[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+    results = []
+    for name in (*data.train, *data.test):
+        own, means = [row for row in rows if row["pose"] == name], dict[str, dict[str, float | None]]()
+        for key in ("outline_mm", "outline_px", "overlap", "cloud_mm", "points_mm"):
+            for model in MODELS:
+                known = [row[key] for row in own if row["model"] == model and row[key] is not None]
+                means.setdefault(key, {})[model] = float(np.mean(known)) if known else None
+        count = len({row["picture"] for row in own})
+        results.append(PictureResult(name, data.poses[name].material or "", name in data.test, count, **means))
+    return results
 
 
 def report_pictures(context: StageContext) -> None:

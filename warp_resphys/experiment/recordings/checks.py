@@ -27,7 +27,10 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     """Checks an experiment that observes its bodies through markers."""
     if run.is_laboratory and run.laboratory is not None and not run.laboratory.trials and not data.sequences:
         raise InputError("laboratory.trials is empty: name the trials, or set data.sequences.")
-    _check_files(data)
+    files: dict[str, str] = {}
+    for name, own in data.trials.items():
+        if own.file is not None and (other := files.setdefault(own.file, name)) != name:
+            raise InputError(f"the trials '{other}' and '{name}' have the same file, {own.file}: use it once.")
     if folds_of(run) is None:
         split_of(run)
     trials = trials_of(run)
@@ -40,8 +43,12 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     if begins & {*RESTING} and data.steps is None:
         raise InputError("data.steps is not set: give the number of time steps that are read from each recording.")
     drive = drive_of(run, body)
-    if drive is not None:
-        _check_inputs(data, drive)
+    if drive is not None and data.input_limit is None:
+        raise InputError(
+            f"data.input_limit is not set: give the largest input of the {drive.per}s, in {drive.quantity.unit}."
+        )
+    if drive is not None and data.parts is not None and max(data.parts) > len(drive.parts):
+        raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {len(drive.parts)}.")
     _check_waves(run, trials, drive)
     if begins & {*RESTING} and data.steps is not None and data.horizons:
         length = data.steps * run.time_step
@@ -58,16 +65,14 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
             raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
         if trial.begins == STATIC and (data.obstacle_motion or trial.obstacle_motion):
             raise InputError(f"the trial '{trial.name}' is a static pose: obstacles cannot move in it.")
-    if begins & {"held", "released"}:
-        _check_release(run, data)
-
-
-def _check_files(data: RecordedData) -> None:
-    """Refuses a file that is used by two trials."""
-    files: dict[str, str] = {}
-    for name, trial in data.trials.items():
-        if trial.file is not None and (other := files.setdefault(trial.file, name)) != name:
-            raise InputError(f"the trials '{other}' and '{name}' have the same file, {trial.file}: use it once.")
+    if begins & {"held", "released"} and (sideways := run.release.sideways):
+        if data.rest != "held":
+            raise InputError(
+                f"release.sideways is {sideways:g} m, but data.rest is {data.rest}, which gives the markers on the "
+                "undeformed body: set release.sideways to 0."
+            )
+        if not any(run.gravity):
+            raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
 
 
 def _check_markers(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body, begins: set[str]) -> None:
@@ -119,29 +124,6 @@ def _check_view(run: RunSettings, markers: MarkerSettings, trials: Sequence[Tria
             "there, or leave it out."
         )
     marker_view_of(markers, tracked, tuple({tuple(trial.tracked(tracked)) for trial in trials}))
-
-
-def _check_release(run: RunSettings, data: RecordedData) -> None:
-    sideways = run.release.sideways
-    if sideways == 0.0:
-        return
-    if data.rest != "held":
-        raise InputError(
-            f"release.sideways is {sideways:g} m, but data.rest is {data.rest}, which gives the markers on the "
-            "undeformed body: set release.sideways to 0."
-        )
-    if not any(run.gravity):
-        raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
-
-
-def _check_inputs(data: RecordedData, drive: Drive) -> None:
-    count = len(drive.parts)
-    if data.input_limit is None:
-        raise InputError(
-            f"data.input_limit is not set: give the largest input of the {drive.per}s, in {drive.quantity.unit}."
-        )
-    if data.parts is not None and max(data.parts) > count:
-        raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {count}.")
 
 
 def _check_waves(run: RunSettings, trials: Sequence[Trial], drive: Drive | None) -> None:

@@ -47,7 +47,16 @@ def import_recordings(context: StageContext) -> None:
     """
     observer, settings = Observer(context), context.settings
     observed = observer.observe(settings.trials)
-    _check_unit(observer, [x.driven for x in observed if x.driven is not None])
+    drive, limit = observer.drive, settings.data.input_limit
+    driven = [x.driven for x in observed if x.driven is not None]
+    if drive is not None and limit is not None and any(len(inputs) > 1 for inputs in driven):
+        highest = max(float(np.abs(inputs).max()) for inputs in driven)
+        if highest < NO_INPUT * limit:  # as in a wrong unit
+            raise DataFileError(
+                f"the {drive.quantity.plural} of all {len(driven)} recordings stay below {highest:.3g} "
+                f"{drive.quantity.unit}, and data.input_limit is {limit:.3g} {drive.quantity.unit}: give their unit in "
+                "the files (actuation_units, or the header of the column), or set the limit to the robot's maximum."
+            )
     if text := sessions_text({x.settings.name: x.raw.rate for x in observed}, [x.settings.session for x in observed]):
         log.warning("import: %s", text)
     training = [x.settings.name for x in observed] if settings.learned is None else settings.learned
@@ -91,20 +100,6 @@ def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) ->
         f"the recordings have different frame rates, as those of different sessions ({listed}): name them with "
         "data.trials.NAME.session, so that markers may have other places in each."
     )
-
-
-def _check_unit(observer: Observer, driven: Sequence[FloatArray]) -> None:
-    """Refuses recordings with negligible inputs, which indicate a wrong unit."""
-    drive, limit = observer.drive, observer.data.input_limit
-    if drive is None or limit is None or all(len(inputs) == 1 for inputs in driven):
-        return
-    highest = max(float(np.abs(inputs).max()) for inputs in driven)
-    if highest < NO_INPUT * limit:
-        raise DataFileError(
-            f"the {drive.quantity.plural} of all {len(driven)} recordings stay below {highest:.3g} "
-            f"{drive.quantity.unit}, and data.input_limit is {limit:.3g} {drive.quantity.unit}: give their unit in the "
-            "files (actuation_units, or the header of the column), or set the limit to the robot's maximum."
-        )
 
 
 def _offsets(observer: Observer, observed: Sequence[Observed]) -> FloatArray:

@@ -81,7 +81,7 @@ CURVE = {"slope_2": 0.5, "slope_3": 2.0, "slope_5": 0.0}
 
 
 def test_a_characteristic_curve_has_its_slope_in_each_octave_of_the_typical_command():
-    response = InputResponse(STEP, curve=(100.0, CURVE))
+    response = InputResponse(STEP, typical=100.0, **CURVE)
     ends = np.array([0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0])
     inner = (0.6 * ends[1:-1] + 0.4 * ends[2:])[:, None]
     slopes = (response.scaled(inner + 1e-4) - response.scaled(inner - 1e-4))[:, 0] / 2e-4

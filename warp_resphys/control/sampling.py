@@ -183,10 +183,8 @@ class Source:
         self.learned: Learned | None = robot.description.learned
         self.filters = robot.description.filters if self.learned is not None else ()
         values = {name: float(value[0]) for name, value in robot.parameters.items()}
-        names = "factor", "delay", "rise", "slew", "curve", "dead_band", "zero", "backlash", "lower"
-        acts = zip(names, response_of(driven.quantity, values), strict=True)
         self.range, self.moving = np.stack([self._low, self._high]), np.flatnonzero(self._high > self._low)
-        self.acts: dict[str, Any] = {name: value for name, value in acts if value is not None}
+        self.acts = response_of(driven.quantity, values)
         self.response = InputResponse(robot.time_step, **self.acts)
         reach = np.abs(self.response.scaled(np.stack([self._low, self._high]))).max(0)
         self.scale = np.where(reach > 0.0, reach, 1.0)

@@ -17,7 +17,6 @@ from ..stepping.quantity import Quantity
 Array = Any  # of NumPy or torch
 Memory = Mapping[str, Array]
 Number = torch.Tensor | float | None
-Curve = tuple[float, Mapping[str, Any]]  # typical command, and slopes by name
 
 SLOPES = tuple(f"slope_{k}" for k in range(1, 9))  # of the characteristic curve, in octaves of the typical command
 RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", "zero", "backlash", *SLOPES)  # of an input to its commands
@@ -41,8 +40,6 @@ class InputResponse:
         rise: time constant of the lag [s]; None for no lag.
         slew: reciprocal of the slew rate [s/unit], the largest change of the input in a second, as of a valve whose
             flow is choked; a number, or (1 or B,). None or zero for no limit.
-        curve: typical command, and slopes of the characteristic curve by the names in `SLOPES`, numbers or (1 or B,);
-            those left out are one. `_curved` describes it. None for a straight line.
         dead_band: largest command without an effect, as of a tendon that hangs slack; larger ones act less by it. Zero
             or more; a number, or (1 or B,). None for none.
         zero: command at which nothing acts, as of a gauge or a winch that was not zeroed; a number, or (1 or B,). None
@@ -51,7 +48,10 @@ class InputResponse:
             one direction; at rest, commands have risen to their values. Zero or more; a number, or (1 or B,). None for
             none.
         lower: least input; with a zero, lower ones count as this one.
+        typical: typical command, which the octaves of the characteristic curve follow.
         filters: F time constants of the exponential means [s].
+        slopes: of the characteristic curve by the names in `SLOPES`, numbers or (1 or B,); those left out are one.
+            `_curved` describes it. A straight line without any.
     """
 
     def __init__(
@@ -61,14 +61,16 @@ class InputResponse:
         delay: Number = None,
         rise: Number = None,
         slew: Number = None,
-        curve: Curve | None = None,
         dead_band: Number = None,
         zero: Number = None,
         backlash: Number = None,
         lower: float = -math.inf,
+        typical: float = 1.0,
         filters: Sequence[float] = (),
+        **slopes: Number,
     ) -> None:
-        self.filters, self._factor, self._curve, self._dead_band = tuple(filters), factor, curve, dead_band
+        self.filters, self._factor, self._dead_band = tuple(filters), factor, dead_band
+        self._typical, self._slopes = typical, slopes
         self._zero, self._backlash, self._lower = zero, backlash, lower
         self._late = None if delay is None else delay / time_step
         self._length = 0 if self._late is None else int(_whole(self._late).max()) + 1
@@ -126,7 +128,7 @@ class InputResponse:
             beyond = abs(commands) - _column(self._dead_band)
             commands = like.sign(commands) * like.where(beyond > 0.0, beyond, 0.0 * beyond)
         scaled = commands if self._factor is None else commands * _column(self._factor)
-        return scaled if self._curve is None else _curved(scaled, *self._curve)
+        return _curved(scaled, self._typical, self._slopes) if self._slopes else scaled
 
     def _delayed(self, queue: Array, count: int) -> Array:
         """Delayed commands (T, ..., C), from a queue (L + T, ..., C)."""
@@ -141,15 +143,11 @@ class InputResponse:
         return (1.0 - share) * queue[now, rows] + share * queue[now - 1, rows]
 
 
-def response_of(
-    quantity: Quantity, parameters: Mapping[str, Any]
-) -> tuple[Number, Number, Number, Number, Curve | None, Number, Number, Number, float]:
-    """Returns the identified factor, delay, rise, slew, curve, dead band, zero, backlash, and the least input."""
-    own = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
-    slopes = {word: own[word] for word in SLOPES if own[word] is not None}
-    curve = (quantity.typical, slopes) if slopes else None
-    first = own["factor"], own["delay"], own["rise"], own["slew"]
-    return *first, curve, own["dead_band"], own["zero"], own["backlash"], quantity.lower
+def response_of(quantity: Quantity, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the arguments of `InputResponse` for the identified parameters of an input, besides its filters."""
+    values = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
+    known = {word: value for word, value in values.items() if value is not None}
+    return {**known, "lower": quantity.lower, "typical": quantity.typical}
 
 
 def with_means(acting: Array, means: Array) -> Array:

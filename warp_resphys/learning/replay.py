@@ -173,7 +173,7 @@ class Replay:
         for name, commands in inputs.actuation.items():
             if name in HUNG:
                 continue
-            response = InputResponse(self.simulator.time_step, *response_of(self.simulator.inputs[name], spread))
+            response = InputResponse(self.simulator.time_step, **response_of(self.simulator.inputs[name], spread))
             throughout = commands.ndim == 2
             first = resting.actuation.get(name, 0.0 * (commands if throughout else commands[0]))
             acting[name] = response.scaled(commands) if throughout else response(response.steady(first), commands)[0]

@@ -2,8 +2,8 @@ import ezc3d
 import numpy as np
 import pytest
 
+from warp_resphys.data.recordings.processing import find_release
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.release import find_release
 from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError
 

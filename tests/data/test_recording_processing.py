@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
+from warp_resphys.data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release
 from warp_resphys.data.recordings.quality import (
     check_base,
     compare_base,
@@ -15,7 +15,6 @@ from warp_resphys.data.recordings.quality import (
     quality_table,
 )
 from warp_resphys.data.recordings.recording import Recording
-from warp_resphys.data.recordings.release import Release
 from warp_resphys.io.errors import DataFileError, InputError
 
 NOISE = 5e-6

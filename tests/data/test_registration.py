@@ -5,9 +5,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from warp_resphys.data.recordings.processing import fill_gaps
+from warp_resphys.data.recordings.processing import fill_gaps, find_release
 from warp_resphys.data.recordings.reading import read_recording
-from warp_resphys.data.recordings.release import find_release
 from warp_resphys.data.registration import axes_rotation, register_markers
 from warp_resphys.data.rigid import RigidTransform, kabsch
 from warp_resphys.io.errors import DataFileError, InputError

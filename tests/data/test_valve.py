@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from warp_resphys.data.recordings.processing import valve_opening
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
-from warp_resphys.data.recordings.release import valve_opening
 from warp_resphys.data.recordings.segment import (
     CLAMP_LABELS,
     MARKERS,

@@ -10,8 +10,8 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.spatial.distance import cdist
 
 from ...io.errors import DataFileError, InputError, listed
+from .processing import Release
 from .recording import FloatArray, Recording, bridged, runs
-from .release import Release
 
 LEAST_JUMP = 2e-4  # [m]
 _MILLI = 1e3

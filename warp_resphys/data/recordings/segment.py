@@ -12,9 +12,9 @@ import numpy as np
 
 from ...io.errors import DataFileError
 from ...io.files import read_arrays
+from .processing import valve_opening
 from .reading import numbers, write_recording
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
-from .release import valve_opening
 
 # Nominal positions [m]: four markers on the clamp, three at the tip, in the order of the labels.
 SEGMENT_NOMINAL: Final = np.array(

@@ -12,10 +12,9 @@ from ...data.actuation import NO_INPUT, check_inputs
 from ...data.base_motion import followed, in_frame, prescribed, rigid
 from ...data.marker_view import MarkerView
 from ...data.obstacle_motion import prescribed_all
-from ...data.recordings.processing import fill_gaps, release_of, resample, trim_to_release
+from ...data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release, valve_opening
 from ...data.recordings.quality import check_base, check_motion
 from ...data.recordings.recording import Recording
-from ...data.recordings.release import Release, valve_opening
 from ...data.registration import Registration, register_markers
 from ...data.rigid_bodies import corners_of, owners
 from ...io.errors import DataFileError, listed

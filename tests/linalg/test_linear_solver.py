@@ -1,5 +1,6 @@
 """Every layout factorises the same batch of symmetric matrices."""
 
+import os
 import sys
 
 import numpy as np
@@ -10,6 +11,7 @@ from warp_resphys.linalg.bordered import BorderedSolver
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
 from warp_resphys.linalg.pardiso import has_pardiso
+from warp_resphys.linalg.sparse import SparseSolver
 
 NODES, BATCH, HUB = 16, 3, 5
 
@@ -215,3 +217,16 @@ def test_an_indefinite_arrow_may_have_a_singular_band():
     column = right[:, solver.dofs, 0].clone()
     factor.solve_in_place(column)
     torch.testing.assert_close(column, factor.solve(right)[:, solver.dofs, 0])
+
+
+def test_an_indefinite_matrix_prints_nothing(capfd):
+    """CHOLMOD warns by C of a matrix that is not positive definite; other output of the process is kept."""
+    pytest.importorskip("cholespy")
+    solver = SparseSolver(np.array([0]), np.array([0]), 1, 3, torch.device("cpu"), torch.float64)
+    values = torch.zeros(1, solver.n_values, dtype=torch.float64)
+    values[0, solver.address[0][[0, 4, 8]]] = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    os.write(1, b"before\n")
+    factor = solver.factor(values)
+    print("after", flush=True)
+    assert capfd.readouterr().out == "before\nafter\n"
+    assert factor.failed.all()

@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..energies.base import PairTangents, PointSet
+from ..energies.base import PairTangents
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..io.errors import InputError
@@ -328,17 +328,14 @@ class ProjectiveHessian(HessianApproximation):
         self._potential, self._pattern, self._linear = potential, pattern, linear
         self.vertex_at = pattern.free
         self._address = torch.as_tensor(linear.address[:, 0], device=potential.device, dtype=torch.int64)
-        self._products = [self._gradient_products(s) for s in potential.sets]
+        self._products = list[torch.Tensor]()  # (C, Q, pairs) of the gradients of every node pair a >= c of a cell
+        for gradients in (s.source.gradients for s in potential.sets):
+            a, c = np.tril_indices(gradients.shape[2])
+            products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
+            self._products.append(torch.as_tensor(products, device=potential.device, dtype=torch.float64))
         self._key: tuple[torch.Tensor, ...] | None = None
         self.clamped = torch.ones(potential.batch, dtype=torch.bool, device=potential.device)
         self._factor: Factor | None = None
-
-    def _gradient_products(self, points: PointSet) -> torch.Tensor:
-        """Returns the scalar products (C, Q, pairs) of the gradients of every node pair a >= c of a cell."""
-        gradients = points.source.gradients
-        a, c = np.tril_indices(gradients.shape[2])
-        products = np.einsum("cqpi,cqpi->cqp", gradients[:, :, a], gradients[:, :, c])
-        return torch.as_tensor(products, device=self._potential.device, dtype=torch.float64)
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
         p = self._potential

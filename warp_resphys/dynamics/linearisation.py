@@ -90,19 +90,16 @@ class Linearisation:
             solution = None
             if not self._has_factor:
                 self._potential.positions.copy_(self._at)
-                solution = self._solved_with_kept_factor(fields) if 0 < fields.shape[3] <= _MOST_COLUMNS else None
+                if 0 < fields.shape[3] <= _MOST_COLUMNS:
+                    columns = [self._potential.restrict(column) for column in fields.double().unbind(3)]
+                    if (solutions := hessian.solve_with_kept_factor(columns)) is not None:
+                        solution = torch.stack(solutions, 3).to(fields)
                 if solution is None:
                     hessian.refactor_exact()
                     self._has_factor = True
             if solution is None:
                 solution = hessian.solve(fields.flatten(1, 2)).unflatten(1, (-1, 3))
         return self._coordinates.expand(solution).flatten(1, 2)
-
-    def _solved_with_kept_factor(self, fields: torch.Tensor) -> torch.Tensor | None:
-        """Returns solutions (B, N, 3, m) by `ExactHessian.solve_with_kept_factor`, or None."""
-        hessian, columns = self._workspace.hessian(self._name), fields.double().unbind(3)
-        solutions = hessian.solve_with_kept_factor([self._potential.restrict(column) for column in columns])
-        return None if solutions is None else torch.stack(solutions, 3).to(fields)
 
     def update(self, x: torch.Tensor) -> None:
         """Prepares H at x for `product` and `shifted`, without a factor."""

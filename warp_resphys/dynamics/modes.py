@@ -85,14 +85,12 @@ def fix_signs(shapes: FloatArray) -> FloatArray:
     return shapes * np.sign(np.take_along_axis(shapes, first[None], 0))
 
 
-def _blocks(inertia: scipy.sparse.csc_array) -> NDArray[np.int64]:
-    """Returns the coordinates (m,) that are coupled by an inertia matrix."""
-    return np.flatnonzero(np.diff(inertia.indptr) > 1)
-
-
 def _root(inertia: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
     """Returns the triangular R with R^T R = M; only the few coordinates of rigid parts and glue are coupled."""
-    coupled, root = _blocks(inertia), scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil()
+    coupled, root = (
+        np.flatnonzero(np.diff(inertia.indptr) > 1),
+        scipy.sparse.diags_array(np.sqrt(inertia.diagonal())).tolil(),
+    )
     if len(coupled):
         block = inertia[coupled][:, coupled].toarray()
         root[np.ix_(coupled, coupled)] = np.linalg.cholesky(block).T

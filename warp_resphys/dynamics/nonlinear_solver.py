@@ -129,12 +129,10 @@ class NonlinearSolver:
         self.hessian: HessianApproximation
         kind = settings.linear_solver
         where = (potential.device, factors, pattern.positions, potential.has_pairs, settings.name != "newton")
-        if settings.name == "projective_dynamics":
-            linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 1, *where)
-            self.hessian = ProjectiveHessian(potential, pattern, linear)
-        else:
-            linear = make_linear_solver(kind, pattern.rows, pattern.cols, len(pattern.free), 3, *where)
-            self.hessian = ExactHessian(potential, pattern, linear)
+        projective = settings.name == "projective_dynamics"
+        count, block = len(pattern.free), 1 if projective else 3
+        linear = make_linear_solver(kind, pattern.rows, pattern.cols, count, block, *where)
+        self.hessian = (ProjectiveHessian if projective else ExactHessian)(potential, pattern, linear)
         # With an iterative linear solver the solutions dominate the cost, so the Hessian may as well be up to date.
         quasi = 0 if linear.iterates else settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
         after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": NEVER}

@@ -268,15 +268,13 @@ class BoundContact(BoundEnergy):
             self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
         self._free = (~torch.isin(self._vertices, self._fixed)).to(self._area)  # (P,) zero at fixed vertices
-        rigid = [self._rigid_part(site, name) for name in site.body.controls]
-        self._rigid = [(surface, within) for surface, within in rigid if len(surface)]  # others are out of reach
+        self._rigid = list[tuple[torch.Tensor, torch.Tensor]]()  # points of rigid parts, and their vertices within
+        for name in site.body.controls:
+            cells = site.body.mesh.cells[site.body.mesh.region(name)]
+            own = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
+            if len(surface := torch.isin(self._vertices, own).nonzero().ravel()):  # others are out of reach
+                self._rigid.append((surface, own[~torch.isin(own, self._vertices)]))
         self._check_start(like)
-
-    def _rigid_part(self, site: EnergySite, name: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the numbers of a rigid part's points, and its vertices within the body."""
-        cells = site.body.mesh.cells[site.body.mesh.region(name)]
-        own = torch.as_tensor(np.unique(cells) + site.first, device=self._vertices.device)
-        return torch.isin(self._vertices, own).nonzero().ravel(), own[~torch.isin(own, self._vertices)]
 
     def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
         """Returns the poses for parameters and inputs by name."""

@@ -25,10 +25,6 @@ from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
 from .placement import PlacedEnergy
 
 
-def _do_nothing() -> None:
-    """Default of `IncrementalPotential.on_direction`."""
-
-
 @dataclass(frozen=True)
 class StepTerms:
     """The data of a step in the incremental potential (equation in the module's docstring)."""
@@ -85,7 +81,7 @@ class IncrementalPotential(Launcher):
         device: torch.device,
     ) -> None:
         super().__init__(batch, device)
-        self.on_direction: Callable[[], None] = _do_nothing
+        self.on_direction: Callable[[], None] = lambda: None
         self.n_vertices = n_vertices = coordinates.n_vertices
         self.coordinates = DeviceCoordinates(coordinates, torch.empty(0, device=device, dtype=torch.float64))
         self.energies: list[Term] = []
@@ -162,7 +158,10 @@ class IncrementalPotential(Launcher):
                     self.gather(s, stress, self.residual),
                 ]
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
-        project = self._projections(residual)
+        project, c = [], self.coordinates
+        if c.slides:  # removes the residual normal to symmetry planes
+            planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
+            project = [self.record(kernels.project, (b, len(c.sliding)), planes, [residual])]
         self._load_commands += project
         self._load_commands.append(
             self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
@@ -175,14 +174,6 @@ class IncrementalPotential(Launcher):
         )
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)
-
-    def _projections(self, residual: Any) -> list[Any]:
-        """Returns the launch that removes the residual normal to symmetry planes, if there are any."""
-        c = self.coordinates
-        if not c.slides:
-            return []
-        planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
-        return [self.record(kernels.project, (self.batch, len(c.sliding)), planes, [residual])]
 
     def restrict(self, field: torch.Tensor) -> torch.Tensor:
         """Returns a field (B, N, 3, ...) that is zero at vertices without unknowns and normal to symmetry planes."""

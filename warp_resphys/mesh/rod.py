@@ -174,7 +174,12 @@ def boxes_hexahedra(boxes: Sequence[tuple[ArrayLike, ArrayLike]], size: float, n
     for number, (low, high) in enumerate(corners, 1):
         if not (np.isfinite([low, high]).all() and (high - low > _APART).all()):
             raise MeshError(f"box {number} reaches from {low.tolist()} to {high.tolist()} m: it has no volume")
-    lines = [_lines(corners[:, :, axis], size) for axis in range(3)]
+    lines = []  # coordinates of the planes normal to every axis
+    for axis in range(3):
+        planes = np.unique(corners[:, :, axis])
+        planes = planes[np.diff(planes, prepend=-np.inf) > _APART]
+        parts = [np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)), endpoint=False) for a, b in pairwise(planes)]
+        lines.append(np.concatenate([*parts, planes[-1:]]))
     grid = box_hexahedra((1.0, 1.0, 1.0), [len(planes) - 1 for planes in lines])
     places = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
     centres = places[grid.cells].mean(axis=1)[:, None]
@@ -184,11 +189,3 @@ def boxes_hexahedra(boxes: Sequence[tuple[ArrayLike, ArrayLike]], size: float, n
     used, cells = np.unique(grid.cells[inside], return_inverse=True)
     mesh = Mesh(places[used], cells.reshape(-1, 8))
     return mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
-
-
-def _lines(ends: FloatArray, size: float) -> FloatArray:
-    """Returns the coordinates of the mesh planes normal to an axis, ascending [m]."""
-    planes = np.unique(ends)
-    planes = planes[np.diff(planes, prepend=-np.inf) > _APART]
-    parts = [np.linspace(a, b, int(np.ceil((b - a) / size - 1e-9)), endpoint=False) for a, b in pairwise(planes)]
-    return np.concatenate([*parts, planes[-1:]])

@@ -41,7 +41,6 @@ UNUSED = Mesh(np.concatenate([MESH.vertices, [[1.0, 1.0, 1.0]]]), MESH.cells)
 INVERTED = Mesh(MESH.vertices, MESH.cells[:, [4, 5, 6, 7, 0, 1, 2, 3]])
 WHOLE = "is .*: it must be a whole number, one or more"
 CASES = [
-    ("youngs_modulus is", lambda s: make_material(youngs_modulus=0.0)),
     ("youngs_modulus is nan", lambda s: make_material(youngs_modulus=NAN)),
     ("youngs_modulus is", lambda s: make_material(youngs_modulus=[1e5, -1.0])),
     (r"youngs_modulus has shape \(1, 1, 1\)", lambda s: make_material(youngs_modulus=torch.ones(1, 1, 1))),
@@ -75,7 +74,6 @@ CASES = [
     (f"has {ELEMENTS + 1} values for {ELEMENTS} elements", lambda s: moved(s, {"density": [1000.0] * (ELEMENTS + 1)})),
     ("3 environments", lambda s: moved(s, {"youngs_modulus": np.full((3, 1), 1e5)}, 2)),
     ("3 environments", lambda s: moved(s, {"mass_damping": [1.0, 2.0, 3.0]}, 2)),
-    ("a body without fixed vertices has no static equilibrium", lambda s: build().static_equilibrium()),
     ("vertices .* belong to no cell", lambda s: build(UNUSED)),
     ("inverted", lambda s: build(INVERTED)),
 ]

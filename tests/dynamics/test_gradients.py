@@ -175,6 +175,7 @@ def test_poissons_ratio_of_zero_has_a_derivative():
     assert row.relative_error <= 1e-6
 
 
+@pytest.mark.slow
 def test_gradient_through_a_hundred_and_twenty_steps():
     s = simulator(integrator="bdf2", material=replace(DAMPED, youngs_modulus=3e4))
     state, steps = pose(s, "bent", 1), 120

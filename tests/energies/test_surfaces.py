@@ -410,7 +410,7 @@ def test_a_body_touches_itself(device):
         assert float(forces.normal.norm()) > 0.01
 
 
-@pytest.mark.parametrize("rigid", ["", "layer"])
+@pytest.mark.parametrize("rigid", [pytest.param("", marks=pytest.mark.slow), "layer"])
 def test_batch_is_what_its_environments_are_alone(rigid, device):
     """Four environments with different contacts in one batch are what they are alone, on a CPU bit for bit."""
     random = np.random.default_rng(1)

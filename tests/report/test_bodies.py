@@ -79,6 +79,7 @@ def test_second_view_is_from_below():
     assert abs(np.argwhere(dots[1, 1]).mean(axis=0) - np.argwhere(dots[0, 1]).mean(axis=0)).max() > 10
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("can_draw")
 def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
     arm = shipped_arm("arm_hexahedra_500")

@@ -29,6 +29,7 @@ def pixels(picture, colour):
     return int((np.abs(picture - matplotlib.colors.to_rgb(colour)).max(axis=2) < 0.15).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("can_draw")
 def test_an_outlier_is_named_and_connected_and_a_marker_that_was_not_seen_is_left_out(tmp_path):
     fits = drawn(POINTS, tmp_path / "fits.png")

@@ -1,9 +1,8 @@
-"""Controllers: open loop (a plan is played), receding horizon (a new plan at every step), and Jacobian feedback."""
+"""Controllers: receding horizon (a new plan at every step), and Jacobian feedback."""
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
-from typing_extensions import override
 
 from ..settings.control import LimitsOfInputs
 from .baselines import DELAYS, LinearModel
@@ -19,26 +18,10 @@ _LITTLE = 1e-3  # regularises Broyden's correction: squared change of the inputs
 _DAMPING = 0.05  # of the inverse of the Jacobian, relative to its largest singular value
 
 
-class Controller(ABC):
-    """Commands inputs (n,) at each step, from the markers observed after the previous step."""
-
-    @abstractmethod
-    def command(self, number: int, markers: FloatArray) -> FloatArray:
-        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
+Controller = Callable[[int, FloatArray], FloatArray]  # inputs (n,) of a step, from markers (M, 3) before it [m]
 
 
-class OpenLoop(Controller):
-    """Plays a plan (T, n)."""
-
-    def __init__(self, inputs: FloatArray) -> None:
-        self._inputs = inputs
-
-    @override
-    def command(self, number: int, markers: FloatArray) -> FloatArray:
-        return np.asarray(self._inputs[number])
-
-
-class RecedingHorizon(Controller):
+class RecedingHorizon:
     """Plans at every step with a reduced model, from an estimate of its state.
 
     Args:
@@ -53,8 +36,8 @@ class RecedingHorizon(Controller):
         self._estimator = Estimator(model, np.zeros(model.parts), np.where(np.isfinite(offset), offset, 0.0))
         self._offset = planner.tracked @ self._estimator.offset
 
-    @override
-    def command(self, number: int, markers: FloatArray) -> FloatArray:
+    def __call__(self, number: int, markers: FloatArray) -> FloatArray:
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
         estimate = self._estimator
         if number:
             estimate.correct(markers)
@@ -63,7 +46,7 @@ class RecedingHorizon(Controller):
         return command
 
 
-class LinearRecedingHorizon(Controller):
+class LinearRecedingHorizon:
     """Plans with a linear model, from the last markers; a disturbance observer removes its constant error.
 
     Args:
@@ -78,8 +61,8 @@ class LinearRecedingHorizon(Controller):
         self.expected = self.seen[0]
         self.missed = np.zeros_like(self.expected)
 
-    @override
-    def command(self, number: int, markers: FloatArray) -> FloatArray:
+    def __call__(self, number: int, markers: FloatArray) -> FloatArray:
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
         if number:
             now = np.where(np.isfinite(markers.ravel()), markers.ravel(), self.expected)
             self.missed = self.missed + _SETTLES * (now - self.expected - self.missed)
@@ -90,7 +73,7 @@ class LinearRecedingHorizon(Controller):
         return command
 
 
-class JacobianFeedback(Controller):
+class JacobianFeedback:
     """Feeds the error back through a measured Jacobian, which Broyden's rule updates while the robot moves.
 
     The rule is applied to means over a time window, because the body vibrates.
@@ -122,8 +105,8 @@ class JacobianFeedback(Controller):
         self._window = max(round(_AVERAGED / time_step), 1)
         self.past = np.zeros((0, sum(jacobian.shape)))  # points and inputs as shares, latest last
 
-    @override
-    def command(self, number: int, markers: FloatArray) -> FloatArray:
+    def __call__(self, number: int, markers: FloatArray) -> FloatArray:
+        """Returns the inputs (n,) of a step, from markers (M, 3) before it [m], NaN where one is not seen."""
         self.last_seen = np.where(np.isfinite(markers.ravel()), markers.ravel(), self.last_seen)
         point, goal, next_goal = self._tracked @ self.last_seen, self._path[max(number - 1, 0)], self._path[number]
         u, h, d = self.shares, self._step, len(point)

@@ -42,7 +42,6 @@ from ..energies.viscosity import relaxation
 from ..io.errors import ConvergenceError
 from .polynomials import BoolArray, FloatArray, Monomials, Polynomial, SquaredPolynomial, around
 from .reduced_force import ForceAlong, ReducedForce
-from .sampling import check_integrator
 
 IntArray = NDArray[np.int64]
 
@@ -129,9 +128,6 @@ class ReducedModel:
         force: the learned force; None for a simulator alone.
         quality: errors, and counts of the samples that the model was fitted to.
         robot: `reduction.fingerprint` of its robot.
-
-    Raises:
-        InputError: an integrator that cannot be reduced.
     """
 
     time_step: float
@@ -155,9 +151,6 @@ class ReducedModel:
     force: ReducedForce | None = None
     quality: Mapping[str, Any] = field(default_factory=dict)
     robot: str = ""
-
-    def __post_init__(self) -> None:
-        check_integrator(self.integrator)
 
     @property
     def modes(self) -> int:

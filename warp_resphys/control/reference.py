@@ -82,11 +82,6 @@ class Path:
         second /= np.linalg.norm(second)
         return np.asarray(np.asarray(self.centre) + flat[:, :1] * first + flat[:, 1:] * second)
 
-    @property
-    def length(self) -> float:
-        """Length of the curve [m]."""
-        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
-
     def timed(self, seconds: float, time_step: float, lead: FloatArray | None = None) -> FloatArray:
         """Positions of the point (T + 1, 3) at the time steps [m]; it starts and ends at rest.
 

@@ -117,7 +117,11 @@ def check_reducible(robot: Robot) -> None:
         raise InputError(f"the base of {description.name} moves: reduced models have a fixed base.")
     if any(material.hysteresis for material in robot.simulator.materials.values()):
         raise InputError("a material with hysteresis cannot be reduced: remove its sliders (material.hysteresis).")
-    check_integrator(robot.simulator.integrator)
+    if robot.simulator.integrator not in ("implicit_euler", "bdf2"):
+        raise InputError(
+            f"a robot that is stepped by {robot.simulator.integrator} cannot be reduced: set identify.integrator to "
+            "implicit_euler or bdf2."
+        )
     if any(getattr(energy, "memory", ()) for energy in robot.simulator.body.energies):
         raise InputError("an energy with memory, such as friction, cannot be reduced: use the full simulator.")
     if any(getattr(energy, "is_barrier", False) for energy in robot.simulator.body.energies):
@@ -130,19 +134,6 @@ def check_reducible(robot: Robot) -> None:
         raise InputError("a recurrent network cannot be reduced: train one without a recurrent state.")
     if network is not None and any(coder.basis is None for coder in (network.position, *network.coders)):
         raise InputError("a nodal network cannot be reduced: train one with network.kind=reduced.")
-
-
-def check_integrator(integrator: str) -> None:
-    """Refuses an integrator that cannot be reduced.
-
-    Raises:
-        InputError: such an integrator.
-    """
-    if integrator not in ("implicit_euler", "bdf2"):
-        raise InputError(
-            f"a robot that is stepped by {integrator} cannot be reduced: set identify.integrator to implicit_euler or "
-            "bdf2."
-        )
 
 
 def _value(robot: Robot, name: str) -> torch.Tensor:
@@ -226,7 +217,7 @@ class Source:
         if network is None or network.actuation is None:
             return np.zeros(0), np.zeros((0, 0))
         nothing = self.given(np.zeros((1, self.parts)))
-        still = RobotState(self.robot.simulator.rest_state(1), self.robot.begin_memory(nothing))
+        still = self.robot.state(self.rest, **nothing)
         conditions = self.robot.conditions(still, **nothing)
         assert conditions is not None
         blocks = 1 + len(self.filters)
@@ -294,8 +285,7 @@ class Source:
         if not len(commands):
             return q, commands, np.zeros((0, self.learned.network.linear.shape[1]))
         given = self.given(commands)
-        state = RobotState(State(q, torch.zeros_like(q)), self.robot.begin_memory(given, len(commands)))
-        return q, commands, self._outputs(state, given)
+        return q, commands, self._outputs(self.robot.state(q, **given), given)
 
     def _pull(self, state: State, outputs: FloatArray) -> torch.Tensor:
         """Learned force (B, N, 3) of network outputs (B, c) on a body in a state [N]."""
@@ -307,7 +297,7 @@ class Source:
     def tangent(self, q: torch.Tensor, commands: FloatArray, modes: int, outputs: FloatArray | None) -> Tangent:
         """Linearises about an equilibrium (1, N, 3) under commands (n,) and the force of network outputs (c,)."""
         robot, still, given = self.robot, torch.zeros_like(q), self.given(commands[None])
-        state = RobotState(State(q, still), robot.begin_memory(given))
+        state = robot.state(q, **given)
         hessian, inertia, free = self._elastic.linearised(state, **given)
         stiffness = (hessian - inertia).tocsc()
         coordinates = (3 * free[:, None] + np.arange(3)).ravel()

@@ -19,7 +19,6 @@ from ..io.stages import StageContext, finished_record
 from ..mesh.motion_files import input_columns, write_csv
 from ..report.driven_film import DrivenBodies
 from ..robot.loading import load
-from ..robot.robot import Robot
 from ..settings.control import ControlSettings
 from ..settings.stages import StageSettings
 from .baselines import fit_linear
@@ -27,7 +26,6 @@ from .controllers import (
     Controller,
     JacobianFeedback,
     LinearRecedingHorizon,
-    OpenLoop,
     RecedingHorizon,
 )
 from .files import (
@@ -187,30 +185,6 @@ def controllers_of(control: ControlSettings) -> list[str]:
     ]
 
 
-def receding_controllers(
-    settings: StageSettings, folder: Path, robot: Robot, path: FloatArray, rests: FloatArray
-) -> list[Controller]:
-    """Returns the receding-horizon controllers, on the reduced models and finally on the linear model.
-
-    Args:
-        settings: of the stage drive.
-        folder: of the run.
-        robot: with the last of the models.
-        path: (T, d) reference of the point after each step [m].
-        rests: (>= C, M, 3) markers that each controller observes while the robot rests without inputs [m].
-    """
-    control = settings.control
-    task, controllers = Task(control, robot), list[Controller]()
-    for model, rest in zip(control.receding, rests, strict=False):
-        learned = robot if model == robot.description.model else load(folder, model, settings.device)
-        reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
-        planner = task.planner(reduced, path, control.horizon, *_RECEDING)
-        controllers.append(RecedingHorizon(planner, reduced, rest))
-    linear, rest = read_baselines(folder / BASELINES)[0], rests[len(controllers)]
-    planner = task.planner(linear, path, control.horizon, *_RECEDING)
-    return [*controllers, LinearRecedingHorizon(planner, linear, rest)]
-
-
 def _driven(part: TrialPart, report: Report) -> Arrays:
     """One motion with all controllers, each on a body of its own: points, inputs and computing times."""
     settings: StageSettings = part.context.settings
@@ -220,19 +194,26 @@ def _driven(part: TrialPart, report: Report) -> Arrays:
     laboratory = Laboratory(settings.played, folder, driven.name, count, motions_of(control).index(name))
     plans = {model: read_plan(folder / plans_file(model), name) for model in control.models}
     rest, path = laboratory.rest(), plans[control.models[-1]].path
-    controllers: list[Controller] = [OpenLoop(plan.inputs) for plan in plans.values()]
-    controllers += receding_controllers(settings, folder, robot, path, rest[len(controllers) :])
-    limits, jacobian = control.limits, read_baselines(folder / BASELINES)[1]
+    linear, jacobian = read_baselines(folder / BASELINES)
+    controllers = list[Controller]()
+    for model in control.receding:
+        learned = robot if model == robot.description.model else load(folder, model, settings.device)
+        reduced = read_reduced(folder / reduced_file(model), learned.description.learned)
+        planner = task.planner(reduced, path, control.horizon, *_RECEDING)
+        controllers.append(RecedingHorizon(planner, reduced, rest[len(plans) + len(controllers)]))
+    planner = task.planner(linear, path, control.horizon, *_RECEDING)
+    controllers.append(LinearRecedingHorizon(planner, linear, rest[len(plans) + len(controllers)]))
     for gain in control.feedback.gains:
-        own = rest[len(controllers)]
-        controllers.append(JacobianFeedback(jacobian, limits, gain, task.time_step, task.tracked, path, own))
+        own = rest[len(plans) + len(controllers)]
+        controllers.append(JacobianFeedback(jacobian, control.limits, gain, task.time_step, task.tracked, path, own))
     points, inputs, seconds = list[FloatArray](), list[FloatArray](), list[FloatArray]()
     for step in range(part.frames - 1):
         seen = laboratory.seen(step)
         acting, took = np.zeros((count, task.parts)), np.zeros(count)
-        for row, controller in enumerate(controllers):
+        acting[: len(plans)] = [plan.inputs[step] for plan in plans.values()]
+        for row, controller in enumerate(controllers, len(plans)):
             began = time.perf_counter()
-            acting[row] = controller.command(step, seen[row])
+            acting[row] = controller(step, seen[row])
             took[row] = time.perf_counter() - began
         laboratory.step(acting)
         points.append(laboratory.markers().reshape(count, -1) @ task.tracked.T)

@@ -1,7 +1,7 @@
 """Loads a robot from a finished run or a file, and the trials of the run, to replay them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from ..experiment.experiment import Experiment
 from ..experiment.files import STATIC
 from ..io.errors import DataFileError, InputError, listed
 from ..learning.parameters import own_name
-from ..stepping.state import State
 from .description import Description, describe, finished_experiment
 from .inputs import BASE
 from .motion import Motion
@@ -147,15 +146,15 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
             begun, steps = robot.settle(1, **inputs), 0
         else:
-            state = State(replay.initial_state(start, constants, resting).q, start.state.v)
+            q = replay.initial_state(start, constants, resting).q
             before = {key: 0.0 * value[0] for key, value in inputs.items() if key in robot.driven}
-            before |= {key: value.to(state.q) for key, value in replay.trials.resting.actuation.items()}
-            memory = robot.begin_memory(_commands(experiment, robot, name, before))
-            begun, steps = RobotState(state, memory), replay.steps(start)
+            before |= {key: value.to(q) for key, value in replay.trials.resting.actuation.items()}
+            held: dict[str, Any] = _commands(experiment, robot, name, before)
+            begun, steps = robot.state(q, start.state.v, **held), replay.steps(start)
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]
-                begun = RobotState(begun.body, begun.memory, None, poses[:1].repeat(2, 1, 1), begun.left, begun.lost)
+                begun = replace(begun, base=poses[:1].repeat(2, 1, 1))
     trials = replay.trials
     since = (trials.times - start.delay[:, None]).clamp_min(0.0)[0].cpu().numpy()
     shift = None if start.shift is None else start.shift[0].cpu().numpy()

@@ -197,16 +197,19 @@ class Robot:
 
     # Initial states
 
-    def state(self, q: ArrayLike | torch.Tensor, v: ArrayLike | torch.Tensor | None = None) -> RobotState:
-        """Returns a state of given positions, with a history of zero inputs.
+    def state(
+        self, q: ArrayLike | torch.Tensor, v: ArrayLike | torch.Tensor | None = None, **inputs: Given
+    ) -> RobotState:
+        """Returns a state of given positions, in which constant inputs have acted for a long time.
 
         Args:
             q: (N, 3) or (B, N, 3) [m].
             v: velocities of the same shape [m/s]; zero if omitted.
+            inputs: by name, as for `step`.
         """
         at = self._reader.field(q, "q")
         body = State(at, torch.zeros_like(at) if v is None else self._reader.field(v, "v"))
-        return self._commands.begin(body, {})
+        return self._commands.begin(body, self._read(inputs, len(at)))
 
     def begin(self, batch: int = 1, **inputs: Given) -> RobotState:
         """Returns the equilibrium of the simulator under its weight and constant inputs, without the learned force.
@@ -404,12 +407,8 @@ class Robot:
 
     # Linearisation and the network's inputs in a state
 
-    def begin_memory(self, inputs: Mapping[str, Given], batch: int = 1) -> dict[str, torch.Tensor]:
-        """Returns `RobotState.memory` after constant inputs have acted for a long time."""
-        return dict(self._commands.begin(self.simulator.rest_state(batch), self._read(inputs, batch)).memory)
-
     def conditions(self, state: RobotState, **inputs: Given) -> torch.Tensor | None:
-        """Inputs (B, A) of the network beside the state in a step, as `program.condition_names` lists them."""
+        """Inputs (B, A) of the network beside the state in a step, as `Description` lists them."""
         return self._commands.act(state, self._read(inputs, state.batch)).conditions
 
     def linearised(self, state: RobotState, **inputs: Given) -> tuple[csc_array, csc_array, NDArray[np.int64]]:

@@ -21,7 +21,7 @@ NOISE = 1e-4
 
 @pytest.fixture(scope="module")
 def robot(finished):
-    return load(finished[0], "simulation")._integrated_by("bdf2")
+    return load(finished[0], "simulation").integrated_by("bdf2")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_conditioning_is_that_of_normal_variables():
 
 
 def test_a_step_is_linear_in_its_vibrations(robot):
-    robot = robot._integrated_by("implicit_euler")
+    robot = robot.integrated_by("implicit_euler")
     start = robot.begin()
     tangent = StepTangent.of(robot, start, {}, 4)
     count = len(tangent.frequencies)
@@ -334,7 +334,7 @@ def test_predictions_follow_a_plan_of_commands(robot):
 
 def test_its_transition_follows_the_body(robot):
     """In a bent body a step has other derivatives than at rest; after a turn of renewals the twin has them."""
-    robot = robot._integrated_by("implicit_euler")
+    robot = robot.integrated_by("implicit_euler")
     force, estimator = pull(robot, 8.0), Twin(robot).estimator
     belief = estimator.begin({})
     count = len(belief.bias)

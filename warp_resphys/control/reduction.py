@@ -6,7 +6,6 @@ import logging
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -60,35 +59,25 @@ def reduced_of(robot: Robot) -> ReducedModel:
     """
     check_reducible(robot)
     path = None if robot.folder is None else robot.folder / reduced_file(robot.description.model)
-    model = _kept(path, robot) or _computed(path, robot)
+    model = None
+    if path is not None and path.exists():
+        with suppress(DataFileError):  # Of an earlier version, or damaged.
+            model = read_reduced(path, robot.description.learned)
+    if model is None or model.robot != fingerprint(robot):
+        samples = ReductionSettings()
+        with Progress("reduced model", samples.total, "samples") as progress:
+            model = reduce(robot, samples, on_progress=progress.advance)
+        identified = robot.with_parameters(**robot.description.parameters)
+        if path is not None and model.robot == fingerprint(identified):
+            try:
+                write_reduced(path, model)
+            except DataFileError as error:
+                log.warning("The reduced model is not kept for the next time: %s", error)
     off, moved = model.quality["window_error_mm"], model.quality["window_motion_mm"]
     if off > _MUCH * moved:
         log.warning(
             "The reduced model is %.2g mm off in motions of %.2g mm: compare it with the full simulator.", off, moved
         )
-    return model
-
-
-def _kept(path: Path | None, robot: Robot) -> ReducedModel | None:
-    """The reduced model in a file; None if that is missing, damaged, of an earlier version, or of another robot."""
-    if path is not None and path.exists():
-        with suppress(DataFileError):
-            model = read_reduced(path, robot.description.learned)
-            if model.robot == fingerprint(robot):
-                return model
-    return None
-
-
-def _computed(path: Path | None, robot: Robot) -> ReducedModel:
-    """The reduced model, kept in a file if the robot has the parameters that its run has identified."""
-    samples = ReductionSettings()
-    with Progress("reduced model", samples.total, "samples") as progress:
-        model = reduce(robot, samples, on_progress=progress.advance)
-    if path is not None and fingerprint(robot) == fingerprint(robot.with_parameters(**robot.description.parameters)):
-        try:
-            write_reduced(path, model)
-        except DataFileError as error:
-            log.warning("The reduced model is not kept for the next time: %s", error)
     return model
 
 

@@ -394,11 +394,8 @@ class Robot:
             obstacles=self.simulator.obstacle_motions([state.body for state in states], self.constants),
         )
 
-    def without_midpoint(self) -> "Robot":
-        """Returns the robot, stepped by BDF2 where it is by the midpoint rule, which keeps vibrations."""
-        return self._integrated_by("bdf2") if self.simulator.integrator == "midpoint" else self
-
-    def _integrated_by(self, integrator: str) -> "Robot":
+    def integrated_by(self, integrator: str) -> "Robot":
+        """Returns the robot, stepped by another time integrator."""
         other = object.__new__(Robot)
         other.__dict__.update(self.__dict__)
         other.simulator = replace(self.simulator, integrator=integrator)

@@ -1,7 +1,7 @@
 """Predictions of a twin, compared with the markers that come."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -71,15 +71,10 @@ class Scores:
     Args:
         noise: standard deviation of a coordinate of a marker [m].
         labels: of the M markers; empty where every vertex is observed.
-
-    Attributes:
-        pending: predictions that have not come to their end, with unscaled deviations, and the markers (M, 3) that were
-            last seen when they were made [m].
     """
 
     def __init__(self, noise: float, labels: Sequence[str]) -> None:
         self._noise, self._labels = noise, labels
-        self.pending: list[tuple[Forecast, FloatArray]] = []
         self._errors: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)
         self._ratios: deque[FloatArray] = deque(maxlen=REMEMBERED)
 
@@ -90,26 +85,15 @@ class Scores:
             return 1.0
         return float(np.sqrt(np.mean(np.concatenate(list(self._ratios)) ** 2)))
 
-    def compare(self, frame_at_end: Callable[[Forecast], tuple[float, FloatArray] | None]) -> None:
-        """Compares pending predictions with the frames at their end.
+    def add(self, forecast: Forecast, seen: FloatArray, time: float, frame: FloatArray) -> None:
+        """Compares a forecast with the last frame in the step at its end.
 
         Args:
-            frame_at_end: returns time and markers (M, 3) [m] of the frame in the last step of a prediction, None where
-                it may still come, and raises LookupError where it cannot.
+            forecast: with unscaled deviations.
+            seen: markers (M, 3) as they were last seen when it was made [m].
+            time: of the frame [s].
+            frame: (M, 3) [m].
         """
-        left = []
-        for forecast, seen in self.pending:
-            try:
-                at_end = frame_at_end(forecast)
-            except LookupError:
-                continue
-            if at_end is None:
-                left.append((forecast, seen))
-            else:
-                self._add(forecast, seen, *at_end)
-        self.pending = left
-
-    def _add(self, forecast: Forecast, seen: FloatArray, time: float, frame: FloatArray) -> None:
         before, end = forecast.times[-2:]
         share = (end - time) / (end - before)
         off = frame - ((1.0 - share) * forecast.markers[-1] + share * forecast.markers[-2])

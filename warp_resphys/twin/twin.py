@@ -101,7 +101,8 @@ class Twin:
         for name, value in (("horizon", horizon), ("patience", patience)):
             if not 0.0 < value < np.inf:
                 raise InputError(f"{name} is {value:g}: give seconds, more than zero.")
-        estimator = _ENGINES[engine](robot.without_midpoint(), inputs, refine or {}, noise)
+        robot = robot.integrated_by("bdf2") if robot.simulator.integrator == "midpoint" else robot
+        estimator = _ENGINES[engine](robot, inputs, refine or {}, noise)
         self.estimator, self.horizon, self.patience = estimator, horizon, patience
         self.labels, self._h = estimator.labels, estimator.time_step
         self._keep = int(np.ceil(patience / self._h)) + 1
@@ -113,6 +114,8 @@ class Twin:
     def reset(self) -> None:
         """Forgets all packets."""
         self._scores = Scores(self.estimator.noise, self.labels)
+        # Predictions that have not come to their end, with unscaled deviations, and markers seen when they were made.
+        self._pending: list[tuple[Forecast, FloatArray]] = []
         self._free: deque[float] = deque(maxlen=REMEMBERED)
         self._counts = Faults()
         self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(self.estimator.inputs))]
@@ -144,7 +147,7 @@ class Twin:
         self._commands = [(-np.inf, 0, commands)]
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
-        self._scores.pending = []
+        self._pending = []
 
     # Packets
 
@@ -172,7 +175,7 @@ class Twin:
             self._start(time, {**self._commanded(np.inf), **commands}, frame)
             commands = {}
         elif frame is not None and not self._framed:
-            self._check_unit(frame, next(one for one in map(self._known_at, self._steps) if one is not None))
+            self._check_unit(frame, next(one.predicted for one in self._steps.values() if one.predicted is not None))
         self._framed = self._framed or frame is not None
         assert self._origin is not None
         number = int(np.ceil((time - self._origin) / self._h - _ROUNDING))
@@ -218,9 +221,6 @@ class Twin:
         if self.has_begun:
             self._counts.add(f"starts {why}")
             self._again = True
-
-    def _known_at(self, number: int) -> Belief | None:
-        return self._steps[number].predicted
 
     def _belief_at(self, number: int) -> Belief:
         belief = self._steps[number].corrected
@@ -282,7 +282,14 @@ class Twin:
                 self._corrected(interval, number)
                 self._done = number
         self._refined = self._belief_at(self._newest).parameters
-        self._scores.compare(self._frame_at_end)
+        pending, self._pending = self._pending, []
+        for forecast, seen in pending:
+            number = round((forecast.times[-1] - self._origin) / self._h)
+            if number in self._steps and self._steps[number].frames:
+                time, _, frame = self._steps[number].frames[-1]
+                self._scores.add(forecast, seen, time, frame)
+            elif number > self._newest - self._keep:  # A frame may still come.
+                self._pending.append((forecast, seen))
         for number in [number for number in self._steps if number <= self._newest - self._keep]:
             self._forget(self._steps.pop(number))
         self._commands = self._needed(self._origin + min(self._steps) * self._h)
@@ -344,9 +351,6 @@ class Twin:
             interval.corrections.append((time, correction))
             last = time
         interval.corrected, interval.last = belief, last
-
-    def _frames_of(self, number: int) -> list[tuple[float, int, FloatArray]]:
-        return self._steps[number].frames if number in self._steps else []
 
     def _forget(self, interval: _Interval) -> None:
         """Counts what happened in a step that no packet can change any more."""
@@ -437,23 +441,8 @@ class Twin:
         )
         seen = self._last_seen()
         if not inputs and seconds is None and seen is not None:
-            self._scores.pending.append((replace(prediction, deviations=deviations), seen))
+            self._pending.append((replace(prediction, deviations=deviations), seen))
         return prediction
-
-    def _frame_at_end(self, forecast: Forecast) -> tuple[float, FloatArray] | None:
-        """The last frame in the step at the end of a forecast, and its time; None before it can be known.
-
-        Raises:
-            LookupError: there was none.
-        """
-        assert self._origin is not None
-        number = round((forecast.times[-1] - self._origin) / self._h)
-        frames = self._frames_of(number)
-        if number > self._newest or (not frames and number > self._newest - self._keep):
-            return None
-        if not frames:
-            raise LookupError
-        return frames[-1][0], frames[-1][2]
 
     def _last_seen(self) -> FloatArray | None:
         """Markers (M, 3) as they were last seen [m], NaN where not for `patience`."""

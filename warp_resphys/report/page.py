@@ -5,7 +5,7 @@ import hashlib
 import logging
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -71,14 +71,19 @@ class PageTable:
     summary: str = ""  # Title of a table that can be folded; empty for one that cannot.
     unfolded: bool = False  # Whether it is unfolded at first.
 
+    @classmethod
+    def plain(cls, title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> "PageTable":
+        """Returns a table of texts, without small print."""
+        return cls(heads[0], heads[1:], [Row(first, [*map(Cell, cells)]) for first, *cells in rows], summary=title)
+
     def __rich__(self) -> "rich.table.Table":
         """Returns the table for a terminal."""
         import rich.table
         import rich.text
 
-        table = rich.table.Table()
+        table = rich.table.Table(title=self.summary or None)
         for column in (self.head, *self.columns):
-            table.add_column(rich.text.Text(column))
+            table.add_column(rich.text.Text(column), justify="left" if column is self.head else "right")
         for row in self.rows:
             cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
             table.add_row(*map(rich.text.Text, (row.head, *cells)), style="bold" if row.answer else None)

@@ -35,10 +35,11 @@ from ..linalg.choice import LINEAR_SOLVERS
 from ..linalg.pardiso import has_pardiso
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from ..report.page import PageTable
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .gradient_check import check_gradients, pose
-from .tables import Sheet, show
+from .tables import show
 
 SIZE: Final = (0.1, 0.03, 0.03)  # of a beam [m]
 BATCH, STEPS = 3, 4  # of a motion
@@ -90,9 +91,9 @@ def check(settings: CheckSettings, folder: Path) -> None:
             checks.append(bounded(f"{name}, gradients", partial(gradient_error, name, device), GRADIENT_BOUND))
             progress.advance()
     rows = [[own.name, own.result, own.allowed, "passed" if own.passed else "FAILED"] for own in checks]
-    failed = [number for number, own in enumerate(checks) if not own.passed]
+    failed = [own for own in checks if not own.passed]
     place = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
-    show(Sheet(f"Largest errors on {place}", ["check", "error", "allowed", ""], rows, failed), speed_sheet(device))
+    show(PageTable.plain(f"Largest errors on {place}", ["check", "error", "allowed", ""], rows), speed_table(device))
     outcome = f"{len(failed)} of {len(rows)} checks failed" if failed else f"All {len(rows)} checks passed"
     show(f"{outcome}, in {time.perf_counter() - began:.0f} s.")
     if failed:
@@ -158,7 +159,7 @@ def gradient_error(name: str, device: torch.device) -> float:
     return max(row.relative_error for row in rows)
 
 
-def speed_sheet(device: torch.device) -> Sheet:
+def speed_table(device: torch.device) -> PageTable:
     """Milliseconds of a step of a batch of beams and of its gradient, on the CPU and on the device beside it."""
     devices = dict.fromkeys((torch.device("cpu"), device))
     rows = []
@@ -167,7 +168,7 @@ def speed_sheet(device: torch.device) -> Sheet:
             faster = [f"{figures[0] / figure:.1f}" for figure in figures[1:]]
             rows.append([f"{what} of {batch}", *(f"{figure:.2f}" for figure in figures), *faster])
     columns = [str(own) for own in devices] + ["times as fast"] * (len(devices) - 1)
-    return Sheet("Milliseconds of beams of 480 unknowns, all together", ["", *columns], rows)
+    return PageTable.plain("Milliseconds of beams of 480 unknowns, all together", ["", *columns], rows)
 
 
 def milliseconds(device: torch.device, batch: int) -> tuple[float, float]:

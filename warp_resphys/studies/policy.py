@@ -16,8 +16,9 @@ from ..io.files import read_json, write_json
 from ..io.progress import Progress
 from ..io.settings import Count, Natural, Settings, Some, Word, setting
 from ..io.stages import finished_record
+from ..report.page import PageTable
 from ..settings.trials import Labels, different
-from .tables import Sheet, show
+from .tables import show
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at
@@ -88,7 +89,7 @@ def train_policy(settings: Policies, folder: Path) -> None:
         title += f", policies of {len(settings.seeds)} seeds (lowest to highest)"
     rates = ", ".join(f"{model} {np.mean(speed):.0f}" for model, speed in speeds.items())
     wrote = f"Written: {path} and the policies beside it"
-    show(Sheet(title, ["policy", *worlds], rows), f"Actions a second while learning: {rates}.", wrote)
+    show(PageTable.plain(title, ["policy", *worlds], rows), f"Actions a second while learning: {rates}.", wrote)
 
 
 @dataclass(frozen=True)

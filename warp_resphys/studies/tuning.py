@@ -29,10 +29,10 @@ from ..io.errors import DataFileError, InputError, listed
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
 from ..io.stages import Stage, StageInterrupted, run_stages
 from ..pipeline import acquire, learning_stages, prepare
-from ..report.page import number_text
+from ..report.page import PageTable, number_text
 from ..settings.learning import TrainingSettings
 from ..settings.run import RunSettings
-from .tables import Sheet, show
+from .tables import show
 
 log = logging.getLogger(__name__)
 _SHOWN = 5  # trials
@@ -195,7 +195,7 @@ def _print(study: optuna.Study, search: Tune) -> None:
     rows = [
         [str(trial.number), number_text(trial.value), *map(_text, trial.params.values())] for trial in done[:_SHOWN]
     ]
-    table = Sheet("Best trials: roll-out error on the validation split", headings, rows)
+    table = PageTable.plain("Best trials: roll-out error on the validation split", headings, rows)
     given = [override.lstrip("+") for override in HydraConfig.get().overrides.task]
     kept = [override for override in given if not override.lstrip("~").startswith("tune.")]
     prefix = "simfree." if search.model == "simfree" else ""

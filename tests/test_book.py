@@ -79,22 +79,3 @@ def test_signatures_have_short_types_and_fields_their_comments():
     assert parameters == "(regions: dict = {})"
     source = "class A:\n    x: int  # [m]\n    # of the\n    # body\n    y: int = 1\n    z: str = '#'\n"
     assert extension["field_comments"](source) == {"x": "[m]", "y": "of the body"}
-
-
-def test_every_tutorial_is_a_notebook_with_a_link():
-    pytest.importorskip("sphinx")
-    pytest.importorskip("jupytext")
-    extension = runpy.run_path(str(DOCS / "extensions" / "notebooks.py"))
-
-    class Application:
-        srcdir = DOCS
-
-    context = {"body": "<h1>A finger</h1>"}
-    extension["link_notebook"](Application, "tutorials/finger", "", context, None)
-    assert 'href="finger.ipynb"' in context["body"]
-    unlinked = {"body": "<h1>GPU</h1>"}
-    extension["link_notebook"](Application, "tutorials/gpu", "", unlinked, None)
-    assert unlinked == {"body": "<h1>GPU</h1>"}
-    assert [path.name for path in extension["tutorials"](Application)] == sorted(
-        path.name for path in DOCS.glob("tutorials/*.py")
-    )

@@ -46,7 +46,7 @@ CONTROL = [
     *("control.plan={corrections:2,reach:0.05}", "control.horizon=0.1"),
     *("control.feedback={gains:[5.0],settles:0.1}",),
     "control.reduction={modes:[4],equilibria:48,tangents:24,motions:3,seconds:2.0}",
-    *("hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+    IN_RUN,
 ]
 
 
@@ -305,7 +305,7 @@ class TestDriving:
 
     def test_a_film_of_it_is_a_command(self, folder, tmp_path, can_draw):
         place = f"file={tmp_path / 'film.mp4'}"
-        code, err = run("view", "film", f"run={folder}", "motion=circle_0.4s", place, "seconds=0.1", *CONTROL[-3:-1])
+        code, err = run("view", "film", f"run={folder}", "motion=circle_0.4s", place, "seconds=0.1")
         assert code == 0, err
         header = next(imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4")))
         assert header["size"] == (1120, 480)  # Open loop on SysID and on ResPhys, side by side.
@@ -322,7 +322,7 @@ class TestDriving:
         ],
     )
     def test_invalid_options_of_a_film_are_refused(self, folder, change, said):
-        code, err = run("view", "film", f"run={folder}", *change, *CONTROL[-3:-1])
+        code, err = run("view", "film", f"run={folder}", *change)
         assert code == 2
         assert said in err
         assert err.count("\n") == 1

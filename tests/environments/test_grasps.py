@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from support.main_job import IN_RUN, run_without_report
+from support.main_job import run_without_report
 from warp_resphys.environments.making import make_vector, register
 from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.io.errors import InputError
@@ -19,7 +19,7 @@ RUN = [
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
     *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "trainer={epochs:4,rollout_every:2}"),
     *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
-    *("actuation.filter_time_constants=[0.1]", "hydra/job_logging=none", "hydra/hydra_logging=none", IN_RUN),
+    "actuation.filter_time_constants=[0.1]",
 ]
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import warp_resphys
-from support.main_job import IN_RUN, run_without_report
+from support.main_job import run_without_report
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
 from warp_resphys.io.errors import DataFileError, InputError
@@ -30,14 +30,7 @@ identify:
     pressure_rise: {lower: 0.001, upper: 0.1, logarithmic: true}
   first_guess: {pressure_factor: 0.9, pressure_delay: 0.012, pressure_rise: 0.02}
 """
-COMMAND = [
-    "experiment=unknown_pressures",
-    TRACKED,
-    "solver.relative_tolerance=1e-10",
-    "hydra/job_logging=none",
-    "hydra/hydra_logging=none",
-    IN_RUN,
-]
+COMMAND = ["experiment=unknown_pressures", TRACKED, "solver.relative_tolerance=1e-10"]
 HIGH = 6e3  # Pa
 
 

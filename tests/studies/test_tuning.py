@@ -57,7 +57,7 @@ def test_a_run_with_the_printed_settings_has_the_error_of_the_best_trial(searche
     assert program == "warp-resphys"
     assert f"network.width={best.params['network.width']}" in arguments
     assert re.search(rf"│ {best.number} +│", printed)
-    run_without_report(root, *arguments, "hydra.run.dir=run", "hydra/job_logging=none", "hydra/hydra_logging=none")
+    run_without_report(root, *arguments)
     _, metadata = read_checkpoint("run/resphys.safetensors", "residual force")
     assert metadata["validation_rollout_error_mm"] == pytest.approx(best.value, rel=1e-6)
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -128,9 +128,6 @@ class DrivenMotion:
     seconds: FloatArray
 
 
-AnyMotion = TypeVar("AnyMotion", PlannedMotion, DrivenMotion)
-
-
 def write_plans(path: Path, motions: Mapping[str, PlannedMotion]) -> None:
     """Writes planned motions by name."""
     _write_motions(path, _PLANS, {}, motions)
@@ -138,7 +135,7 @@ def write_plans(path: Path, motions: Mapping[str, PlannedMotion]) -> None:
 
 def read_plan(path: Path, motion: str) -> PlannedMotion:
     """Reads one planned motion."""
-    return _read_motion(path, _PLANS, motion, PlannedMotion)
+    return PlannedMotion(*_read_motion(path, _PLANS, motion, PlannedMotion))
 
 
 def write_driven(path: Path, controllers: Sequence[str], time_step: float, motions: Mapping[str, DrivenMotion]) -> None:
@@ -146,23 +143,23 @@ def write_driven(path: Path, controllers: Sequence[str], time_step: float, motio
     _write_motions(path, _DRIVEN, {"controllers": list(controllers), "time_step": time_step}, motions)
 
 
-def read_driven(path: Path, motion: str) -> DrivenMotion:
-    """Reads one driven motion."""
-    return _read_motion(path, _DRIVEN, motion, DrivenMotion)
-
-
-def _write_motions(path: Path, kind: str, more: Mapping[str, Any], motions: Mapping[str, AnyMotion]) -> None:
+def _write_motions(path: Path, kind: str, more: Mapping[str, Any], motions: Mapping[str, Any]) -> None:
     with atomic_hdf5(path, kind, {"names": list(motions), **more}) as file:
         for name, motion in motions.items():
             group = file.create_group(name)
             for key, values in vars(motion).items():
-                time_axis = int(isinstance(motion, DrivenMotion) and key != "path")
+                time_axis = int(kind == _DRIVEN and key != "path")
                 create(group, key, values, _UNITS.get(key, "1"), time_axis)
 
 
-def _read_motion(path: Path, kind: str, motion: str, made: type[AnyMotion]) -> AnyMotion:
+def read_driven(path: Path, motion: str) -> DrivenMotion:
+    """Reads one driven motion."""
+    return DrivenMotion(*_read_motion(path, _DRIVEN, motion, DrivenMotion))
+
+
+def _read_motion(path: Path, kind: str, motion: str, made: type) -> list[FloatArray]:
     with read_hdf5(path, kind) as file:
-        return made(*(read_array(file, f"{motion}/{field.name}").astype(np.float64) for field in fields(made)))
+        return [read_array(file, f"{motion}/{field.name}").astype(np.float64) for field in fields(made)]
 
 
 def write_baselines(path: Path, linear: LinearModel, jacobian: FloatArray) -> None:

@@ -96,12 +96,10 @@ class GoalTask(RobotTask):
         wanted = self.goals[np.arange(len(points))[:, None], ahead]
         return np.asarray(((wanted - points[:, None]) / self.size).reshape(len(points), -1))
 
-    def _now(self, number: NDArray[np.int64]) -> FloatArray:
-        return np.asarray(self.goals[np.arange(len(number)), np.minimum(number, self.goals.shape[1] - 1)])
-
     @override
     def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
-        return np.asarray(1e3 * np.linalg.norm(points - self._now(number), axis=1))
+        now = self.goals[np.arange(len(number)), np.minimum(number, self.goals.shape[1] - 1)]
+        return np.asarray(1e3 * np.linalg.norm(points - now, axis=1))
 
     @override
     def wanted(self, row: int, number: int) -> FloatArray:

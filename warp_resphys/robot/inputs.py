@@ -1,20 +1,31 @@
-"""Inputs of a robot by name: checked values, given as numbers, lists, arrays, tensors or by part."""
+"""Inputs of a robot by name: checked values, and their effects on its simulator, its network and later steps."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from ..data.base_motion import LARGEST_STEP
+from ..data.input_response import InputResponse, response_of, with_means
+from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.contact import MOTION
-from ..energies.strings import PAYLOAD
+from ..energies.strings import PAYLOAD, Strings
+from ..experiment.files import payload_inputs
 from ..io.errors import InputError, listed
+from ..learning.parameters import MASS_FACTOR
+from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
+from ..stepping.rotations import rotations
+from ..stepping.state import State
 from .description import Description
+from .state import RobotState
 
 BASE: Final = "base"
 FORCE: Final = "external_force"
@@ -140,3 +151,120 @@ class InputReader:
             return self._simulator.tensor(value)
         except (TypeError, ValueError, RuntimeError, OverflowError):
             raise InputError(f"{name} is {value!r}: give numbers, or an array or a tensor of numbers.") from None
+
+
+@dataclass(frozen=True)
+class Acting:
+    """Inputs that act during a step of B environments.
+
+    Attributes:
+        inputs: of the simulator.
+        conditions: (B, A) inputs of the network beside the state; None if it has none.
+        memory: `RobotState.memory` after the step.
+        base: (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved.
+    """
+
+    inputs: Inputs
+    conditions: torch.Tensor | None
+    memory: dict[str, torch.Tensor]
+    base: torch.Tensor | None
+
+
+class Commands:
+    """Converts the inputs of a robot, through the delay and lag of its actuators.
+
+    Args:
+        simulator: of the robot.
+        description: of the robot.
+        inputs: declarations of its inputs, by name.
+        parameters: its parameters, (1,) or (B,) by name.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        description: Description,
+        inputs: Mapping[str, RobotInput],
+        parameters: Mapping[str, torch.Tensor],
+    ) -> None:
+        self._simulator, self._description, self._inputs = simulator, description, inputs
+        self._mass_factor = parameters.get(MASS_FACTOR)
+        h, filters = simulator.time_step, description.filters if description.learned is not None else ()
+        taken = [name for name, declared in inputs.items() if declared.is_taken]
+        responses = {name: response_of(simulator.inputs[name], parameters) for name in taken}
+        self._responses = {name: InputResponse(h, **own, filters=filters) for name, own in responses.items()}
+
+    def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> RobotState:
+        """Returns the state after constant inputs (B, C), zero if omitted, have acted for a long time."""
+        memory: dict[str, torch.Tensor] = {}
+        for name, response in self._responses.items():
+            still = response.steady(self._value(name, given, body))
+            memory |= {f"{name}.{key}": values for key, values in still.items()}
+        moved = self._description.told_of_base is not None or BASE in given
+        return RobotState(body, memory, base=torch.stack([self._value(BASE, given, body)] * 2) if moved else None)
+
+    def act(self, state: RobotState, given: Mapping[str, torch.Tensor]) -> Acting:
+        """Returns what acts during a step with inputs (B, C) by name; omitted ones are zero, an omitted base stays."""
+        description = self._description
+        fields: dict[str, torch.Tensor | None] = {FORCE: given.get(FORCE)}
+        conditions, memory = list[torch.Tensor](), dict[str, torch.Tensor]()
+        payload = given.get(PAYLOAD.name)
+        if description.payload_at is not None and description.sees_payload:
+            conditions.append(self._value(PAYLOAD.name, given, state.body))
+        for name, response in self._responses.items():
+            own = f"{name}."
+            remembered = {key.removeprefix(own): x for key, x in state.memory.items() if key.startswith(own)}
+            acting, means, later = response(remembered, self._value(name, given, state.body)[None])
+            fields[name] = acting[0]
+            conditions += [with_means(acting[0], means[:, 0])] if name in description.seen else []
+            memory |= {f"{own}{key}": values for key, values in later.items()}
+        if payload is not None:
+            fields |= self._hung(payload)
+        base = state.base
+        if BASE in given or base is not None:
+            before = given[BASE].new_zeros(2, *given[BASE].shape) if base is None else base
+            base = torch.cat([before, given.get(BASE, before[1])[None]])
+            fields["fixed_positions"] = self._fixed(base[2])
+            if BASE in given:
+                self._check_base(base)
+            if description.told_of_base is not None:
+                gravity = self._simulator.tensor(self._simulator.gravity)
+                moved = base_movement(base, self._simulator.time_step, gravity)[1]
+                conditions.append(moved[:, torch.tensor(description.told_of_base, device=moved.device)])
+        return Acting(Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base)
+
+    def _value(self, name: str, given: Mapping[str, torch.Tensor], body: State) -> torch.Tensor:
+        """Returns the values (B, C) of an input, zero if omitted."""
+        value = given.get(name)
+        return body.q.new_zeros(body.batch, len(self._inputs[name].parts)) if value is None else value
+
+    @cached_property
+    def _payload_share(self) -> torch.Tensor:
+        """Share (1, N) of a payload that hangs on each vertex."""
+        share = payload_inputs(self._simulator.body, self._description.payload_at, np.ones(1))["attached_mass"]
+        return self._simulator.tensor(share)
+
+    def _hung(self, payload: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Inputs of the simulator for a payload (B, 1) [kg]."""
+        mass = payload if self._mass_factor is None else payload * self._mass_factor[:, None]
+        if any(isinstance(energy, Strings) for energy in self._simulator.body.energies):
+            return {PAYLOAD.name: mass}
+        return {"attached_mass": mass * self._payload_share}
+
+    def _check_base(self, base: torch.Tensor) -> None:
+        """Refuses poses (3, B, 6) of the base of which the last step moves fixed vertices too far."""
+        moved = (self._fixed(base[2]) - self._fixed(base[1])).detach().norm(dim=2)
+        rest = self._simulator.rest_positions
+        furthest, size = float(moved.max()), float((rest.amax(0) - rest.amin(0)).max())
+        milliseconds = 1e3 * self._simulator.time_step
+        if furthest > LARGEST_STEP * size:
+            raise InputError(
+                f"base moves by {1e3 * furthest:.4g} mm in a step of {milliseconds:g} ms, and a body "
+                f"of {1e3 * size:.4g} mm follows up to {1e3 * LARGEST_STEP * size:.4g} mm: give poses in m and rad, or "
+                "move it in smaller steps."
+            )
+
+    def _fixed(self, pose: torch.Tensor) -> torch.Tensor:
+        """Positions (B, D, 3) of the fixed vertices for poses (B, 6) of the base [m]."""
+        rest = self._simulator.rest_positions[self._simulator.fixed]
+        return rest @ rotations(pose[:, 3:]).mT + pose[:, None, :3]

@@ -23,9 +23,8 @@ from ..learning.rollout import DIVERGENCE_DISTANCE, LearnedPredictor, Rollout, e
 from ..mesh.mesh import Mesh
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .commands import Acting, Commands
 from .description import Description
-from .inputs import Given, InputReader, inputs_of
+from .inputs import Acting, Commands, Given, InputReader, inputs_of
 from .motion import Motion
 from .state import RobotState
 

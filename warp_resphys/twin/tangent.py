@@ -106,13 +106,10 @@ class StepTangent:
     def slopes(self, after: RobotState, columns: Sequence[int]) -> FloatArray:
         """Returns C columns (2 r, C) of a transition, from 2 C environments after `changes` and a step."""
         count, environments = len(columns), range(len(after.q))
-        response = 0.5 * self.amplitudes(after.select(environments[count:]), after.select(environments[:count]))
+        below, above = after.select(environments[count:]), after.select(environments[:count])
+        changes = ((x - y)[:, self.free].flatten(1) for x, y in ((above.q, below.q), (above.v, below.v)))
+        response = 0.5 * np.concatenate([x.cpu().double().numpy() @ self.duals for x in changes], axis=1)
         return np.asarray(response.T / self.amounts[[*columns]])
-
-    def amplitudes(self, before: RobotState, after: RobotState) -> FloatArray:
-        """Returns (B, 2 r) changes of (z, w) from one state to another."""
-        changes = ((x - y)[:, self.free].flatten(1) for x, y in ((after.q, before.q), (after.v, before.v)))
-        return np.concatenate([x.cpu().double().numpy() @ self.duals for x in changes], axis=1)
 
 
 def pulled_by(robot: Robot, inputs: Mapping[str, Given], forces: torch.Tensor) -> dict[str, Given]:

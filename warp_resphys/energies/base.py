@@ -135,6 +135,7 @@ class PointSet:
         nodes_per_cell: K.
         n_points: P = C Q.
         n_vertices: N.
+        device: device of the launcher.
         width: components of an operator: 3, or 1 if the energy is a function of a vector.
         points: the points on the device (``kernels.points``).
         start: (N + 1) first entry of each vertex in ``incident``.
@@ -143,7 +144,7 @@ class PointSet:
 
     def __init__(self, launcher: Launcher, points: Points, n_vertices: int, part: slice, own: slice) -> None:
         self.source, self.part, self.own, self.n_points = points, part, own, points.n_points
-        self.n_vertices = n_vertices
+        self.n_vertices, self.device = n_vertices, launcher.device
         self.cells, self.points_per_cell, self.nodes_per_cell, self.width = points.gradients.shape
         vertex = points.nodes.ravel()
         # Padded nodes have a zero gradient.
@@ -166,6 +167,13 @@ class PointSet:
     def stress_view(self, stress: torch.Tensor) -> Any:
         """Returns the Warp array of a stress (B, P, 3, width)."""
         return warp_view(stress[..., 0], wp.vec3d) if self.width == 1 else warp_view(stress, wp.mat33d)
+
+
+def points_reader(s: PointSet) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Returns the function from a field (B, N, 3) to its values (B, P, 3) at points with a width of one."""
+    nodes = torch.as_tensor(s.source.nodes, device=s.device)  # (C, K)
+    weights = torch.as_tensor(s.source.gradients[..., 0], device=s.device)  # (C, Q, K)
+    return lambda field: torch.einsum("cqk,bcki->bcqi", weights, field[:, nodes]).flatten(1, 2)
 
 
 class Energy(ABC):

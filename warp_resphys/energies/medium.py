@@ -28,7 +28,7 @@ from ..mesh.mesh import Mesh, boundary_faces
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, points_reader, value_of
 from .launcher import Launcher, warp_view
 
 
@@ -179,37 +179,28 @@ class MediumTerm(Term):
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        """Implements `Term.adjoint` by differentiating the energy twice in torch."""
-        (s,) = self.sets
-        nodes = torch.as_tensor(s.source.nodes, device=self.launcher.device)
-        shape_values = torch.as_tensor(s.source.gradients[..., 0], device=self.launcher.device)  # (F, Q, K)
-
-        def at_points(field: torch.Tensor) -> torch.Tensor:
-            return torch.einsum("fqk,bfki->bfqi", shape_values, field[:, nodes]).flatten(1, 2)
+        """Implements `Term.adjoint` by differentiating the forces in torch."""
+        at_points = points_reader(self.sets[0])
 
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():
                 leaves = {name: value_of(values, name).detach().requires_grad_() for name in self.shapes}
-                x = at_points(positions).requires_grad_()
-                (slope,) = torch.autograd.grad(_energy(x, *leaves.values()), x, create_graph=True)
-                loss = -(slope * at_points(direction)).sum()
+                loss = -(_forces(at_points(positions), *leaves.values()) * at_points(direction)).sum()
                 slopes = torch.autograd.grad(loss, list(leaves.values()))
             return dict(zip(leaves, slopes, strict=True))
 
         return differentiate
 
 
-def _energy(
+def _forces(
     x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
 ) -> torch.Tensor:
-    """Returns the sum of the energy in `kernels.medium` over all points."""
-    size = area.norm(dim=-1)
-    n = area / size[..., None].clamp_min(1e-30)
-    d, inertial = x - reference, ((x - target) * n).sum(-1)
-    across = (d * n).sum(-1)
-    along = (d - across[..., None] * n).square().sum(-1)
-    linear, normal, tangential, mass = coefficients.unbind(-1)
-    squares = 0.5 * (linear * d.square().sum(-1) + mass * inertial.square())
-    slip = torch.where(along > 0.0, along.clamp_min(1e-300).sqrt(), 0.0)
-    # No third powers: for their second derivative torch loads its compiler, which takes seconds.
-    return (size * (squares + (normal * across.square() * across.abs() + tangential * along * slip) / 3.0)).sum()
+    """Returns the derivative (B, P, 3) of the energy in `kernels.medium` by the positions of the points."""
+    size = area.norm(dim=-1, keepdim=True)
+    n, d = area / size.clamp_min(1e-30), x - reference
+    across, inertial = ((way * n).sum(-1, keepdim=True) for way in (d, x - target))
+    along = d - across * n
+    square = along.square().sum(-1, keepdim=True)
+    slip = torch.where(square > 0.0, square.clamp_min(1e-300).sqrt(), 0.0)
+    linear, normal, tangential, mass = coefficients[..., None].unbind(-2)
+    return size * (linear * d + (normal * across.abs() * across + mass * inertial) * n + tangential * slip * along)

@@ -488,7 +488,7 @@ def test_refusals():
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
     with pytest.raises(
-        InputError, match=r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate': move"
+        InputError, match=r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate' at rest: move"
     ):
         Simulator(Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
     with pytest.raises(InputError, match="mm from itself"):

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
+from ..io.errors import InputError
 from ..kernels import broad_phase
 from ..kernels import surfaces as kernels
 from ..kernels.modules import launch_stream
@@ -276,6 +277,25 @@ class PairList:
             inputs = [self.pairs, warp_view(kept, wp.vec3d)]
             own.launch(own.record(kernels.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
         return out
+
+    def check_apart(self, positions: torch.Tensor, when: str, advice: str) -> None:
+        """Raises InputError where surfaces cross at positions (B, N, 3), or a body is within another one.
+
+        Args:
+            positions: of the vertices [m].
+            when: these positions, in words; braces stand for the environment.
+            advice: what to do.
+        """
+        count, edge = self.crossings(positions)
+        if bool(count.any()):
+            b = int(count.argmax())
+            crossing = self.crossing(positions[b], int(edge[b]))
+            raise InputError(f"surfaces cross {when.format(b)}: {crossing}; {advice}.")
+        enclosed = self.enclosed(positions)
+        if bool((enclosed >= 0).any()):
+            b = int(enclosed[:, 0].argmax())
+            inside, outer = map(self.surface.words, enclosed[b].tolist())
+            raise InputError(f"a body with {inside} is within that with {outer} {when.format(b)}: {advice}.")
 
     def crossing(self, positions: torch.Tensor, edge: int) -> str:
         """Returns in words what an edge that passes through a triangle shows at positions (N, 3) [m]."""

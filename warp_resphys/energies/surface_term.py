@@ -145,20 +145,8 @@ class SurfaceTerm(Term):
     def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
         given, ours = value_of(values, "surface_start"), self._list
         if not follows:
-            count, edge = ours.crossings(given)
-            if bool(count.any()):
-                b = int(count.argmax())
-                raise InputError(
-                    f"surfaces cross at the start of a step, in environment {b}: "
-                    f"{ours.crossing(given[b], int(edge[b]))}. Give a state in which the bodies are apart."
-                )
-            if bool(((enclosed := ours.enclosed(given)) >= 0).any()):
-                b = int(enclosed[:, 0].argmax())
-                inside, outer = (ours.surface.words(vertex) for vertex in enclosed[b].tolist())
-                raise InputError(
-                    f"a body with {inside} is within that with {outer} at the start of a step, in environment {b}: "
-                    "give a state in which the bodies are apart."
-                )
+            when = "at the start of a step, in environment {}"
+            ours.check_apart(given, when, "give a state in which the bodies are apart")
         share = self.launcher.zeros() + 1.0
         self.free_way(given, start, share)
         if bool((share < 1.0).any()):

@@ -163,16 +163,7 @@ class BoundSurfaceContact(BoundEnergy):
     def _check_rest(self, pairs: PairList, rest: torch.Tensor) -> None:
         """Raises InputError where surfaces cross or touch at rest, or parts of a piece are within reach of others."""
         words = pairs.surface.words
-        count, edge = pairs.crossings(rest)
-        if int(count):
-            raise InputError(
-                f"surfaces cross at rest: {pairs.crossing(rest[0], int(edge))}. Move bodies apart, or mend the mesh."
-            )
-        inside, outer = pairs.enclosed(rest)[0].tolist()
-        if inside >= 0:
-            raise InputError(
-                f"at rest, a body with {words(inside)} is within that with {words(outer)}: move the bodies apart."
-            )
+        pairs.check_apart(rest, "at rest", "move the bodies apart, or mend the mesh")
         pairs.find(rest, torch.zeros_like(rest))
         piece, ends = torch.as_tensor(pairs.surface.pieces, device=rest.device), pairs.nodes
         gaps = pairs.distances(rest)

@@ -75,7 +75,7 @@ def test_solver_finds_the_minimum_and_reports_it():
     potential.positions.copy_(new.q)
     energy, balance = potential.evaluate()
     residual = float(torch.linalg.vector_norm(potential.residual))
-    scale = float(balance) + float(torch.linalg.vector_norm(potential.force))
+    scale = float(balance) + float(torch.linalg.vector_norm(potential.terms.force))
     assert residual / scale == pytest.approx(float(report.relative_residual), rel=1e-6, abs=1e-13)
     assert 2 <= int(report.iterations) <= 30
     noise = torch.randn(new.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

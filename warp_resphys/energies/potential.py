@@ -202,11 +202,6 @@ class IncrementalPotential(Launcher):
             self.stiffness.copy_(given[0] if len(given) == 1 else torch.stack(given).sum(0))
 
     @property
-    def force(self) -> torch.Tensor:
-        """(B, N, 3) loads of the current terms [N]."""
-        return self.terms.force
-
-    @property
     def inertia(self) -> torch.Tensor:
         """(B, N) inertia of the current terms [N/m], zero at fixed vertices."""
         return self.terms.inertia

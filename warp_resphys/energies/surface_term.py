@@ -303,7 +303,7 @@ class SurfaceTerm(Term):
         cross = torch.linalg.cross(ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]).square().sum(-1)
         share = (cross / ours.parallel[chosen]).clamp_max(1.0)
         factor = torch.where(ours.kind[chosen] == 0, 1.0, (2.0 - share) * share) * ours.area[chosen]
-        return _Near(environment, nodes, ends, w, r, r.norm(dim=-1), part, factor)
+        return _Near(environment, nodes, w, r, r.norm(dim=-1), part, factor)
 
     def sliding(self, values: Values, start: torch.Tensor, stiffness: torch.Tensor) -> Sliding | None:
         """Returns friction for the state at the start of a step, or None without pairs within reach."""
@@ -398,7 +398,6 @@ class _Near(NamedTuple):
 
     environment: torch.Tensor  # (A,)
     nodes: torch.Tensor  # (A, 4)
-    ends: torch.Tensor  # (A, 4, 3) [m]
     weights: torch.Tensor  # (A, 9, 4) of the nearest points, by feature (``kernels.surfaces.nearest``)
     r: torch.Tensor  # (A, 9, 3) from the nearest point of the second part to that of the first [m]
     d: torch.Tensor  # (A, 9) its length [m]

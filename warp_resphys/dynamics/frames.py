@@ -69,15 +69,16 @@ class BaseFrame:
     Args:
         poses: (K + 1, B, 6) translations t [m] and rotation vectors of R; the first and last poses are extended.
         time_step: h [s].
+        first: index of the pose at step zero.
     """
 
-    def __init__(self, poses: torch.Tensor, time_step: float) -> None:
-        self._poses, self._step = poses, time_step
+    def __init__(self, poses: torch.Tensor, time_step: float, first: int = 0) -> None:
+        self._poses, self._step, self._first = poses, time_step, first
         self._rotation = rotations(poses[..., 3:])
 
     def _at(self, step: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns R (B, 3, 3) and t (B, 1, 3) at a step."""
-        at = min(max(step, 0), len(self._poses) - 1)
+        at = min(max(self._first + step, 0), len(self._poses) - 1)
         return self._rotation[at], self._poses[at][:, None, :3]
 
     def enter(self, q: torch.Tensor, v: torch.Tensor, step: int) -> tuple[torch.Tensor, torch.Tensor]:

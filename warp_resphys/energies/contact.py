@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..fem.elements import Points
-from ..io.errors import InputError, MeshError, listed
+from ..io.errors import InputError, listed, naming
 from ..kernels import contact as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces, face_triangles
@@ -197,10 +197,8 @@ def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float
     """
     own, named = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells), dtype=bool)
     for name, factor in factors.items():
-        try:
+        with naming("contact.friction_factors: "):
             cells = mesh.region(name)
-        except MeshError as error:
-            raise InputError(f"contact.friction_factors: {error}") from None
         if named[cells].any():
             raise InputError(f"contact.friction_factors: {name!r} shares cells with another region: leave one out.")
         own[cells], named[cells] = factor, True

@@ -28,7 +28,7 @@ from typing_extensions import override
 
 from ..fem.elements import Points
 from ..fem.scene import Scene
-from ..io.errors import InputError, MeshError
+from ..io.errors import InputError, naming
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, value_of
@@ -123,10 +123,8 @@ class SurfaceContact(Energy):
         regions = np.zeros((len(self.pairs), 2, len(mesh.vertices)), dtype=np.bool_)
         for row, (name, pair) in zip(regions, self.pairs.items(), strict=True):
             for own, region in zip(row, (pair.first, pair.second), strict=True):
-                try:
+                with naming(f"the pair {name!r} of a contact between surfaces: "):
                     own[mesh.cells[mesh.region(region)]] = True
-                except MeshError as error:
-                    raise InputError(f"the pair {name!r} of a contact between surfaces: {error}") from None
         return (SurfacePoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), surface, regions),)
 
     @override

@@ -24,7 +24,7 @@ from ..energies.materials import Material
 from ..fem.body import Body, Glue, Rigid
 from ..fem.coordinates import SymmetryPlane
 from ..io.atomic import digest
-from ..io.errors import InputError, MeshError
+from ..io.errors import InputError, MeshError, naming
 from ..io.machine import find_device
 from ..mesh.arm import ArmGeometry, mesh_arm
 from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, quadratic, select_cells, select_vertices
@@ -156,10 +156,8 @@ def build_material(settings: MaterialSettings, key: str) -> Material | dict[str,
     """
     materials = {}
     for region, own in settings.by_region.items():
-        try:
+        with naming(f"{key}.regions.{region}: " if region else f"{key}: "):
             materials[region] = make_material(own.model, **own.constants)
-        except InputError as error:
-            raise InputError(f"{key}.regions.{region}: {error}" if region else f"{key}: {error}") from error
     return materials.get("", materials)
 
 
@@ -232,12 +230,10 @@ def whole_mesh(settings: BodySettings) -> Mesh:
 def _glue(mesh: Mesh, settings: BodySettings, number: int) -> Glue:
     """Returns the glue of one entry of ``glued``."""
     glue = settings.glued[number]
-    try:
+    with naming(f"glued[{number}]: "):
         members = np.unique(mesh.cells[mesh.region(glue.region)])
         mesh.region(glue.to)
         vertices = np.intersect1d(select_vertices(mesh, **glue.at.arguments()), members)
-    except MeshError as error:
-        raise MeshError(f"glued[{number}]: {error}") from None
     if not len(vertices):
         raise MeshError(f"glued[{number}].at: no vertex of the region {glue.region!r} lies there.")
     return Glue(vertices, glue.to, glue.tolerance)
@@ -249,10 +245,8 @@ def _with_regions(mesh: Mesh, settings: BodySettings) -> Mesh:
     for name, box in settings.regions.items():
         if name in settings.parts:
             raise MeshError(f"regions.{name}: a part has this name already: choose another.")
-        try:
+        with naming(f"regions.{name}: "):
             regions[name] = select_cells(mesh, **box.arguments())
-        except MeshError as error:
-            raise MeshError(f"regions.{name}: {error}") from None
     return replace(mesh, regions=regions)
 
 

@@ -156,36 +156,21 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
         raise DecodingError(printed.getvalue()) from error
     arrays = {"points": np.asarray(content.points, dtype=np.float64)}
     arrays["types"] = np.array([block.type for block in content.cells if len(block)], dtype=np.str_)
-    solids: dict[str, list[NDArray[np.int64]]] = {}
+    parts: dict[str, list[NDArray[np.int64]]] = {}
     for block in content.cells:
         if block.dim == 3 and len(block):
             polyhedra = not isinstance(block.data, np.ndarray)
             data = np.empty((len(block), 0)) if polyhedra else block.data
-            solids.setdefault(f"solid/{block.type}", []).append(np.asarray(data, dtype=np.int64))
-    surfaces = {f"surface/{name}": parts for name, parts in _named_surfaces(content).items()}
-    regions = {f"region/{name}": parts for name, parts in _named_regions(content).items()}
-    return arrays | {name: np.concatenate(parts) for name, parts in (solids | surfaces | regions).items()}
-
-
-def _named_surfaces(content: Any) -> dict[str, list[NDArray[np.int64]]]:
-    """Corners (F, 3 | 4) of the faces of named surfaces, by block."""
-    members: dict[str, list[NDArray[np.int64]]] = {}
+            parts.setdefault(f"solid/{block.type}", []).append(np.asarray(data, dtype=np.int64))
     for name, number, cells in _groups(content, 2):
         block = content.cells[number]
         if block.type in _SURFACE_CELLS:
             corners = np.asarray(block.data, dtype=np.int64)[:, : _SURFACE_CELLS[block.type]]
-            members.setdefault(name, []).append(corners[cells])
-    return members
-
-
-def _named_regions(content: Any) -> dict[str, list[NDArray[np.int64]]]:
-    """Numbers (M,) of the cells of named regions among all volume cells, by block."""
-    sizes = [len(block) if block.dim == 3 else 0 for block in content.cells]
-    first = np.cumsum([0, *sizes])
-    members: dict[str, list[NDArray[np.int64]]] = {}
+            parts.setdefault(f"surface/{name}", []).append(corners[cells])
+    first = np.cumsum([0, *(len(block) if block.dim == 3 else 0 for block in content.cells)])
     for name, number, cells in _groups(content, 3):
-        members.setdefault(name, []).append(first[number] + cells)
-    return members
+        parts.setdefault(f"region/{name}", []).append(first[number] + cells)
+    return arrays | {name: np.concatenate(own) for name, own in parts.items()}
 
 
 def _groups(content: Any, dimension: int) -> Iterator[tuple[str, int, NDArray[np.int64]]]:

@@ -25,7 +25,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from ..experiment.experiment import LEARNED, Experiment
 from ..experiment.learn import Prepared, run_epochs, trainer_of
 from ..experiment.trials import folds_of, split_of
-from ..io.errors import DataFileError, InputError, listed
+from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
 from ..io.stages import Stage, StageInterrupted, run_stages
 from ..pipeline import acquire, learning_stages, prepare
@@ -105,13 +105,11 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, BaseDistribution
     groups = ("network", "trainer" if training.in_the_loop is None else "in_the_loop")
     if unused := [key for key in (*fixed, *space) if key.partition(".")[0] not in groups]:
         raise InputError(f"the trials do not depend on tune's {unused[0]}: search {' and '.join(groups)} only.")
-    try:
+    with naming("tune: "):
         training = _changed(training, fixed)
         for key, values in space.items():
             for value in getattr(values, "choices", None) or (values.low, values.high):  # type: ignore[attr-defined]
                 _changed(training, {key: value})
-    except InputError as error:
-        raise InputError(f"tune: {error}") from error
     return space, training
 
 

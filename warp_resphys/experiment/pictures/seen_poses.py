@@ -15,7 +15,7 @@ from ...data.camera import Lens, PlacedCamera
 from ...data.markers import bind_markers
 from ...fem.body import Body
 from ...io.atomic import atomic_path, digest
-from ...io.errors import DataFileError, InputError, MeshError, listed
+from ...io.errors import DataFileError, InputError, listed, naming
 from ...io.files import atomic_hdf5, create, read_array, read_hdf5
 from ...io.stages import StageContext
 from ...mesh.mesh import Mesh, quadratic, select_vertices
@@ -118,10 +118,8 @@ def released_force(name: str, pose: PoseSettings, mesh: Mesh) -> ReleasedForce |
     wanted = pose.release
     if wanted is None:
         return None
-    try:
+    with naming(f"data.poses.{name}.release.at: "):
         return ReleasedForce(select_vertices(mesh, **wanted.at.arguments()), wanted.force, wanted.time)
-    except MeshError as error:
-        raise MeshError(f"data.poses.{name}.release.at: {error}") from None
 
 
 def import_pictures(context: StageContext) -> None:
@@ -320,10 +318,8 @@ class SeenPoses:
         """The points that may be of a body, as many as configured."""
         wanted = self.data.cloud
         cloud = replace(cloud, noise=wanted.noise, reach=wanted.reach)
-        try:
+        with naming(f"{path}: "):
             return cloud.around(camera, mesh, clamped, wanted.points, self.settings.seed)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
 
     def _mesh(self, name: str) -> tuple[Mesh, tuple[NDArray[np.int64], ...]]:
         """Mesh of a pose, and the vertices in its clamps."""

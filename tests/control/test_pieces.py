@@ -12,7 +12,7 @@ from warp_resphys.control.controllers import JacobianFeedback
 from warp_resphys.control.plan import Planner, solve_program, tracked_of
 from warp_resphys.control.polynomials import Polynomial, powers
 from warp_resphys.control.reduced_force import Evaluator
-from warp_resphys.control.reference import Path
+from warp_resphys.control.task import Path
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.rollout import Range

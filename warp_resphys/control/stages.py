@@ -45,8 +45,7 @@ from .files import (
     write_plans,
     write_reduced,
 )
-from .open_loop import follow
-from .plan import tracked_of
+from .plan import follow, tracked_of
 from .polynomials import FloatArray
 from .reduction import reduce
 from .sampling import check_plannable, driven_input

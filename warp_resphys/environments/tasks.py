@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.polynomials import FloatArray
-from ..control.reference import Path
+from ..control.task import Path
 from ..io.errors import InputError
 
 PREVIEW: Final = (0, 2, 5)  # actions ahead of the goals that are observed

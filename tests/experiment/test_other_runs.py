@@ -218,7 +218,7 @@ def test_inputs_with_a_zero_that_differs_from_trial_to_trial(folder):
     ratios = [error / deviations[f"tendon_tension_zero@{name}"] for name, error in errors.items()]
     assert np.sqrt(np.mean(np.square(ratios))) < 3.0  # the largest of four depends on where the search stops
     page = (run_folder / "report.html").read_text()
-    assert "Zero of the tensions [N]" in page
+    assert "Tendon tension zero [N]" in page
     assert "What could explain the remaining error" in page
     check_sensitivities(finished_experiment(run_folder), later)
 

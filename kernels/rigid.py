@@ -46,6 +46,24 @@ def tangent(
 
 
 @wp.kernel
+def slopes(
+    points: VectorPoints,
+    inertia: wp.array2d[wp.float64],
+    target: wp.array2d[wp.vec3d],
+    positions: wp.array2d[wp.vec3d],
+    direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
+    inertia_out: wp.array2d[wp.float64],  # (B, P) dL/dk
+    target_out: wp.array2d[wp.vec3d],  # (B, P) dL/dy
+):
+    """-z . d residual by the inertia and by the target."""
+    b, p = wp.tid()
+    offset = vector_at(points, positions, b, p) - target[b, p]
+    dz = vector_at(points, direction, b, p)
+    inertia_out[b, p] = -wp.dot(offset, dz)
+    target_out[b, p] = inertia[b, p] * dz
+
+
+@wp.kernel
 def straighten(
     points: MatrixPoints,
     centre: wp.array2d[wp.float64],  # (P, 4) weights of the centre of mass

@@ -20,7 +20,7 @@ from ..kernels.triangles import from_surface
 from ..mesh.motion_files import MovingSurface
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
-from .launcher import launch, struct_of, warp_view
+from .launcher import Launcher, struct_of, warp_view
 
 Vector = tuple[float, float, float]
 # Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
@@ -332,6 +332,7 @@ class ObstacleSet:
         }
         self._fixed = {name: torch.as_tensor(values, device=device) for name, values in arrays.items()}
         self._reach = reach
+        self._measurements: dict[tuple[int, int, int], _Measurement] = {}
 
     def at(self, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor) -> Any:
         """Returns the obstacles at float64 poses, as a kernel argument that reads these tensors."""
@@ -339,8 +340,43 @@ class ObstacleSet:
 
     def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""
-        d, n = _Distances.apply(self, x, pose.place, pose.turn, pose.growth)
+        size = batch, points, count = (*x.shape[:2], pose.place.shape[1])
+        if size not in self._measurements:
+            self._measurements[size] = _Measurement(self, batch, points, count, x.device)
+        d, n = _Distances.apply(self._measurements[size], x, pose.place, pose.turn, pose.growth)
         return d, n
+
+
+class _Measurement(Launcher):
+    """Buffers and launches of `kernels.obstacles.measure` and its adjoint for one size of a batch."""
+
+    def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
+        super().__init__(batch, device)
+        self._size = (points, count)
+        self.inputs = [self.zeros(points, 3), self.zeros(count, 3), self.zeros(count, 3, 3), self.zeros(count)]
+        x, *pose = self.inputs
+        self._given = [shapes.at(*pose), warp_view(x, wp.vec3d)]
+        self.results, views = self._pair()
+        self.measure = self.record(kernels.measure, (batch, *self._size), self._given, views)
+
+    def _pair(self) -> tuple[list[torch.Tensor], list[Any]]:
+        """Returns buffers of distances and normals, and Warp's views of them."""
+        buffers = [self.zeros(*self._size), self.zeros(*self._size, 3)]
+        return buffers, [warp_view(buffer, kind) for buffer, kind in zip(buffers, (wp.float64, wp.vec3d), strict=True)]
+
+    @cached_property
+    def adjoint(self) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, Any]:
+        """Buffers of derivatives by the results, by positions and by rotations, and the launch; made when needed."""
+        by_results, views = self._pair()
+        position, turn = self.zeros(*self._size, 3), self.zeros(*self._size, 3, 3)
+        slopes = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
+        inputs = [*self._given, *views]
+        return (
+            by_results,
+            position,
+            turn,
+            self.record(kernels.measure_adjoint, (self.batch, *self._size), inputs, slopes),
+        )
 
 
 class _Distances(torch.autograd.Function):
@@ -348,28 +384,25 @@ class _Distances(torch.autograd.Function):
 
     @override
     @staticmethod
-    def forward(ctx: Any, shapes: ObstacleSet, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        x, *pose = (value.detach().double().contiguous() for value in given)
-        distance = x.new_empty(*x.shape[:2], pose[0].shape[1])
-        normal = x.new_empty(*distance.shape, 3)
-        out = [warp_view(distance, wp.float64), warp_view(normal, wp.vec3d)]
-        launch(kernels.measure, distance.shape, [shapes.at(*pose), warp_view(x, wp.vec3d)], out, x.device)
-        ctx.shapes = shapes
-        ctx.save_for_backward(x, *pose)
-        return distance.to(given[0].dtype), normal.to(given[0].dtype)
+    def forward(ctx: Any, own: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        for buffer, value in zip(own.inputs, given, strict=True):
+            buffer.copy_(value.detach())
+        own.launch(own.measure)
+        ctx.own = own
+        ctx.save_for_backward(*given)
+        d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
+        return d, n
 
     @override
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        x, *pose = ctx.saved_tensors
-        by_distance, by_normal = (value.double().contiguous() for value in by_results)
-        position, turn = torch.empty_like(by_normal), x.new_empty(*by_distance.shape, 3, 3)
-        given = [ctx.shapes.at(*pose), warp_view(x, wp.vec3d)]
-        given += [warp_view(by_distance, wp.float64), warp_view(by_normal, wp.vec3d)]
-        out = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
-        launch(kernels.measure_adjoint, by_distance.shape, given, out, x.device)
-        sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -by_distance.sum(1))
+        own = ctx.own
+        buffers, position, turn, command = own.adjoint
+        for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
+            buffer.copy_(value)
+        own.launch(command)
+        sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
         needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
         return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
 

@@ -29,7 +29,7 @@ from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
 from ..stepping.quantity import Parameter, Quantity
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, points_reader, value_of
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import Corotated
 from .solid import VISCOUS, SolidTerm
@@ -139,11 +139,16 @@ class PointInertiaTerm(Term):
 
     @override
     def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        at_points, (inertia, target) = points_reader(self.sets[0]), (value_of(values, name) for name in self.shapes)
+        own, (s,) = self.launcher, self.sets
+        by_inertia, by_target = own.zeros(self.n_points), own.zeros(self.n_points, 3)
+        fields = [warp_view(field, wp.vec3d) for field in (positions, direction)]
+        inputs = [s.points, *self._views(values), *fields]
+        outputs = [warp_view(by_inertia, wp.float64), warp_view(by_target, wp.vec3d)]
+        command = own.record(kernels.slopes, (own.batch, self.n_points), inputs, outputs)
 
         def differentiate() -> dict[str, torch.Tensor]:
-            offset, moved = at_points(positions) - target, at_points(direction)
-            return {"inertia": -(offset * moved).sum(-1), "target": inertia[..., None] * moved}
+            own.launch(command)
+            return {"inertia": by_inertia.clone(), "target": by_target.clone()}
 
         return differentiate
 

@@ -88,10 +88,8 @@ def command_line() -> argparse.ArgumentParser:
     for part, solvers, counts in ((step, ["quasi_newton", "newton"], [1]), (batches, ["quasi_newton"], None)):
         part.set_defaults(measure=steps.measure_steps, run=None)
         part.add_argument("--solvers", nargs="+", choices=SOLVERS, default=solvers)
-        part.add_argument("--refinements", nargs="+", type=float, default=[1.0])
         part.add_argument("--batches", nargs="+", type=int, default=counts)
         part.add_argument("--steps", type=int, default=60, help="of a roll-out (default: %(default)s)")
-        part.add_argument("--straight", action="store_true", help="the body starts from its shape at rest")
         part.add_argument("--floor", action="store_true", help="the body is lifted, and falls on a floor")
     batches.add_argument("--run", type=Path, help="a run folder, whose environments are timed, too")
     sizes = parts.add_parser("sizes", parents=[shared, body], help="by size of the body and linear solver")
@@ -109,13 +107,11 @@ def command_line() -> argparse.ArgumentParser:
     grasp.set_defaults(measure=gripper.measure_grippers)
     grasp.add_argument("--batches", nargs="+", type=int, help="numbers of grippers")
     grasp.add_argument("--fingers", nargs=3, type=int, default=[2, 2, 10], help="bricks of a finger")
-    grasp.add_argument("--tensions", nargs=2, type=float, default=[1.2, 1.8], help="of the first and the last [N]")
     grasp.add_argument("--factors", choices=["double", "single"], default="double")
     other = parts.add_parser("peers", parents=[shared], help="beside Newton and MuJoCo, at equal error")
     other.set_defaults(measure=peers.measure_peers)
     other.add_argument("--programs", nargs="*", choices=["newton", "mujoco"], default=["newton", "mujoco"])
     other.add_argument("--divisions", nargs=3, type=int, default=[8, 6, 5], help="bricks of the block")
-    other.add_argument("--finest", type=int, default=8, help="number of settings of every program")
     return parser
 
 

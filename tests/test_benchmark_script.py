@@ -41,13 +41,11 @@ def test_the_median_of_every_figure_over_turns():
 
 
 def test_a_row_for_every_case(measured, capsys, device):
-    result = measured("step", *TINY, "--steps=2", "--refinements", "1", "2", f"--device={device}")
+    result = measured("step", *TINY, "--steps=2", f"--device={device}")
     rows = result[steps.STEPS]
-    assert [(row["solver"], row["refinement"]) for row in rows] == [
-        (solver, refinement) for solver in ("quasi_newton", "newton") for refinement in (1.0, 2.0)
-    ]
+    assert [row["solver"] for row in rows] == ["quasi_newton", "newton"]
     for row in rows:
-        assert (row["batch"], row["unknowns"]) == (1, {1.0: 24, 2.0: 108}[row["refinement"]])
+        assert (row["batch"], row["unknowns"]) == (1, 24)
         assert row["steps_per_s"] == pytest.approx(1e3 / row["plain_ms"])
         assert row["yardsticks"] == pytest.approx((row["forward_ms"] + row["backward_ms"]) / result["yardstick_ms"])
         assert row["factorisations"] >= row["iterations"] >= 1.0 or row["solver"] == "quasi_newton"
@@ -62,7 +60,8 @@ def test_a_row_for_every_case(measured, capsys, device):
 
 
 def test_a_beam_that_is_lifted_falls_on_the_floor():
-    rollout = steps.rollout_of(arguments("batches", *TINY, "--floor", "--steps=40"), "quasi_newton", "0.45", 1.0, 2)
+    settings = steps.run_settings(arguments("batches", *TINY), *steps.FLOOR)
+    rollout = steps.rollout_of(settings, "quasi_newton", "0.45", 2, 40)
     with torch.no_grad():
         path = rollout.simulator.rollout(rollout.start, rollout.steps)
     gaps = path.q[..., 2].flatten(1).amin(1) + 0.004
@@ -70,7 +69,7 @@ def test_a_beam_that_is_lifted_falls_on_the_floor():
 
 
 def test_a_beam_hangs_under_a_weight_that_is_lighter_in_later_environments():
-    settings = measuring.run_settings(("mesh.divisions=[2,1,1]",))
+    settings = steps.run_settings(arguments("step", *TINY))
     simulator = build_simulator(settings, settings.simulation)
     start, _ = steps.loaded(simulator, 2, 3)
     sag = (start.q - simulator.static_equilibrium().q)[:, :, 2].amin(1)
@@ -123,10 +122,10 @@ def test_a_twin_follows_the_trials_of_a_run(finished, measured, capsys):
 class TestGripper:
     @pytest.mark.slow
     def test_all_hold_the_ball_and_nothing_crosses(self, measured):
-        result = measured("gripper", "--batches=2", "--repeats=1", "--tensions", "1.5", "1.8")
+        result = measured("gripper", "--batches=2", "--repeats=1")
         (row,) = result["a step of 10 ms of all grippers"]
         assert (row["grippers"], row["held"], row["crossings"]) == (2, 2, 0)
-        assert row["speed_of_that_without"] == pytest.approx(row["without_contact_ms"] / row["grasp_ms"])
+        assert row["without_contact_ms"] < row["grasp_ms"]
 
 
 class TestPeers:

@@ -2,7 +2,8 @@
 
 import argparse
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -27,10 +28,10 @@ from warp_resphys.stepping.inputs import Inputs
 from .measuring import free_unknowns, now, solves, take_turns
 
 LENGTH, SIDE, RADIUS, TABLE, GAP = 0.08, 0.014, 0.012, -0.083, 1.5e-3  # [m]
-BALL: Final = 4  # bricks along the ball
 D: Final = 5e-4  # distance at which contact begins [m]
 STIFFNESS, FRICTION, SLIP_SPEED = 5e4, 0.5, 5e-3  # [Pa], 1, [m/s]
 CLOSED, LIFTED, RISE, TIME_STEP = 0.2, 0.5, 0.03, 0.01  # times [s] and height [m] of a grasp
+TENSIONS: Final = (1.2, 1.8)  # of the first and the last gripper [N]; one alone has the largest
 RUBBER: Final = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45, density=1070.0, stiffness_damping=4e-3)
 BATCHES: Final = {"cpu": (1, 16), "cuda": (1, 16, 256, 1024)}
 STEPS: Final = round(LIFTED / TIME_STEP)
@@ -44,62 +45,53 @@ def finger(side: float, divisions: tuple[int, int, int]) -> Body:
     return Body(mesh, fixed=select_vertices(mesh, z=0.0), energies=[tendon])
 
 
-@dataclass(frozen=True)
-class Grasp:
-    """Grippers that close on a ball and lift it, one for every tension; without contact, fingers pass through it."""
+def grasp(arguments: argparse.Namespace, batch: int, contact: bool) -> tuple[int, Callable[[], dict[str, float]]]:
+    """Returns the unknowns of a gripper, and a task: a batch of them closes on the ball and lifts it.
 
-    scene: Scene
-    simulator: Simulator
-    inputs: Inputs
-    batch: int
-
-    @classmethod
-    def of(cls, arguments: argparse.Namespace, batch: int, device: torch.device, contact: bool) -> "Grasp":
-        """Returns grippers whose tensions are spread evenly; one alone has the largest."""
-        ball = ball_mesh(RADIUS, BALL)
-        ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
-        table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED)
-        bodies = {name: finger(side, tuple(arguments.fingers)) for name, side in (("left", -1.0), ("right", 1.0))}
-        bodies["ball"] = Body(ball, energies=[table] if contact else [])
-        scene = Scene(bodies, SurfaceContact(STIFFNESS, FRICTION, D, SLIP_SPEED) if contact else None)
-        solver = SolverSettings(relative_tolerance=1e-6, factors=arguments.factors)
-        simulator = Simulator(scene, RUBBER, TIME_STEP, solver=solver, device=device)
-        least, most = arguments.tensions
-        tensions = simulator.tensor(np.linspace(most if batch == 1 else least, most, batch))
-        times = TIME_STEP * simulator.tensor(1 + np.arange(STEPS))
-        way = ((times - CLOSED) / (LIFTED - CLOSED)).clamp(0.0, 1.0)
-        base = simulator.rest_positions[simulator.fixed].repeat(STEPS, 1, 1, 1)
-        base[..., 2] += RISE * (0.5 - 0.5 * torch.cos(math.pi * way))[:, None, None]
-        pull = ((times / CLOSED).clamp_max(1.0)[:, None] * tensions)[..., None]
-        own = scene.inputs({name: Inputs(tendon_tension=pull) for name in ("left", "right")})
-        return cls(scene, simulator, Inputs(fixed_positions=base.expand(-1, batch, -1, -1), **own.fields), batch)
+    The task returns the time of a step of all grippers, and how many hold the ball; without contact, fingers pass
+    through it.
+    """
+    ball = ball_mesh(RADIUS, 4)
+    ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, TABLE + RADIUS + 0.9 * D])
+    table = Contact({"table": HalfSpace(position=(0.0, 0.0, TABLE))}, STIFFNESS, FRICTION, D, SLIP_SPEED)
+    bodies = {name: finger(side, tuple(arguments.fingers)) for name, side in (("left", -1.0), ("right", 1.0))}
+    bodies["ball"] = Body(ball, energies=[table] if contact else [])
+    scene = Scene(bodies, SurfaceContact(STIFFNESS, FRICTION, D, SLIP_SPEED) if contact else None)
+    solver = SolverSettings(relative_tolerance=1e-6, factors=arguments.factors)
+    device = choose_device(arguments.device)
+    simulator = Simulator(scene, RUBBER, TIME_STEP, solver=solver, device=device)
+    tensions = simulator.tensor(np.linspace(TENSIONS[0 if batch > 1 else 1], TENSIONS[1], batch))
+    times = TIME_STEP * simulator.tensor(1 + np.arange(STEPS))
+    way = ((times - CLOSED) / (LIFTED - CLOSED)).clamp(0.0, 1.0)
+    base = simulator.rest_positions[simulator.fixed].repeat(STEPS, 1, 1, 1)
+    base[..., 2] += RISE * (0.5 - 0.5 * torch.cos(math.pi * way))[:, None, None]
+    pull = Inputs(tendon_tension=((times / CLOSED).clamp_max(1.0)[:, None] * tensions)[..., None])
+    fields = scene.inputs({"left": pull, "right": pull}).fields
+    inputs = Inputs(fixed_positions=base.expand(-1, batch, -1, -1), **fields)
+    start, of_ball = simulator.rest_state(batch), scene.vertex_slice("ball")
 
     @torch.no_grad()
-    def measure(self) -> dict[str, float]:
-        """Lifts the ball once: time of a step of all grippers, and how many hold the ball."""
-        start = self.simulator.rest_state(self.batch)
-        began = now(start.q.device)
-        path = self.simulator.rollout(start, STEPS, self.inputs)
-        seconds = (now(start.q.device) - began) / STEPS
-        ball = self.scene.vertex_slice("ball")
-        height = path.q[-1, :, ball, 2].mean(1) - start.q[:, ball, 2].mean(1)
-        pairs = PairList(Launcher(self.batch, start.q.device), Surface.of(self.scene.mesh), D)
-        seen = path.q[:: max(STEPS // 10, 1)].double()
-        crossings = sum(int(pairs.crossings(q)[0].sum()) for q in seen)
+    def lift() -> dict[str, float]:
+        began = now(device)
+        path = simulator.rollout(start, STEPS, inputs)
+        seconds = (now(device) - began) / STEPS
+        height = path.q[-1, :, of_ball, 2].mean(1) - start.q[:, of_ball, 2].mean(1)
+        pairs = PairList(Launcher(batch, device), Surface.of(scene.mesh), D)
+        crossings = sum(int(pairs.crossings(q)[0].sum()) for q in path.q[:: STEPS // 10].double())
         held = int((height > 0.9 * RISE).sum())
         return {"ms": 1e3 * seconds, "iterations": solves(path)["iterations"], "held": held, "crossings": crossings}
+
+    lift()  # compiles kernels
+    return free_unknowns(simulator), lift
 
 
 def measure_grippers(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times a step of grippers, with contact and without."""
-    device, rows, yardstick = choose_device(arguments.device), list[dict[str, Any]](), 0.0
-    for batch in arguments.batches or BATCHES[device.type]:
-        grasps = [Grasp.of(arguments, batch, device, contact) for contact in (True, False)]
-        for grasp in grasps:
-            grasp.measure()  # compiles kernels
-        (own, free), yardstick = take_turns(f"{batch} grippers", [g.measure for g in grasps], arguments.repeats)
-        head = {"grippers": batch, "unknowns": free_unknowns(grasps[0].simulator), "grasp_ms": own.pop("ms")}
-        speed = {"steps_per_s": 1e3 * batch / head["grasp_ms"], "without_contact_ms": free["ms"]}
-        share = {"iterations_without": free["iterations"], "speed_of_that_without": free["ms"] / head["grasp_ms"]}
-        rows.append({**head, **speed, **own, **share})
-    return {"yardstick_ms": yardstick, f"a step of {1e3 * TIME_STEP:g} ms of all grippers": rows}
+    rows = list[dict[str, Any]]()
+    for batch in arguments.batches or BATCHES[choose_device(arguments.device).type]:
+        (unknowns, lift), (_, without) = (grasp(arguments, batch, contact) for contact in (True, False))
+        (own, free), _ = take_turns(f"{batch} grippers", [lift, without], arguments.repeats)
+        ms = own.pop("ms")
+        head = {"grippers": batch, "unknowns": unknowns, "grasp_ms": ms, "steps_per_s": 1e3 * batch / ms}
+        rows.append({**head, **own, "without_contact_ms": free["ms"], "iterations_without": free["iterations"]})
+    return {f"a step of {1e3 * TIME_STEP:g} ms of all grippers": rows}

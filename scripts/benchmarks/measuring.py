@@ -6,9 +6,8 @@ yardstick, is timed with them, so that times over the yardstick can be compared 
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from statistics import median
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -20,19 +19,16 @@ from warp_resphys.commands import CONFIG_PACKAGE
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.dynamics.trajectory import Trajectory
 from warp_resphys.io.progress import Progress
-from warp_resphys.io.settings import parse
 from warp_resphys.launch import freed
-from warp_resphys.settings.run import RunSettings
 
 CPU: Final = torch.device("cpu")
 _SIZE: Final = 480  # of the yardstick's matrices
 
 
-@cache
-def run_settings(overrides: tuple[str, ...]) -> RunSettings:
-    """Returns the settings of a run, as the command line composes them."""
+def composed(name: str, overrides: Sequence[str]) -> Any:
+    """Returns the values of a configuration, as the command line composes them."""
     with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
-        return parse(RunSettings, OmegaConf.to_container(compose("config", freed(overrides)), resolve=True))
+        return OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)
 
 
 def now(device: torch.device = CPU) -> float:
@@ -52,17 +48,14 @@ def median_ms(task: Callable[[], object], repeats: int, device: torch.device = C
     return 1e3 * median(durations)
 
 
-def yardstick_ms() -> float:
-    """Returns the median duration [ms] of a product and a Cholesky factor of 480 x 480 in NumPy, on one thread."""
-    random = np.random.default_rng(0).standard_normal((_SIZE, _SIZE))
-    with threadpool_limits(1):
-        return median_ms(lambda: np.linalg.cholesky(random @ random.T + _SIZE * np.eye(_SIZE)), 5)
-
-
 def take_turns(
     title: str, tasks: Sequence[Callable[[], Mapping[str, float]]], repeats: int
 ) -> tuple[list[dict[str, float]], float]:
-    """Runs tasks in turns, and returns the medians of the figures that each returns, and of the yardstick [ms]."""
+    """Runs tasks in turns, and returns the medians of the figures that each returns, and of the yardstick [ms].
+
+    The yardstick is a product and a Cholesky factor of 480 x 480 in NumPy, on one thread.
+    """
+    random = np.random.default_rng(0).standard_normal((_SIZE, _SIZE))
     figures: list[list[Mapping[str, float]]] = [[] for _ in tasks]
     yardsticks = []
     with Progress(title, repeats * len(tasks), "runs") as progress:
@@ -70,7 +63,8 @@ def take_turns(
             for task, own in zip(tasks, figures, strict=True):
                 own.append(task())
                 progress.advance()
-            yardsticks.append(yardstick_ms())
+            with threadpool_limits(1):
+                yardsticks.append(median_ms(lambda: np.linalg.cholesky(random @ random.T + _SIZE * np.eye(_SIZE)), 5))
     return [{name: median(row[name] for row in own) for name in own[0]} for own in figures], median(yardsticks)
 
 

@@ -36,7 +36,7 @@ from warp_resphys.mesh.mesh import Mesh, box_tetrahedra
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.stepping.state import State
 
-from .measuring import CPU, now, take_turns
+from .measuring import now, take_turns
 
 Array = NDArray[np.float64]
 Run = Callable[[Array, Array, int], tuple[float, Array]]  # q, v (N, 3), T to seconds a step and positions (T, N, 3)
@@ -110,18 +110,16 @@ class Scene:
         seconds, positions = run(settled[-1], 0.0 * q + [self.speed, 0.0, 0.0], steps)
         return (before * first + seconds * steps) / (first + steps), settled[-1], positions
 
-    def error(self, settled: Array, end: Array, expected: Array) -> float:
-        """Returns the error of the way of a block that slides, or of the shape of one that is held [m]."""
-        if self.speed:
-            return abs(float((end - settled)[:, 0].mean()) - self.speed**2 / (2.0 * FRICTION * G))
-        return float(np.linalg.norm(end - expected, axis=-1).mean())
-
     def compare(self, run: Run, time_step: float, clearance: float, expected: Array) -> dict[str, float]:
         """Runs the scene once: time of a step, the same over the simulated time, error and penetration."""
         seconds, settled, q = self.measure(run, time_step, clearance)
         gap = min(float(((q - point) @ normal).min()) for point, normal in self.planes)
-        errors = {"error_mm": 1e3 * self.error(settled, q[-1], expected), "penetration_um": 1e6 * max(-gap, 0.0)}
-        return {"time_ms": 1e3 * seconds, "load": seconds / time_step, **errors}
+        if self.speed:
+            error = abs(float((q[-1] - settled)[:, 0].mean()) - self.speed**2 / (2.0 * FRICTION * G))
+        else:
+            error = float(np.linalg.norm(q[-1] - expected, axis=-1).mean())
+        figures = {"time_ms": 1e3 * seconds, "load": seconds / time_step}
+        return {**figures, "error_mm": 1e3 * error, "penetration_um": 1e6 * max(-gap, 0.0)}
 
 
 def measure_peers(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -131,15 +129,19 @@ def measure_peers(arguments: argparse.Namespace) -> dict[str, Any]:
         InputError: the package of a peer is not installed.
     """
     for peer in arguments.programs:
-        package(peer)
+        try:
+            import_module(peer)
+        except ModuleNotFoundError:
+            message = f"The package {peer} is not installed: run pip install 'warp-resphys[peer]'."
+            raise InputError(message) from None
     device, tables = choose_device(arguments.device), dict[str, Any]()
     for name in ("slide", "grip"):
         scene = Scene.of(name, tuple(arguments.divisions))
-        rigid = ours(scene, device, 5e-4, 1e-5, 1e-8, slip_speed=0.1 * SLIP_SPEED)
+        rigid = ours(scene, device, 5e-4, 1e-5, 1e-8, slip_share=0.1)
         expected = scene.measure(rigid, 5e-4, 1e-5)[2][-1] if name == "grip" else scene.mesh.vertices
         heads, tasks = list[dict[str, Any]](), list[Callable[[], dict[str, float]]]()
         for program in (OURS, *arguments.programs):
-            for h, *values in SETTINGS[program][-arguments.finest :]:
+            for h, *values in SETTINGS[program]:
                 heads.append({"program": program, "step_ms": 1e3 * h, "setting": ", ".join(map(str, values))})
                 run, clearance = MAKERS[program](scene, device, h, *values), values[0] if program == OURS else 0.0
                 tasks.append(partial(scene.compare, run, h, clearance, expected))
@@ -155,36 +157,16 @@ def at_equal_error(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) ->
     return "" if row["program"] == OURS else f"{min(loads):.3g}" if loads else "-"
 
 
-def package(name: str) -> Any:
-    """Returns the package of a peer.
-
-    Raises:
-        InputError: it is not installed.
-    """
-    try:
-        return import_module(name)
-    except ModuleNotFoundError:
-        message = f"The package {name} is not installed: run pip install 'warp-resphys[peer]'."
-        raise InputError(message) from None
-
-
-def ours(
-    scene: Scene,
-    device: torch.device,
-    time_step: float,
-    distance: float,
-    tolerance: float,
-    slip_speed: float = SLIP_SPEED,
-) -> Run:
-    """Prepares roll-outs of this simulator; the solver stops at a relative residual."""
+def ours(scene: Scene, device: torch.device, h: float, distance: float, tolerance: float, slip_share: float = 1) -> Run:
+    """Prepares roll-outs of this simulator with steps of h; the solver stops at a relative residual."""
     planes = {
         f"plane{number}": HalfSpace(position=tuple(point - _AWAY * normal), axis=tuple(normal))
         for number, (point, normal) in enumerate(scene.planes)
     }
-    contact = Contact(planes, STIFFNESS, FRICTION, distance, slip_speed)
+    contact = Contact(planes, STIFFNESS, FRICTION, distance, slip_share * SLIP_SPEED)
     material = StableNeoHookean(density=DENSITY, youngs_modulus=MODULUS, poissons_ratio=RATIO)
     body, solver = Body(scene.mesh, energies=[contact]), SolverSettings(relative_tolerance=tolerance)
-    s = Simulator(body, material, time_step, (0.0, 0.0, -G), solver=solver, device=device)
+    s = Simulator(body, material, h, (0.0, 0.0, -G), solver=solver, device=device)
 
     @torch.no_grad()
     def run(q: Array, v: Array, steps: int) -> tuple[float, Array]:
@@ -196,9 +178,9 @@ def ours(
     return run
 
 
-def vbd(scene: Scene, device: torch.device, time_step: float, iterations: int, stiffness: float, damping: float) -> Run:
-    """Prepares roll-outs of Newton's VBD, as graphs of two steps."""
-    newton = package("newton")
+def vbd(scene: Scene, device: torch.device, h: float, iterations: int, stiffness: float, damping: float) -> Run:
+    """Prepares roll-outs of Newton's VBD with steps of h, as graphs of two steps."""
+    newton: Any = import_module("newton")
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, -G))
     builder.add_soft_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0),
@@ -229,60 +211,45 @@ def vbd(scene: Scene, device: torch.device, time_step: float, iterations: int, s
         for before, after in (states, reversed(states)):
             before.clear_forces()
             collisions.collide(before, contacts)
-            solver.step(before, after, control, contacts, time_step)
+            solver.step(before, after, control, contacts, h)
 
     two_steps()  # compiles the kernels
     with wp.ScopedCapture(device=str(device)) as capture:
         two_steps()
-    launch = partial(wp.capture_launch, capture.graph)
-
-    def read() -> list[Array]:  # the first state is the one after the second step
-        return [state.particle_q.numpy().astype(np.float64) for state in reversed(states)]
 
     def run(q: Array, v: Array, steps: int) -> tuple[float, Array]:
         states[0].particle_q.assign(q.astype(np.float32))
         states[0].particle_qd.assign(v.astype(np.float32))
-        return advance(launch, read, steps, device)
+        seconds, positions = 0.0, list[Array]()
+        while len(positions) < steps:
+            began = now(device)
+            wp.capture_launch(capture.graph)
+            seconds += now(device) - began  # the first state is the one after the second step
+            positions += [state.particle_q.numpy().astype(np.float64) for state in reversed(states)]
+        return seconds / len(positions), np.array(positions[:steps])
 
     return run
 
 
-def advance(
-    launch: Callable[[], object], read: Callable[[], list[Array]], steps: int, device: torch.device
-) -> tuple[float, Array]:
-    """Launches steps until there are enough, and returns seconds a step and the positions (T, N, 3) after every one."""
-    seconds, positions = 0.0, list[Array]()
-    while len(positions) < steps:
-        began = now(device)
-        launch()
-        seconds += now(device) - began
-        positions += read()
-    return seconds / len(positions), np.array(positions[:steps])
+def flex(scene: Scene, _: torch.device, h: float, solver: str, tolerance: float, reaction: float, limit: float) -> Run:
+    """Prepares roll-outs of MuJoCo with steps of h, on the CPU: vertices are bodies on three slides, as in `flexcomp`.
 
-
-def flex(
-    scene: Scene,
-    device: torch.device,
-    time_step: float,
-    solver: str,
-    tolerance: float,
-    time_constant: float,
-    impedance: float,
-) -> Run:
-    """Prepares roll-outs of MuJoCo, on the CPU: every vertex is a body on three slides, as its `flexcomp` has it."""
-    mujoco, mesh = package("mujoco"), scene.mesh
+    Contact has a time constant, ``reaction`` [s], and an impedance, ``limit``.
+    """
+    mujoco: Any = import_module("mujoco")
+    mesh = scene.mesh
     mujoco.set_mju_user_warning(warnings.warn)  # its own writes a file
     spec = mujoco.MjSpec()
     spec.memory = 1 << 28
     option = spec.option
-    option.timestep, option.gravity, option.impratio = time_step, (0.0, 0.0, -G), 10.0  # as advised for grasping
+    option.timestep, option.gravity, option.impratio = h, (0.0, 0.0, -G), 10.0  # as advised for grasping
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_DISCRETE, mujoco.mjtCone.mjCONE_ELLIPTIC
     option.solver, option.tolerance = getattr(mujoco.mjtSolver, f"mjSOL_{solver}"), tolerance
     for point, normal in scene.planes:
         plane = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, pos=point, size=(0.0, 0.0, 0.01), priority=1)
         plane.alt.type, plane.alt.zaxis = mujoco.mjtOrientation.mjORIENTATION_ZAXIS, normal
-        plane.friction, plane.solref = (FRICTION, 0.0, 0.0), (time_constant, 1.0)
-        plane.solimp = (impedance, impedance, 1e-3, 0.5, 2.0)
+        plane.friction, plane.solref = (FRICTION, 0.0, 0.0), (reaction, 1.0)
+        plane.solimp = (limit, limit, 1e-3, 0.5, 2.0)
     masses = np.bincount(mesh.cells.ravel(), np.repeat(0.25 * DENSITY * cell_volumes(mesh), 4))
     names = [f"vertex{number}" for number in range(len(masses))]
     for name, vertex, mass in zip(names, mesh.vertices, masses, strict=True):
@@ -298,8 +265,11 @@ def flex(
     def run(q: Array, v: Array, steps: int) -> tuple[float, Array]:
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:] = (q - rest).ravel(), v.ravel()
-        step = partial(mujoco.mj_step, model, data)
-        return advance(step, lambda: [rest + data.qpos.reshape(-1, 3)], steps, CPU)
+        began, positions = now(), list[Array]()
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+            positions.append(rest + data.qpos.reshape(-1, 3))
+        return (now() - began) / steps, np.array(positions)
 
     return run
 

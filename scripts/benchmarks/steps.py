@@ -1,4 +1,4 @@
-"""A step of an experiment's body, forward and backward: by solver, material, refinement, batch and linear solver."""
+"""A step of an experiment's body, forward and backward: by solver, material and batch, or by linear solver and size."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -17,24 +17,23 @@ from warp_resphys.experiment.build import build_body, build_simulator, choose_de
 from warp_resphys.io.memory import peak_memory_gib
 from warp_resphys.io.settings import parse
 from warp_resphys.linalg.threads import threads_for
-from warp_resphys.settings.body import MaterialSettings
+from warp_resphys.settings.run import RunSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
 
-from .measuring import free_unknowns, median_ms, now, run_settings, solves, take_turns
+from .measuring import composed, free_unknowns, median_ms, now, solves, take_turns
 
 Rows = list[dict[str, Any]]
 MATERIALS: Final[Mapping[str, Mapping[str, Any]]] = {
     "0.45": {"poissons_ratio": 0.45, "youngs_modulus": 215e3},
     "0.499": {"poissons_ratio": 0.499, "youngs_modulus": 264e3},
-    "law": {"model": "law", "c10": 24e3, "ogden_3": 40e3, "bulk_1": 22e6},
     "configured": {},
 }
 BATCHES: Final[Mapping[str, Sequence[int]]] = {"cpu": (1, 4, 16), "cuda": (1, 16, 256, 1024, 4096)}
 FLOOR: Final = ("obstacles.floor={shape: half_space, position: [0.0, 0.0, -0.004]}", "contact.friction=0.3")
 STEPS: Final = "a step of the whole batch"
 _DEFAULTS: Final = ("solver.relative_tolerance=1e-6", "solver.max_iterations=20000")
-_MODULI: Final[tuple[str, ...]] = ("youngs_modulus", "c10")  # by the first of which gradients are taken
+_MODULUS: Final = "youngs_modulus"
 _TIP_MASS: Final = 0.1  # [kg]
 _PRESSURE: Final = 2e4  # [Pa]
 
@@ -53,7 +52,7 @@ class Rollout:
         """Times a step of the whole batch without gradients (plain), with them, and in the backward pass.
 
         The gradient is that of the sum of squares of the last state, with respect to the first state, a force on every
-        vertex at every step, and a modulus.
+        vertex at every step, and Young's modulus.
         """
         device, steps, batch = self.start.q.device, self.steps, len(self.start.q)
         began = now(device)
@@ -75,29 +74,26 @@ class Rollout:
         return {**{name: 1e3 * seconds / steps for name, seconds in times.items()}, **speed}
 
 
-def rollout_of(arguments: argparse.Namespace, solver: str, material: str, refinement: float, batch: int) -> Rollout:
+def rollout_of(
+    settings: RunSettings, solver: str, material: str, batch: int, steps: int, straight: bool = False
+) -> Rollout:
     """Returns a roll-out, after two steps and their gradient, which compile kernels.
 
     Args:
-        arguments: of the command line.
+        settings: of a run.
         solver: its name.
         material: a key of `MATERIALS`.
-        refinement: of the configured mesh.
         batch: number of environments.
+        steps: of the roll-out.
+        straight: whether the body starts from its shape at rest.
     """
-    overrides = (*arguments.settings, *(FLOOR if arguments.floor else ()), f"device={choose_device(arguments.device)}")
-    steps = steps_of(solver, refinement, arguments.steps)
-    settings = run_settings((*_DEFAULTS, *overrides))
-    mesh = settings.mesh if refinement == 1.0 else finer(settings.mesh, refinement)
-    settings = settings.changed(mesh=mesh, solver=settings.solver.changed(name=solver))
-    changes = MATERIALS[material]
-    law = parse(MaterialSettings, changes) if "model" in changes else settings.simulation.changed(**changes)
+    settings = settings.changed(solver=settings.solver.changed(name=solver))
+    law = settings.simulation.changed(**MATERIALS[material])
     simulator = build_simulator(settings, law, build_body(settings))
     start, inputs = simulator.rest_state(batch), Inputs()
-    if not arguments.straight:
+    if not straight:
         start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
-    name = next((name for name in _MODULI if name in law.constants), None)
-    moduli = {} if name is None else {name: simulator.tensor(law.constants[name]).reshape(1)}
+    moduli = {_MODULUS: simulator.tensor([law.constants[_MODULUS]])} if _MODULUS in law.constants else {}
     Rollout(simulator, start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}), moduli).measure()
     return Rollout(simulator, start, steps, inputs, moduli)
 
@@ -124,16 +120,22 @@ def loaded(simulator: Simulator, batch: int, steps: int, sign: float = 1.0) -> t
     return simulator.static_equilibrium(Inputs(force)).detach(), Inputs()
 
 
+def run_settings(arguments: argparse.Namespace, *overrides: str) -> RunSettings:
+    """Returns the settings of a run, as the command line composes them."""
+    overrides = (*_DEFAULTS, *arguments.settings, *overrides, f"device={choose_device(arguments.device)}")
+    return parse(RunSettings, composed("config", overrides))
+
+
 def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times steps and their parts, and the environments of a run."""
     device = choose_device(arguments.device)
-    batches = arguments.batches or BATCHES[device.type]
-    cases = [*product(arguments.solvers, arguments.materials, arguments.refinements, batches)]
-    rollouts = [rollout_of(arguments, *case) for case in cases]
+    settings = run_settings(arguments, *(FLOOR if arguments.floor else ()))
+    cases = [*product(arguments.solvers, arguments.materials, arguments.batches or BATCHES[device.type])]
+    rollouts = [rollout_of(settings, *case, arguments.steps) for case in cases]
     measured, yardstick = take_turns("steps", [rollout.measure for rollout in rollouts], arguments.repeats)
     steps, parts = Rows(), Rows()
-    for (*case, batch), rollout, times in zip(cases, rollouts, measured, strict=True):
-        head: dict[str, Any] = {**dict(zip(("solver", "material", "refinement"), case, strict=True)), "batch": batch}
+    for (solver, material, batch), rollout, times in zip(cases, rollouts, measured, strict=True):
+        head: dict[str, Any] = {"solver": solver, "material": material, "batch": batch}
         relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
         steps.append({**head, "unknowns": free_unknowns(rollout.simulator), **times, **relative})
         parts.append({**head, **part_times(rollout.simulator, batch, arguments.repeats)})
@@ -142,11 +144,6 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
         counts = arguments.batches or (1, 16, 64)
         tables["environments"] = environments(arguments.run, counts, arguments.repeats, str(device))
     return tables
-
-
-def steps_of(solver: str, refinement: float, most: int) -> int:
-    """Returns the length of a roll-out: fewer steps of large bodies, and of a solver with hundreds of iterations."""
-    return min(most, 5) if solver == "projective_dynamics" else max(round(most / refinement**2), min(most, 5))
 
 
 def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]:
@@ -193,11 +190,12 @@ def environments(run: Path, counts: Sequence[int], repeats: int, device: str) ->
 
 def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times a body that starts straight, by linear solver and size, one case after the other."""
-    arguments.straight, arguments.floor, arguments.steps, rows = True, False, 2, Rows()
-    settings = arguments.settings
+    rows = Rows()
     for material, linear, refinement in product(arguments.materials, arguments.linear_solvers, arguments.refinements):
-        arguments.settings = [*settings, f"solver.linear_solver={linear}"]
-        rollout = rollout_of(arguments, "quasi_newton", material, refinement, 1)
+        settings = run_settings(arguments, f"solver.linear_solver={linear}")
+        if refinement != 1.0:
+            settings = settings.changed(mesh=finer(settings.mesh, refinement))
+        rollout = rollout_of(settings, "quasi_newton", material, 1, 2, straight=True)
         head = {"material": material, "linear_solver": linear, "unknowns": free_unknowns(rollout.simulator)}
         ((times,), _) = take_turns(f"{linear} {refinement:g}", [rollout.measure], arguments.repeats)
         rows.append({**head, **times, "memory_gib": peak_memory_gib()})  # of this process, so far

@@ -24,6 +24,7 @@ ensure_kernel_cache()  # before Warp is first used
 
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     """Returns a Warp array on a tensor's memory, without gradient."""
+    wp.init()  # `from_torch` does not
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -175,61 +175,6 @@ def test_poissons_ratio_of_zero_has_a_derivative():
     assert row.relative_error <= 1e-6
 
 
-@pytest.mark.slow
-def test_gradient_through_a_hundred_and_twenty_steps():
-    s = simulator(integrator="bdf2", material=replace(DAMPED, youngs_modulus=3e4))
-    state, steps = pose(s, "bent", 1), 120
-    tip = torch.as_tensor(select_vertices(MESHES["hexahedron"], x=SIZE[0]))
-
-    def end(trajectory):
-        return trajectory.q[-1, 0, tip, 2].mean() + 0.01 * trajectory.v[60:, 0, tip, 0].mean()
-
-    def of_modulus(e):
-        return end(s.rollout(state, steps, parameters={"youngs_modulus": e}))
-
-    def of_velocity(v):
-        return end(s.rollout(State(state.q, v), steps))
-
-    e = torch.tensor([3e4], dtype=torch.float64)
-    assert derivative(of_modulus, e, 2e-3 * e).relative_error <= 1e-6
-    assert derivative(of_velocity, state.v, 1e-3 * noise(*state.v.shape)).relative_error <= 1e-6
-
-
-def moving_clamp(s, steps):
-    """(T, 2, D, 3) targets of two clamps: one turns about x by 0.1 rad a step, both are carried off and shaken."""
-    clamp = s.rest_positions[s.fixed]
-    time = torch.arange(1, steps + 1, dtype=torch.float64)
-    shift = 1e-3 * torch.stack([time, 0.5 * time**2, 2.0 * (-1.0) ** time], dim=1)[:, None]
-    turn = torch.zeros(steps, 3, 3, dtype=torch.float64)
-    turn[:, 2, 1], turn[:, 1, 2] = 0.1 * time, -0.1 * time
-    centre = clamp.mean(0)
-    turned = centre + (clamp - centre) @ torch.linalg.matrix_exp(turn).mT
-    return torch.stack([turned + shift, clamp - 0.5 * shift], dim=1)
-
-
-@pytest.mark.parametrize(("integrator", "kind"), [*zip(INTEGRATORS, MESHES, strict=False)])
-def test_a_clamp_that_moves(integrator, kind):
-    s = simulator(kind, integrator=integrator)
-    state, steps = pose(s, "bent", 2), 4
-    targets = moving_clamp(s, steps)
-    weights = noise(steps + 1, *state.q.shape, seed=1), s.time_step * noise(steps + 1, *state.q.shape, seed=2)
-
-    def loss(targets=targets, q=state.q, v=state.v, **constants):
-        moved = s.rollout(State(q, v), steps, Inputs(fixed_positions=targets), constants)
-        return (weights[0] * moved.q).sum() + (weights[1] * moved.v).sum()
-
-    one = torch.ones(1, dtype=torch.float64)
-    cases = {
-        "targets": (lambda x: loss(targets=x), targets, 1e-6 * noise(*targets.shape, seed=3)),
-        "positions": (lambda x: loss(q=x), state.q, 1e-6 * noise(*state.q.shape, seed=4)),
-        "velocities": (lambda x: loss(v=x), state.v, 1e-4 * noise(*state.v.shape, seed=5)),
-        "E": (lambda x: loss(youngs_modulus=x), 264e3 * one, 2e3 * one),
-        "damping": (lambda x: loss(stiffness_damping=x), 2e-3 * one, 1e-5 * one),
-    }
-    errors = {name: derivative(*case).relative_error for name, case in cases.items()}
-    assert {name: error for name, error in errors.items() if not error <= 1e-6} == {}
-
-
 @pytest.mark.parametrize("kind", ["hexahedron", "tetrahedron10"])
 def test_static_equilibrium(kind):
     s = simulator(kind)

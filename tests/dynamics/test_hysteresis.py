@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import trapezoid
 
 from warp_resphys import (
     Body,
@@ -59,13 +58,6 @@ def cycle(steps, peak):
     return np.concatenate([np.linspace(0.0, peak, steps // 2 + 1)[1:], down, up])
 
 
-def loss(gammas, material, steps, **options):
-    """Energy [J/m^3] that the last cycle takes, with its trapezoids."""
-    path = np.asarray(gammas)
-    stress = sheared(path, material, **options) - sheared(path, ELASTIC, **options)
-    return trapezoid(stress[-2 * steps - 1 :], path[-2 * steps - 1 :])
-
-
 def closed_form(gammas, ratio, limit):
     """(T,) shear stresses [Pa] of a slider, by its definition in one dimension, with dE = dgamma [[0, 1], [1, 0]] / 2.
 
@@ -84,19 +76,12 @@ class TestALoop:
     def material(self, **changes):
         return replace(ELASTIC, hysteresis=[(self.RATIO, self.LIMIT)], **changes)
 
-    def test_it_follows_the_elastic_perfectly_plastic_slider(self):
+    @pytest.mark.parametrize("step", [1e-3, 1e3])
+    def test_it_follows_the_elastic_perfectly_plastic_slider_at_any_speed(self, step):
         path = cycle(self.STEPS, self.PEAK)
-        stress = sheared(path, self.material()) - sheared(path, ELASTIC)
+        stress = sheared(path, self.material(), step) - sheared(path, ELASTIC, step)
         expected = closed_form(path, self.RATIO, self.LIMIT)
         np.testing.assert_allclose(stress, expected, atol=2e-3 * expected.max())
-
-    @pytest.mark.parametrize("step", [1e-3, 1e3])
-    def test_it_takes_the_energy_of_the_closed_form_at_any_speed(self, step):
-        """4 yield stresses times what the amplitude exceeds the yield shear by."""
-        yield_shear = math.sqrt(2.0) * self.LIMIT
-        expected = 4.0 * self.RATIO * MU * yield_shear * (self.PEAK - yield_shear)
-        taken = loss(cycle(self.STEPS, self.PEAK), self.material(), self.STEPS, step=step)
-        assert taken == pytest.approx(expected, rel=0.02)  # a trapezoid at each of the corners is as large
 
 
 def pull(newtons, batch=1):

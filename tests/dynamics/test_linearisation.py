@@ -17,7 +17,7 @@ from warp_resphys.stepping.integrators import INTEGRATORS
 
 BOX = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
 MESH = Mesh(BOX.vertices, BOX.cells, {"beam": np.array([0, 1]), "cap": np.array([2])})
-TENDON = Tendons([[[0.0, 0.01, 0.02], [0.03, 0.01, 0.02]]], 400.0)
+TENDON = Tendons([[[x, 0.01, 0.02] for x in (0.0, 0.01, 0.03, 0.04)]], 400.0, directions=[[[0.0, 0.0, 1.0]]])
 
 
 def simulator(rigid):
@@ -32,7 +32,8 @@ def linearised(rigid):
     state = s.rest_state(2)
     bend = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     state = s.state(state.q + 20.0 * state.q[..., :1] ** 2 * bend, 0.1 * state.q)
-    step: Linearisation = s.linearise(state, Inputs(tendon_tension=torch.tensor([[1.0], [2.0]]).double()))
+    inputs = Inputs(tendon_tension=torch.tensor([[1.0], [2.0]]).double(), tendon_contraction=1e-3)
+    step: Linearisation = s.linearise(state, inputs, {"tendon_offset_1": 2e-3})
     x, zero = (step.hold(q) for q in (state.q, torch.zeros_like(state.q)))
     noise = torch.rand(state.q.shape, generator=generator, dtype=torch.float64)
     direction = step.hold(noise) - zero
@@ -86,8 +87,8 @@ def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     volume = 0.02**3
     np.testing.assert_allclose(mass.inertia.sum(1), [volume * (1000.0 + 2 * density) for density in (500.0, 700.0)])
     assert "tendon_friction" in values
-    energies.check_memory({"tendon_segment_tension": rest.new_zeros(2, 1)}, 2, rest)
-    for wrong in ({"tension": rest.new_zeros(2, 1)}, {"tendon_segment_tension": rest.new_zeros(2, 3)}):
+    energies.check_memory({"tendon_segment_tension": rest.new_zeros(2, 3)}, 2, rest)
+    for wrong in ({"tension": rest.new_zeros(2, 1)}, {"tendon_segment_tension": rest.new_zeros(2, 1)}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             energies.check_memory(wrong, 2, rest)
     twice = 2 * place_energies(body, materials)

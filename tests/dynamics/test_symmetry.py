@@ -14,7 +14,6 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     StableNeoHookean,
-    Tendons,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
@@ -35,19 +34,17 @@ def turned(points, angle):
     return np.asarray(points) @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]).T
 
 
-def beam(half, angle=0.0, rigid=False, tendon=False, stiffness=1e9):
+def beam(half, angle=0.0, rigid=False, stiffness=1e9):
     """A beam of four cells across, or its half y < 15 mm behind a symmetry plane, turned about its axis."""
     size, cells = ((SIZE[0], 0.015, SIZE[2]), (6, 2, 2)) if half else (SIZE, (6, 4, 2))
     mesh = box_hexahedra(size, cells)
     regions = {"cap": np.flatnonzero(mesh.vertices[mesh.cells].mean(1)[:, 0] > 0.08)} if rigid else {}
     mesh = Mesh(turned(mesh.vertices, angle), mesh.cells, regions)
     planes = [SymmetryPlane(turned([0.0, 1.0, 0.0], angle), 0.015)] if half else []
-    line = turned(np.linspace([0.0, 0.015, 0.025], [0.1, 0.015, 0.025], 7), angle)
     return Body(
         mesh,
         fixed=select_vertices(mesh, x=0.0),
         rigid={"cap": Rigid(1200.0, stiffness)} if rigid else {},
-        energies=(Tendons([line], stiffness=2e3),) if tendon else (),
         symmetry=planes,
     )
 

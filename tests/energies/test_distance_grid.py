@@ -60,18 +60,6 @@ def test_interpolated_distances_converge_with_the_fourth_power_of_the_spacing():
     assert errors[0][1] > 6.0 * errors[1][1]
 
 
-def test_normals_are_slopes_of_distances_and_have_a_derivative():
-    grid, x = exact(), around(1)
-    d, n = measured(grid, x.requires_grad_())
-    (slope,) = torch.autograd.grad(d.sum(), x, retain_graph=True)
-    torch.testing.assert_close(slope, n)
-    weights, way = (torch.as_tensor(np.random.default_rng(k).normal(size=x.shape)) for k in (2, 3))
-    (slope,) = torch.autograd.grad((n * weights).sum(), x)
-    step = 1e-6
-    up, down = (float((measured(grid, x.detach() + s * step * way)[1] * weights).sum()) for s in (1, -1))
-    assert float((slope * way).sum()) == pytest.approx((up - down) / (2.0 * step), rel=1e-4)
-
-
 def test_outside_of_the_grid_its_distance_is_added_to_the_least_one_at_its_boundary():
     """The interpolation ends one node within the grid, 13 spacings from the sphere in the direction of an axis."""
     spacing, x = 2e-3, np.array([[[0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.09, -0.07, 0.001]]])

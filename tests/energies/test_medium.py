@@ -121,24 +121,6 @@ def test_gradients(integrator, start, device):
     assert {name: row.relative_error for name, row in wrong.items() if not row.relative_error < 1e-5} == {}
 
 
-def test_the_tangent_is_the_derivative_of_the_force():
-    mesh = MESHES["tetrahedra10"]
-    medium = Medium(900.0, linear=30.0, normal=1.2, tangential=0.5, layer=4e-3)
-    sim = simulator(medium, mesh, 9.8, select_vertices(mesh, x=0.0))
-    draw = torch.Generator().manual_seed(0)
-    rest = sim.rest_state()
-    state = State(rest.q, 0.5 * torch.randn(rest.q.shape, generator=draw, dtype=torch.float64))
-    lines = sim.linearise(state)
-    x = rest.q + 1e-3 * torch.randn(rest.q.shape, generator=draw, dtype=torch.float64)
-    direction = torch.randn(rest.q.shape, generator=draw, dtype=torch.float64)
-    direction[:, sim.fixed] = x[:, sim.fixed] = 0.0
-    x[:, sim.fixed] = rest.q[:, sim.fixed]
-    step = 1e-8
-    expected = (lines.residual(x + step * direction) - lines.residual(x - step * direction)) / (2.0 * step)
-    lines.factorise(x)
-    torch.testing.assert_close(lines.product(direction), expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
-
-
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [

@@ -11,6 +11,7 @@ from support.configured import settings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
+from warp_resphys.mesh.arm_section import SOLID, section_grids, section_quadrilaterals
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
@@ -73,8 +74,8 @@ def polygons(section, size):
 
 
 def area(polygon):
-    """Area of (N,) complex corners, counter-clockwise."""
-    return 0.5 * (polygon.conj() * np.roll(polygon, -1)).imag.sum()
+    """Area of polygons (..., N) of complex corners, counter-clockwise."""
+    return 0.5 * (polygon.conj() * np.roll(polygon, -1, axis=-1)).imag.sum(-1)
 
 
 def configured(*overrides):
@@ -102,6 +103,22 @@ def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(profile, out
     for size, most in ((1.0, 0.16), (0.002, 0.012), (0.0005, 8e-4)):
         np.testing.assert_allclose([area(polygon) for polygon in polygons(section, size)], fine, rtol=1e-12)
         assert all(0.0 < growth < most for growth in section.growth(section.divisions(size)))
+
+
+@pytest.mark.parametrize(("profile", "outline", "count"), SHAPES)
+def test_quadrilaterals_fill_the_solid_and_each_chamber_once(profile, outline, count):
+    section = ArmGeometry(chambers=count, profile=profile, outline=outline, wall=0.003, web=0.0025).section(0.025)
+    divisions = section.divisions(0.003)
+    grids, chambers = section_grids(section, divisions)
+    places, quads = section_quadrilaterals(grids)
+    points = np.concatenate([grid.ravel() for grid in grids])[places]
+    areas = [area(points[corners]) for corners in quads]
+    assert min(own.min() for own in areas) > 0.0
+    for chamber in range(section.count):
+        own = sum(part.sum() for part, number in zip(areas, chambers, strict=True) if number == chamber)
+        assert own == pytest.approx(area(section.chamber_polygon(divisions)), rel=1e-9)
+    assert set(chambers) == {SOLID, *range(section.count)}
+    assert sum(part.sum() for part in areas) == pytest.approx(area(section.body_polygon(divisions)), rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -129,9 +129,8 @@ class TestArms:
             "data": data(folder="recordings", input_limit=None),
         }
         settings = arm_settings("segment_real", 2, **own)
-        write_arm_run(
-            tmp_path, settings, train=0, test=1, chambers=1, models=("simulation", "resphys"), simulated=False
-        )
+        alone = {"models": ("simulation", "resphys"), "diverged": ("resphys",), "simulated": False}
+        write_arm_run(tmp_path, settings, train=0, test=1, chambers=1, **alone)
         page = report(tmp_path, settings)
         for said in (
             "ResPhys diverged in 1 of 1 trials.",

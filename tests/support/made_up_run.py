@@ -32,15 +32,10 @@ def _write_rollouts(folder, names, step, film_steps, drawn, observed, films):
 def _write_trainings(folder, models):
     """Histories of the trainings of those models that are learned."""
     epochs = [
-        {
-            "epoch": epoch,
-            "train_loss": 1.0 / epoch,
-            "validation_loss": 1.5 / epoch,
-            "rollout_error_mm": 1.0 / epoch if epoch % 5 == 0 else None,
-            "learning_rate": 1e-3,
-        }
-        for epoch in range(1, 31)
+        {"epoch": k, "train_loss": 1.0 / k, "validation_loss": 1.5 / k, "learning_rate": 1e-3} for k in range(1, 31)
     ]
+    for record in epochs[4::5]:
+        record["rollout_error_mm"] = 1.0 / record["epoch"]
     kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.2}
     for model in {"simfree", "resphys_uncorrected", "resphys"} & set(models):
         write_json(folder / f"training_{model}.json", {"kept": kept, "epochs": epochs})
@@ -53,43 +48,38 @@ def _write_stages(folder, **seconds):
 
 def _write_recordings(folder, trials, tracked, reference, rng, release=61.3):
     """quality.json and registration.json, from the places of the registered markers by label [m]."""
-    labels, places = [*tracked, *reference], np.array([*tracked.values(), *reference.values()])
-    second, first_standing, last = labels[1 % len(tracked)], next(iter(reference)), labels[-1]
+    places = {**tracked, **reference}
+    standing, *_, last = reference
+    seen = {"seen": 0.99, "gaps": 1, "longest_gap_frames": 7, "masked_frames": 7, "jumps": [{"frame": 80, "mm": 0.31}]}
+    rows = [{"label": label, "still": label in reference, **seen} for label in places]
+    about = {"rate_hz": 100.0, "frames": 300, "release_frame": release, "longest_gap_filled": 5}
+    about |= {"markers": [{**row, "noise_mm": 0.0071, "drift_mm": 0.02 if row["still"] else None} for row in rows]}
     quality, registration = {}, {}
     for number, trial in enumerate(trials):
-        rows = [
-            {
-                "label": label,
-                "still": label in reference,
-                "seen": 0.99 if number == 0 and label == second else 1.0,
-                "gaps": int(number == 0 and label == second),
-                "longest_gap_frames": 7,
-                "masked_frames": 7,
-                "jumps": [{"frame": 80, "mm": 0.31}] if label == first_standing else [],
-                "noise_mm": 0.0071,
-                "drift_mm": 0.02 if label in reference else None,
-            }
-            for label in labels
-        ]
-        quality[trial] = {
-            "source": f"recordings/{trial}.c3d",
-            "rate_hz": 100.0,
-            "frames": 300,
-            "release_frame": release,
-            "longest_gap_filled": 5,
-            "markers": rows,
-            "warnings": [f"{first_standing} jumps once, by 0.31 mm, in frame 80."] if number < 2 else [],
-        }
-        residual = dict(zip(labels, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(labels)), strict=True))
+        warnings = [f"{standing} jumps once, by 0.31 mm, in frame 80."] if number < 2 else []
+        quality[trial] = {"source": f"recordings/{trial}.c3d", "warnings": warnings, **about}
         registration[trial] = {
             "rms_mm": 0.82 + 0.1 * number,
-            "residual_mm": residual,
+            "residual_mm": dict(zip(places, (0.8 + 0.1 * number) * rng.uniform(0.5, 1.5, len(places)), strict=True)),
             "outliers": [last] if number == 2 else [],
             "shift_mm": {label: [0.2, 0.2, 0.2] for label in tracked},
-            "positions": dict(zip(labels, places.tolist(), strict=True)),
+            "positions": places,
         }
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
+
+
+def _errors(simulated, measured, names, labels=()):
+    """Content of errors.json, of positions (R, T, M, 3) of models and as measured [m]."""
+    errors = {m: [marker_errors(*pair) for pair in zip(x, measured, strict=True)] for m, x in simulated.items()}
+    content = {
+        "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
+        "per_trajectory": summarise_trajectories(names, errors),
+    }
+    if labels:
+        away = {m: np.nanmean(1e3 * np.linalg.norm(x - measured, axis=3), axis=(0, 1)) for m, x in simulated.items()}
+        content["per_marker"] = {model: dict(zip(labels, each, strict=True)) for model, each in away.items()}
+    return content
 
 
 TRIALS = {"bare": 0.0, "load52": 0.0520154, "load101": 0.1020303}
@@ -179,19 +169,8 @@ def write_split(folder: Path, test, models=BEAM_MODELS, diverged=()):
     for model in diverged:
         films[model][20:] = observed[model][0, 20:] = np.nan
     _write_rollouts(folder, list(test), STEP, np.arange(len(steps)), test[-1], observed, films)
-    truth = np.stack([sag(BOUND, frames[trial], TRIALS[trial]) for trial in test])
-    errors = {m: 1e3 * np.linalg.norm(x - truth, axis=-1)[:, : round(SECONDS / STEP)] for m, x in observed.items()}
-    means = {model: [float(each.mean()) for each in rows] for model, rows in errors.items()}
-    content = {
-        "errors_mm": {model: summarise(rows.mean(axis=2)) for model, rows in errors.items()},
-        "per_trajectory": [
-            {"name": trial, "errors_mm": {model: means[model][row] for model in models}}
-            for row, trial in enumerate(test)
-        ],
-        "per_marker": {
-            model: dict(zip(TRACKED, rows.mean(axis=(0, 1)).tolist(), strict=True)) for model, rows in errors.items()
-        },
-    }
+    truth, count = np.stack([sag(BOUND, frames[trial], TRIALS[trial]) for trial in test]), round(SECONDS / STEP)
+    content = _errors({model: x[:, :count] for model, x in observed.items()}, truth[:, :count], test, TRACKED)
     if "resphys" in models:
         own = {"factor": [3.0] * 3, "variance": [1e-6, 0.0, 0.0, 0.0, 1.0], "coverage": 0.87, "half_width_mm": 3.0}
         content["intervals"] = {"level": 0.9, "calibrated_on": "validation", "models": {"resphys": own}}
@@ -372,36 +351,26 @@ def write_arm_run(
 
 
 def _arm_errors(simulated, measured, names, test, labels, scales, horizons):
-    distances = {model: mean_distance(markers, measured)[:, 1:] for model, markers in simulated.items()}
-    for rows in distances.values():
-        rows[np.isinf(rows)] = np.nan
-    nominal = {model: rows[:test] for model, rows in distances.items()}
-
-    def part(rows, first=0, last=None):
-        return {model: summarise(values[first:last]) for model, values in rows.items()}
+    def part(first=0, last=None, frames=None):
+        rows, steps = slice(first, last), slice(1, None if frames is None else frames + 1)
+        own = {model: x[rows, steps] for model, x in simulated.items()}
+        return _errors(own, measured[rows, steps], names[rows], labels)
 
     late = {"left": 2, "first_s": {"test_01": 1.2, "test_00": 0.84}}
-    content = {
-        "errors_mm": part(nominal),
-        "per_trajectory": summarise_trajectories(names[:test], nominal),
-        "per_marker": {
-            model: dict(zip(labels, np.nanmean(1e3 * np.linalg.norm(m - measured, axis=3), axis=(0, 1)), strict=True))
-            for model, m in simulated.items()
+    means = {m: mean_distance(x[:test], measured[:test])[:, 1:].mean(0) for m, x in simulated.items()}
+    content = part(0, test) | {
+        "median_filtered": {
+            m: median_filter(np.where(np.isinf(x), np.nan, x), ARM_STEP).max() for m, x in means.items()
         },
-        "median_filtered": {m: median_filter(rows.mean(axis=0), ARM_STEP).max() for m, rows in nominal.items()},
         "range": {"simfree": late, "resphys": {"left": 0, "first_s": {}}},
     }
     if horizons:
-        content["horizons"] = {
-            f"{w:g}": part({m: rows[:, : round(w / ARM_STEP)] for m, rows in nominal.items()}) for w in horizons
-        }
-        first, *_, last = content["horizons"].values()
-        content["growth"] = {
-            m: None if last[m]["mean"] is None else last[m]["mean"] / first[m]["mean"] - 1.0 for m in first
-        }
+        content["horizons"] = {f"{w:g}": part(0, test, round(w / ARM_STEP))["errors_mm"] for w in horizons}
+        first, *_, last = ({m: own["mean"] for m, own in each.items()} for each in content["horizons"].values())
+        content["growth"] = {m: None if last[m] is None else last[m] / first[m] - 1.0 for m in first}
     if scales:
         content["scales"] = {"1": content["errors_mm"]} | {
-            f"{scale:g}": part(distances, test * (k + 1), test * (k + 2)) for k, scale in enumerate(scales)
+            f"{scale:g}": part(test * k, test * (k + 1))["errors_mm"] for k, scale in enumerate(scales, 1)
         }
         late = {"1": {}, f"{scales[0]:g}": {}, f"{scales[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
         content["scales_range"] = {
@@ -448,12 +417,9 @@ def write_vertex_run(folder, settings, *, models=tuple(PERIODS)[:-1], diverged=(
         runs[model][1, 9:] = np.nan
     _write_rollouts(folder, test, STEP, np.arange(steps + 1), test[1], runs, {m: q[1] for m, q in runs.items()})
     first = min(1, steps)
-    pairs = {model: zip(q, target[1:], strict=True) for model, q in runs.items()}
-    errors = {model: [marker_errors(a[first:], b[first:]) for a, b in rows] for model, rows in pairs.items()}
-    summaries = {model: summarise(rows) for model, rows in errors.items()}
-    against = {m: rows for m, rows in summaries.items() if m != "reconstruction"}
-    content = {"errors_mm": summaries, "errors_vs_reconstruction_mm": against}
-    write_json(folder / "errors.json", content | {"per_trajectory": summarise_trajectories(test, errors)})
+    content = _errors({model: q[:, first:] for model, q in runs.items()}, target[1:, first:], test)
+    against = {m: rows for m, rows in content["errors_mm"].items() if m != "reconstruction"}
+    write_json(folder / "errors.json", content | {"errors_vs_reconstruction_mm": against})
     _write_trainings(folder, models)
     seconds = {name: {"mean": 0.421, "std": 0.1} for name in ("simulation", "target", "resphys", "inference")}
     write_json(folder / "times.json", {"steps": steps, "seconds": seconds})

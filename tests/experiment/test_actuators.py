@@ -1,14 +1,11 @@
 """Actuators from the configuration: routes and muscles on the body, and the input that drives them."""
 
 import numpy as np
-import pytest
 
-from support.chambered import hollow_box
-from warp_resphys.experiment.actuators import build_chambers, build_muscles, build_tendons
-from warp_resphys.io.errors import InputError
+from warp_resphys.experiment.actuators import build_muscles, build_tendons
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.settings.body import ChamberSettings, MuscleSettings, TendonSettings
+from warp_resphys.settings.body import MuscleSettings, TendonSettings
 
 
 def test_tendons_run_straight_between_their_guides():
@@ -30,11 +27,3 @@ def test_muscles_are_in_the_cells_whose_centres_are_in_their_boxes():
     root, everywhere = build_muscles(settings, box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))).muscles
     assert (list(root.cells), root.name) == ([0, 1], "root")
     assert list(everywhere.cells) == [0, 1, 2, 3]
-
-
-def test_chambers_are_counted():
-    mesh = hollow_box("hexahedron")
-    assert build_chambers(None, mesh) == ()
-    assert len(build_chambers(ChamberSettings(count=2, axis=(1.0, 0.0, 0.0)), mesh)) == 2
-    with pytest.raises(InputError, match=r"chambers\.count is 3"):
-        build_chambers(ChamberSettings(count=3, axis=(1.0, 0.0, 0.0)), mesh)

@@ -2,7 +2,10 @@
 
 import importlib.util
 import re
+import shutil
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +15,6 @@ from torch import nn
 import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import run_without_report
-from support.template import TEMPLATE, install
 from warp_resphys.energies.base import Energy
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.experiment.build import build_body, build_simulator
@@ -26,11 +28,25 @@ from warp_resphys.robot.description import describe
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.studies.gradient_check import check_gradients
 
+TEMPLATE = Path(__file__).parents[2] / "docs" / "examples" / "my_robot_physics"
 OPTIONS = [
     *("experiment=magnetic_beam", "budget=quick", f"hydra.searchpath=[{(TEMPLATE / 'configs').as_uri()}]"),
     *("mesh.divisions=[6,1,1]", "laboratory.mesh.divisions=[6,1,1]", "parallel.processes=1"),
     *("simfree.trainer.epochs=6", "simfree.trainer.rollout_every=6"),
 ]
+
+
+def install(site, version=None):
+    """Installs the package in a folder as installers do, without network."""
+    project = tomllib.loads((TEMPLATE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    version = version or project["version"]
+    site.mkdir(exist_ok=True)
+    shutil.copytree(TEMPLATE / "my_robot_physics", site / "my_robot_physics")
+    about = site / f"my_robot_physics-{version}.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {version}\n")
+    (about / "top_level.txt").write_text("my_robot_physics\n")
+    return site
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,28 @@ class TestAtomicFiles:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         assert files.read_json(path) == 1
 
+    @pytest.mark.parametrize("name", ["a.safetensors", "a.h5", "a.json"])
+    def test_a_file_that_the_system_cuts_short_is_named_and_not_left(self, tmp_path, name):
+        resource = pytest.importorskip("resource")
+        path, limits = tmp_path / name, resource.getrlimit(resource.RLIMIT_FSIZE)
+
+        def write():
+            with files.atomic_hdf5(path, "k") as file:
+                files.create(file, "x", np.ones(8000), "m")
+
+        work = {
+            "a.safetensors": lambda: files.write_checkpoint(path, "k", {"x": torch.ones(8000).double()}, {}),
+            "a.h5": write,
+            "a.json": lambda: files.write_json(path, [0] * 40_000),
+        }
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))  # Python ignores the signal.
+        try:
+            with pytest.raises(DataFileError, match=f"disk is full while writing {path}"):
+                work[name]()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert os.listdir(tmp_path) == []
+
 
 class TestJson:
     def test_numpy_values_paths_and_infinite_numbers(self, tmp_path):
@@ -119,6 +141,17 @@ class TestHdf5:
             except DataFileError:
                 refused += 1
         assert refused > 0.8 * len(range(0, POSITIONS.nbytes, 211))
+
+    def test_a_finished_file_is_one_of_the_same_settings_that_is_whole(self, tmp_path):
+        path = tmp_path / "forces.h5"
+        assert not files.is_final(path, "forces", "f")
+        with files.atomic_hdf5(path, "forces", {"fingerprint": "f"}) as file:
+            files.create(file, "force", np.ones((4, 10, 3)), "N")
+        assert files.is_final(path, "forces", "f")
+        assert not files.is_final(path, "forces", "g")
+        path.write_bytes(path.read_bytes()[:-9])
+        with pytest.raises(DataFileError, match=r"forces\.h5 is truncated"):
+            files.is_final(path, "forces", "f")
 
     @pytest.mark.parametrize(
         ("attributes", "message"),
@@ -230,3 +263,14 @@ class TestCheckpoints:
         save_file({"x": torch.zeros(2)}, path)
         with pytest.raises(DataFileError, match="was not written by warp_resphys"):
             files.read_checkpoint(path, "network")
+
+    def test_those_of_other_settings_or_cut_short_are_not_used(self, tmp_path, caplog):
+        path = tmp_path / "a.safetensors"
+        files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
+        assert torch.equal(files.resume_checkpoint(path, "network", "f")[0]["weight"], self.tensors["weight"])
+        assert files.resume_checkpoint(path, "network", "g") is None
+        assert files.resume_checkpoint(tmp_path / "none", "network", "f") is None
+        assert "belongs to other settings" in caplog.text
+        path.write_bytes(path.read_bytes()[:-9])
+        assert files.resume_checkpoint(path, "network", "f") is None
+        assert f"{path} is not a complete safetensors file" in caplog.text

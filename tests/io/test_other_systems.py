@@ -1,4 +1,4 @@
-"""Windows and macOS, imitated: modules and functions that Linux has alone are missing."""
+"""What is known of the machine; Windows and macOS, imitated: modules and functions of Linux alone are missing."""
 
 import os
 import signal
@@ -9,23 +9,15 @@ from pathlib import Path
 import pytest
 
 from warp_resphys.io import atomic, fan_out, memory
-from warp_resphys.io.machine import available_cores, hardware
+from warp_resphys.io.machine import available_cores, commit, hardware
 
+REPOSITORY = Path(__file__).parents[2]
 UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
 
 
 @pytest.mark.slow
 def test_the_package_imports_without_the_modules_of_unix():
-    names = [
-        "atomic",
-        "decoding",
-        "fan_out",
-        "files",
-        "kernel_cache",
-        "machine",
-        "memory",
-        "stages",
-    ]
+    names = ["atomic", "decoding", "fan_out", "files", "kernel_cache", "machine", "memory", "stages"]
     program = f"""
 import sys
 import filelock
@@ -78,3 +70,18 @@ def test_workers_start_where_signals_cannot_be_blocked(monkeypatch):
     monkeypatch.delattr(signal, "pthread_sigmask", raising=False)
     with fan_out.interrupts_blocked():
         pass
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen on this system")
+def test_cores_are_those_that_the_process_may_use():
+    core = min(os.sched_getaffinity(0))
+    program = "from warp_resphys.io import machine; print(machine.available_cores(), machine.hardware()['cores used'])"
+    command = [sys.executable, "-c", f"import os; os.sched_setaffinity(0, [{core}]); {program}"]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert out == f"1 1 of {os.cpu_count()}\n"
+
+
+def test_the_commit_is_that_of_the_repository():
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert commit() is None if head.returncode else head.stdout.startswith(str(commit()).partition(" ")[0])

@@ -3,20 +3,15 @@
 import copy
 import functools
 
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
-
+from support.command_line import configuration
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.io.settings import parse
-from warp_resphys.launch import freed
 from warp_resphys.settings.run import RunSettings
 
 
 @functools.cache
 def _composed(*overrides):
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        plain = OmegaConf.to_container(compose("config", freed(overrides)), resolve=True)
-    return parse(RunSettings, plain).plain()
+    return parse(RunSettings, configuration("config", *overrides)).plain()
 
 
 def composed(*overrides):

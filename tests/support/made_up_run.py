@@ -98,12 +98,6 @@ _SWINGS = {  # Period, damping and level of a model of the beam, over those of t
 }
 BEAM_MODELS = tuple(_SWINGS)
 _FOUND = {"youngs_modulus": 251.3e3, "poissons_ratio": 0.499, "mass_damping": 0.94, "stiffness_damping": 2.9e-3}
-_STARTS = {
-    "youngs_modulus": (264e3, 180e3, 400e3),
-    "poissons_ratio": (0.499, 0.45, 0.48),
-    "mass_damping": (0.0, 0.5, 2.0),
-    "stiffness_damping": (0.0, 1e-3, 5e-3),
-}
 
 
 def beam_settings(**data):
@@ -175,30 +169,30 @@ def write_split(folder: Path, test, models=BEAM_MODELS, diverged=()):
         own = {"factor": [3.0] * 3, "variance": [1e-6, 0.0, 0.0, 0.0, 1.0], "coverage": 0.87, "half_width_mm": 3.0}
         content["intervals"] = {"level": 0.9, "calibrated_on": "validation", "models": {"resphys": own}}
     write_json(folder / "errors.json", content)
-    searched = {"sysid": tuple(_FOUND), "sysid_elastic": tuple(_FOUND)[:2]}
-    write_json(folder / "identification.json", {m: _search(names) for m, names in searched.items() if m in models})
+    elastic = {name: _FOUND[name] for name in ("youngs_modulus", "poissons_ratio")}
+    searches = {"sysid": _search(_FOUND), "sysid_elastic": _search(elastic)}
+    write_json(folder / "identification.json", {m: own for m, own in searches.items() if m in models})
     _write_trainings(folder, models)
     _write_stages(folder, identify=95.0)
 
 
-def _search(names):
-    """Content of identification.json for a model whose parameters these are: three searches."""
+def _search(found):
+    """Content of identification.json for a model of these parameters: three searches."""
 
     def record(start, k):
-        values = {name: _FOUND[name] + (_STARTS[name][start] - _FOUND[name]) * 0.6**k for name in names}
-        return {"loss": 0.002 + 0.1 * (start + 1) * 0.5**k, **values}
+        return {"loss": 0.002 + 0.1 * start * 0.5**k} | {n: x * (1.0 + 0.1 * start * 0.6**k) for n, x in found.items()}
 
-    correlation = np.eye(len(names))
+    correlation = np.eye(len(found))
     correlation[0, 1] = correlation[1, 0] = -0.96
     return {
-        "parameters": {name: _FOUND[name] for name in names},
+        "parameters": found,
         "loss": 0.002,
-        "history": [[record(start, k) for k in range(12)] for start in range(3)],
+        "history": [[record(start, k) for k in range(12)] for start in (1, 2, 3)],
         "at_bounds": ["poissons_ratio"],
         "uncertainty": {
-            "deviation": {name: 0.01 * _FOUND[name] for name in names},
+            "deviation": {name: 0.01 * value for name, value in found.items()},
             "correlation": correlation.tolist(),
-            "poorest": dict(zip(names, [0.8, 0.6, 0.01, 0.0], strict=False)),
+            "poorest": dict(zip(found, [0.8, 0.6, 0.01, 0.0], strict=False)),
             "poorest_deviation": 0.12,
         },
     }
@@ -341,9 +335,7 @@ def write_arm_run(
         material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
         write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
     if "sysid" in models:
-        found = {"youngs_modulus": 237e3, "poissons_ratio": 0.42}
-        history = [[{"loss": 0.3 * 0.6**k + 0.02, **found} for k in range(9)]]
-        own = {"parameters": found, "loss": 0.02, "history": history, "at_bounds": [], "uncertainty": None}
+        own = _search({"youngs_modulus": 237e3, "poissons_ratio": 0.42}) | {"at_bounds": [], "uncertainty": None}
         write_json(folder / "identification.json", {"sysid": own})
     _write_trainings(folder, models)
     write_json(folder / "reconstruction.json", {"resphys": {"mean_mm": 0.12, "max_mm": 0.61}})

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import warp_resphys
-from support.main_job import IN_RUN, run, run_without_report
+from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
 from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import sampling
 from warp_resphys.control.estimate import Estimator
@@ -30,18 +30,12 @@ from warp_resphys.twin.twin import Twin
 
 CONTROL = [
     "experiment=tendon_rod_control",
-    *("mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory.mesh.nodes=20"),
+    *(*ROD, *DRIVEN, "data.steps=40"),
     *("+simulation.prony_ratio_1=0.0", "+simulation.prony_time_1=0.05"),
-    *("data.steps=40", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1"),
-    *("data.horizons=[]", "data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}"),
-    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
-    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3"),
     "+identify.parameters.tendon_tension_factor={lower:0.5,upper:1.5}",
     "+identify.parameters.tendon_tension_delay={lower:0.0,upper:0.05}",
     "+identify.parameters.tendon_tension_rise={lower:0.001,upper:0.1,logarithmic:true}",
     "+identify.first_guess={tendon_tension_factor:0.9,tendon_tension_delay:0.012,tendon_tension_rise:0.02}",
-    *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer={epochs:4,rollout_every:2}"),
-    *("actuation.filter_time_constants=[0.1]", "trainer.batch_size=16", "timing=false"),
     *("control.models=[sysid,resphys]", "control.shapes=[circle]", "control.seconds=[0.4]", "control.size=0.01"),
     *("control.plan={corrections:2,reach:0.05}", "control.horizon=0.1"),
     *("control.feedback={gains:[5.0],settles:0.1}",),

@@ -134,6 +134,8 @@ def test_rays_are_the_inverse_of_pixels():
         rays = lens.rays(pixels)
         assert rays[:, 2].tolist() == [1.0, 1.0, 1.0]
         torch.testing.assert_close(lens.pixels(rays), pixels, rtol=0.0, atol=1e-8)
+    beyond = Lens(intrinsic, torch.tensor([-0.4, 0.0, 0.0, 0.0], dtype=torch.float64)).rays(pixels + 3000.0)
+    assert beyond[:, :2].isnan().all()  # where the lens cannot be undistorted
 
 
 @pytest.mark.parametrize(

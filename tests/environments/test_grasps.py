@@ -5,22 +5,14 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from support.main_job import run_without_report
+from support.main_job import DRIVEN, run_without_report
 from warp_resphys.environments.making import make_vector, register
 from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.io.errors import InputError
 
 BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
-RUN = [
-    "experiment=finger",
-    *("mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"),
-    *("data.steps=30", "data.sequences=5", "data.train=3", "data.validation=1", "data.test=1", "data.horizons=[]"),
-    *("data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}", "timing=false"),
-    *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
-    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "trainer={epochs:4,rollout_every:2}"),
-    *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
-    "actuation.filter_time_constants=[0.1]",
-]
+MESHES = ["mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"]
+RUN = ["experiment=finger", *MESHES, *DRIVEN, "data.steps=30"]
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Residual forces of a tiny beam from all of its vertices or from markers: replayed, by both methods, by brute force."""
+"""Residual forces of a tiny beam, of all its vertices or of markers: replayed, by both methods, by brute force."""
 
 import numpy as np
 import pytest

@@ -107,24 +107,3 @@ def test_a_hidden_state_of_another_size_is_refused(model):
     for wrong in (torch.zeros(3, 7), torch.zeros(2, 8)):
         with pytest.raises(InputError, match=r"the hidden state is \(.*\): it must be \(3, 8\), or None to begin"):
             model[0].standardised(inputs, wrong)
-
-
-def test_an_interrupted_training_goes_on_with_the_same_losses():
-    train, held_out = series(1), series(2)
-
-    def trainer():
-        torch.manual_seed(0)
-        model = build_model(ResidualForce, NetworkSettings(**NETWORK), REST, train.q, train.v, train.outputs[0])
-        return SequenceTrainer(
-            model, train, held_out, lambda _: 0.0, TrainerSettings(**{**TRAINER, "epochs": 6, "noise": 1e-3}), 0
-        )
-
-    whole = trainer()
-    losses = [whole.run_epoch()["train_loss"] for _ in range(6)]
-    first = trainer()
-    for _ in range(3):
-        first.run_epoch()
-    tensors, metadata = first.snapshot()
-    second = trainer()
-    second.resume({k: t.clone() for k, t in tensors.items()}, metadata)
-    assert [second.run_epoch()["train_loss"] for _ in range(3)] == losses[3:]

@@ -127,14 +127,6 @@ class TestSelection:
         assert not run.model.training
 
 
-class TestRepeatability:
-    def test_the_seed_decides(self):
-        a, b, other = finish(trainer()), finish(trainer()), finish(trainer(seed=1))
-        assert a.history == b.history
-        assert same(a.model.state_dict(), b.model.state_dict())
-        assert not same(a.model.state_dict(), other.model.state_dict())
-
-
 class TestLearning:
     def test_losses_fall_below_the_remainder_of_the_linear_part(self):
         run = finish(trainer(epochs=100, batch_size=8, noise=0.0))

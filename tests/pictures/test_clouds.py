@@ -182,14 +182,6 @@ def test_background_and_isolated_points_are_left_out():
             Cloud(wrong).around(SCANNER, MESH, CLAMP, 100)
 
 
-def test_a_lens_sees_no_rays_where_it_cannot_be_undistorted():
-    lens = Lens(LENS.matrix, torch.tensor([-0.4, 0.0, 0.0, 0.0], dtype=torch.float64))
-    pixels = torch.tensor([[160.0, 120.0], [250.0, 160.0], [3000.0, 2000.0]], dtype=torch.float64)
-    rays = lens.rays(pixels)
-    torch.testing.assert_close(lens.pixels(rays[:2]), pixels[:2], rtol=0, atol=1e-6)
-    assert rays[2, :2].isnan().all()
-
-
 def test_two_lenses_have_values_of_their_own(beam):
     """Two depth cameras, of which one has a longer lens than is assumed."""
     pose, q = beam

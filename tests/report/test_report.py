@@ -110,12 +110,6 @@ def test_poses_have_no_time(tmp_path):
     assert not read_trials(tmp_path, SETTINGS).moves
 
 
-def test_the_trial_of_the_largest_error_is_drawn(tmp_path):
-    write_vertex_run(tmp_path, SETTINGS)
-    trials = read_trials(tmp_path, SETTINGS)
-    assert trials.worst == 1
-
-
 def test_arrays_that_do_not_fit_are_refused(tmp_path):
     write_vertex_run(tmp_path, SETTINGS)
     other = tmp_path / "other"

@@ -154,16 +154,6 @@ class TestGradients:
 
 
 @pytest.mark.slow
-class TestStates:
-    def test_an_environment_goes_on_where_another_begins_again(self, robot):
-        with torch.no_grad():
-            moved, fresh = robot.step(robot.begin(2), pressure=[[HIGH, 0.0], [0.0, HIGH]]), robot.begin(2)
-            later = robot.step(moved.where(torch.tensor([True, False]), fresh), pressure=[HIGH, 0.0])
-            expected = robot.step(moved.select([0]), pressure=[HIGH, 0.0])
-        torch.testing.assert_close(later.q[:1], expected.q, atol=1e-9, rtol=0.0)
-
-
-@pytest.mark.slow
 class TestFiles:
     def test_a_table_is_read_as_a_recording(self, robot, tmp_path):
         motion = played(robot, 6)

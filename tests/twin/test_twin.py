@@ -42,10 +42,11 @@ def pull(robot, newtons):
     return force
 
 
-def followed(robot, frames, order=None, **settings):
+def followed(robot, frames, order=None, commands=None, **settings):
+    """A twin that took frames in an order, some with commands, by their numbers."""
     twin = Twin(robot, noise=NOISE, **settings)
     for number in order or range(len(frames)):
-        twin.take(number * robot.time_step, frames[number])
+        twin.take(number * robot.time_step, frames[number], **(commands or {}).get(number, {}))
     return twin
 
 
@@ -122,38 +123,23 @@ def test_its_predictions_are_better_than_the_last_markers(robot, swing):
 
 
 def test_packets_that_come_late_change_nothing(robot, swing):
+    """Neither their markers nor their commands."""
     frames, _, _ = swing
-    order = list(range(40))
+    order, commands = list(range(40)), {6: {"base": [0.0, 0.0, 1e-3, 0.0, 0.0, 0.0]}}
     for number in range(1, 36, 5):
         order[number], order[number + 3] = order[number + 3], order[number]
-    late, due = followed(robot, frames, order), followed(robot, frames, range(40))
+    late, due = (followed(robot, frames, own, commands) for own in (order, range(40)))
     for number in range(3):  # Estimates on the way must not matter either.
         late.take((39 - number) * robot.time_step, np.full_like(frames[0], np.nan))
         _ = late.now
     assert torch.equal(late.now.state.q, due.now.state.q)
     np.testing.assert_array_equal(late.now.markers, due.now.markers)
+    fixed = robot.simulator.body.fixed_vertices
+    lifted = late.now.state.q[0, fixed] - robot.simulator.rest_positions[fixed]
+    assert float(lifted[:, 2].min()) == pytest.approx(1e-3)
     assert late.counts["packets out of order"] >= 7
     assert not late.take(0.0, frames[0])
     assert late.counts["packets too late"] == 1
-
-
-def test_commands_that_come_late_change_nothing(robot, swing):
-    frames, _, _ = swing
-    h, twins = robot.time_step, []
-    for late in (False, True):
-        twin = Twin(robot, noise=NOISE)
-        for number in range(20):
-            if number == 5 and not late:
-                twin.take(5 * h, base=[0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])
-            twin.take(number * h, frames[number])
-            _ = twin.now
-        if late:
-            twin.take(5 * h, base=[0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])
-        twins.append(twin.now)
-    assert torch.equal(twins[0].state.q, twins[1].state.q)
-    fixed = robot.simulator.body.fixed_vertices
-    lifted = twins[0].state.q[0, fixed] - robot.simulator.rest_positions[fixed]
-    assert float(lifted[:, 2].min()) == pytest.approx(1e-3)
 
 
 def test_markers_that_vanish_or_jump_are_left_out_and_named(robot, swing):
@@ -299,12 +285,9 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
 
 
 def test_a_command_that_cannot_be_done_is_left_out(robot, swing):
-    h, frames = robot.time_step, swing[0]
-    twin = Twin(robot, noise=NOISE)
-    for number in range(10):
-        commands = {"base": [0.0, 0.0, 0.03, 0.0, 0.0, 0.0]} if number == 5 else {}
-        twin.take(number * h, frames[number], **commands)
-        assert twin.now.time == pytest.approx(number * h)
+    frames = swing[0]
+    twin = followed(robot, frames, range(10), {5: {"base": [0.0, 0.0, 0.03, 0.0, 0.0, 0.0]}})
+    assert twin.now.time == pytest.approx(9 * robot.time_step)
     (fault,) = twin.counts
     assert fault.startswith("a command was left out: base moves by 30 mm in a step")
     same = followed(robot, frames, range(10))

@@ -7,34 +7,31 @@ other settings begin another study in the same file.
 
 import hashlib
 import json
-import logging
 import math
 import shlex
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import optuna
 from hydra.core.hydra_config import HydraConfig
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 from optuna.exceptions import StorageInternalError
-from optuna.trial import Trial, TrialState
+from optuna.study import MaxTrialsCallback
+from optuna.trial import BaseTrial, FixedTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..experiment.experiment import LEARNED, Experiment
-from ..experiment.learn import Prepared, run_epochs, trainer_of
+from ..experiment.learn import run_epochs, trainer_of
 from ..experiment.trials import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
-from ..io.stages import Stage, StageInterrupted, run_stages
+from ..io.stages import StageInterrupted, run_stages
 from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import PageTable, number_text
 from ..settings.learning import TrainingSettings
 from ..settings.run import RunSettings
 from .tables import show
 
-log = logging.getLogger(__name__)
 _SHOWN = 5  # trials
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
@@ -68,23 +65,46 @@ def tune(settings: TunedRun, folder: Path) -> None:
     prepare(run)
     space, training = _checked(run, search)
     _, acquired = acquire(run, folder, wait=True)
-    *before, trained = _stages(run, search.model, acquired)
+    stages = {stage.name: stage for stage in learning_stages(run, split_of(run), ".", acquired)}
+    wanted = [f"train_{search.model}"]
+    for needed in wanted:
+        wanted += [name for name in stages[needed].upstream if name not in wanted]
+    *before, trained = (stage for name, stage in stages.items() if name in wanted)
     run_stages(before, folder, wait=True)
     experiment = Experiment(trained.settings, folder)
     conditions = [training.plain(), str(space), *(stage.settings.plain() for stage in (*before, trained))]
     name = f"{search.model} {hashlib.sha256(json.dumps(conditions, sort_keys=True).encode()).hexdigest()[:12]}"
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+    def error_mm(trial: Trial) -> float:
+        """Trains with the settings of a trial, and returns its error; infinite where every roll-out diverged."""
+
+        def watch(record: Mapping[str, float]) -> None:
+            if "rollout_error_mm" in record:
+                trial.report(record["rollout_error_mm"], int(record["epoch"]))
+                if trial.should_prune():
+                    raise optuna.TrialPruned
+
+        tried = {key: _suggest(trial, key, values) for key, values in space.items()}
+        try:
+            with naming(f"trial {trial.number}, with {tried}: "):
+                trainer, _ = trainer_of(experiment, search.model, _changed(training, tried))
+                run_epochs(f"trial {trial.number}", trainer, lambda kept: None, watch)
+        except KeyboardInterrupt as error:
+            again = "the same command continues with another one"
+            raise StageInterrupted(f"interrupted in trial {trial.number}; {again}") from error
+        return trainer.best_error if math.isfinite(trainer.best_error) else math.inf
+
     try:
         study = optuna.create_study(storage=f"sqlite:///{folder / 'tune.db'}", study_name=name, load_if_exists=True)
-        while len(study.get_trials(deepcopy=False, states=_FINISHED)) < search.trials:
-            study.sampler = optuna.samplers.TPESampler(seed=search.seed + len(study.trials))
-            _run_trial(study, study.ask(space), partial(trainer_of, experiment, search.model), training)
+        study.sampler = optuna.samplers.TPESampler(seed=search.seed + len(study.trials))
+        if len(study.get_trials(deepcopy=False, states=_FINISHED)) < search.trials:
+            study.optimize(error_mm, callbacks=[MaxTrialsCallback(search.trials, _FINISHED)])
         _print(study, search)
     except (SQLAlchemyError, StorageInternalError) as error:
         raise DataFileError(f"cannot use {folder / 'tune.db'} ({error}): make it writable, or delete it.") from error
 
 
-def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, BaseDistribution], TrainingSettings]:
+def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSettings]:
     """Returns the search space by dotted key, and the settings of every trial outside of it.
 
     Raises:
@@ -98,8 +118,7 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, BaseDistribution
             "a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
             "data.validation and data.test."
         )
-    training, fixed = run.training(search.model), _dotted(search.settings)
-    space = {key: _distribution(key, values) for key, values in _dotted(search.space).items()}
+    training, fixed, space = run.training(search.model), _dotted(search.settings), _dotted(search.space)
     if not space:
         raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
     groups = ("network", "trainer" if training.in_the_loop is None else "in_the_loop")
@@ -107,8 +126,18 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, BaseDistribution
         raise InputError(f"the trials do not depend on tune's {unused[0]}: search {' and '.join(groups)} only.")
     with naming("tune: "):
         training = _changed(training, fixed)
-        for key, values in space.items():
-            for value in getattr(values, "choices", None) or (values.low, values.high):  # type: ignore[attr-defined]
+    for key, values in space.items():
+        try:
+            ends = values if isinstance(values, list) and len(values) > 1 else (values["low"], values["high"])
+            for value in ends:
+                _suggest(FixedTrial({key: value}), key, values)
+        except (TypeError, ValueError, KeyError) as error:
+            raise InputError(
+                f"tune.space.{key} is {values}: write two or more values, as in [8, 16], or a range, as in "
+                "{low: 1.0e-4, high: 1.0e-2, log: true}."
+            ) from error
+        for value in ends:
+            with naming("tune: "):
                 _changed(training, {key: value})
     return space, training
 
@@ -118,18 +147,12 @@ def _dotted(groups: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     return {f"{group}.{name}": value for group, values in groups.items() for name, value in values.items()}
 
 
-def _distribution(key: str, values: Any) -> BaseDistribution:
-    """The distribution of a list or a range."""
-    try:
-        if isinstance(values, list) and len(values) > 1:
-            return CategoricalDistribution(values)
-        whole = isinstance(values["low"], int) and isinstance(values["high"], int)
-        return (IntDistribution if whole else FloatDistribution)(**values)
-    except (TypeError, ValueError, KeyError) as error:
-        raise InputError(
-            f"tune.space.{key} is {values}: write two or more values, as in [8, 16], or a range, as in "
-            "{low: 1.0e-4, high: 1.0e-2, log: true}."
-        ) from error
+def _suggest(trial: BaseTrial, key: str, values: Any) -> Any:
+    """Returns a trial's value of a list or a range."""
+    if isinstance(values, list):
+        return trial.suggest_categorical(key, values)
+    whole = isinstance(values["low"], int) and isinstance(values["high"], int)
+    return (trial.suggest_int if whole else trial.suggest_float)(key, **values)
 
 
 def _changed(training: TrainingSettings, changes: Mapping[str, Any]) -> TrainingSettings:
@@ -139,48 +162,6 @@ def _changed(training: TrainingSettings, changes: Mapping[str, Any]) -> Training
         group, _, name = key.partition(".")
         values[group][name] = value
     return parse(TrainingSettings, values)
-
-
-def _stages(run: RunSettings, model: str, acquired: str) -> list[Stage]:
-    """Returns the stages of a run after its dataset, of a given fingerprint, up to the training of a model."""
-    stages = {stage.name: stage for stage in learning_stages(run, split_of(run), ".", acquired)}
-    wanted = [f"train_{model}"]
-    for name in wanted:
-        wanted += [needed for needed in stages[name].upstream if needed not in wanted]
-    return [stage for name, stage in stages.items() if name in wanted]
-
-
-def _run_trial(
-    study: optuna.Study, trial: Trial, prepared: Callable[[TrainingSettings], Prepared], training: TrainingSettings
-) -> None:
-    """Trains with the settings of a trial, and stores its error [mm]; infinite where every roll-out diverged."""
-    words = ", ".join(f"{key} {_text(value)}" for key, value in trial.params.items())
-    log.info("trial %d: %s", trial.number, words)
-
-    def watch(record: Mapping[str, float]) -> None:
-        if "rollout_error_mm" in record:
-            trial.report(record["rollout_error_mm"], int(record["epoch"]))
-            if trial.should_prune():
-                raise optuna.TrialPruned
-
-    try:
-        trainer, _ = prepared(_changed(training, trial.params))
-        run_epochs(f"trial {trial.number}", trainer, lambda kept: None, watch)
-        error = trainer.best_error if math.isfinite(trainer.best_error) else math.inf
-        study.tell(trial, error)
-        log.info("trial %d: %s mm", trial.number, number_text(error))
-    except optuna.TrialPruned:
-        study.tell(trial, state=TrialState.PRUNED)
-        log.info("trial %d: stopped, as others were better", trial.number)
-    except BaseException as error:
-        study.tell(trial, state=TrialState.FAIL)
-        if isinstance(error, KeyboardInterrupt):
-            raise StageInterrupted(
-                f"interrupted in trial {trial.number}; the same command continues with another one"
-            ) from error
-        if isinstance(error, InputError):
-            raise InputError(f"trial {trial.number} ({words}): {error}") from error
-        raise
 
 
 def _print(study: optuna.Study, search: Tune) -> None:

@@ -22,12 +22,9 @@ import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
 
 import torch
 from benchmarks import gripper, peers, steps, twin
-from rich.console import Console
-from rich.table import Table
 
 from warp_resphys.commands import USER_ERROR
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
@@ -37,8 +34,8 @@ from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.stages import package_versions
 from warp_resphys.linalg.choice import LINEAR_SOLVERS
-
-_LOG_WIDTH: Final = 180  # of tables that go to a file, in characters
+from warp_resphys.report.page import PageTable
+from warp_resphys.studies.tables import show
 
 
 def main(words: Sequence[str]) -> int:
@@ -57,7 +54,12 @@ def main(words: Sequence[str]) -> int:
     except ResphysError as error:
         print(f"error: {error}", file=sys.stderr)
         return USER_ERROR
-    show(results)
+    for title, rows in results.items():
+        if isinstance(rows, float):
+            show(f"{title}: {rows:.3g}")
+        else:
+            cells = [[f"{x:.4g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows]
+            show(PageTable.plain(title, [name.replace("_", " ") for name in rows[0]], cells))
     machine = hardware()
     place = machine["GPU" if device.type == "cuda" else "processor"]
     path = arguments.output / (re.sub(r"[^a-z0-9]+", "-", place.lower()).strip("-") + ".json")
@@ -113,21 +115,6 @@ def command_line() -> argparse.ArgumentParser:
     other.add_argument("--programs", nargs="*", choices=["newton", "mujoco"], default=["newton", "mujoco"])
     other.add_argument("--divisions", nargs=3, type=int, default=[8, 6, 5], help="bricks of the block")
     return parser
-
-
-def show(results: dict[str, Any]) -> None:
-    """Prints lists of rows as tables, and single figures as lines."""
-    console = Console(width=None if sys.stdout.isatty() else _LOG_WIDTH)
-    for title, rows in results.items():
-        if not isinstance(rows, list):
-            console.print(f"{title}: {rows:.3g}", highlight=False)
-            continue
-        table = Table(title=title, title_justify="left")
-        for name in dict.fromkeys(name for row in rows for name in row):
-            table.add_column(name.replace("_", " "), justify="right")
-        for row in rows:
-            table.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()))
-        console.print(table)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 python scripts/reproduce.py                                          the beams, beside what was published
 python scripts/reproduce.py robots --data FOLDER --results docs      robots with recordings in FOLDER: docs/robots.md
-python scripts/reproduce.py tentacle --data FOLDER --budget quick    one of them; or beam_twist, beam_twist/default
+python scripts/reproduce.py tentacle --data FOLDER --overrides budget=quick    one; or beam_twist, beam_twist/default
 
 Runs follow each other. One that fails does not stop the others, and one that is up to date is not run again. The pages
 are reproduction.md and robots.md, with their figures beside them, in --results. robots.json keeps the result of every
@@ -32,26 +32,16 @@ from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.stages import package_versions
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.metrics import PUBLISHED_MM
-from warp_resphys.report.data import Errors, trial_errors
+from warp_resphys.report.data import MODELS, Errors, trial_errors
 from warp_resphys.report.page import MINUS, NONE, duration_text, error_parts, in_a_row, number_text, published_parts
-from warp_resphys.report.verdict import LEAST_TRIALS, ModelComparison, best_pair, known_errors
+from warp_resphys.report.verdict import LEAST_TRIALS, ModelComparison, best_pair, known_errors, model_name
 
 ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+RUNS: Final = Path("runs")
 INTERRUPTED, USER_ERROR = 130, 2
 
-# Models: name in tables, and in sentences.
-MODELS: Final = {
-    "rest": ("At rest", "a body that does not move"),
-    "interpolation": ("Interpolation", "interpolation between the training trials"),
-    "regression": ("Regression", "kernel regression over the training trials"),
-    "linear": ("Linear model", "a linear model without physics"),
-    "simulation": ("Uncorrected", "the uncorrected simulation"),
-    "sysid": ("SysID", "SysID"),
-    "simfree": ("SimFree", "SimFree"),
-    "resphys": ("ResPhys", "ResPhys"),
-}
+COMPARED: Final = (*BASELINES, "simulation", "sysid", "simfree", "resphys")
 CORRECTED: Final = ("sysid", "resphys")
-IN_BEAMS: Final = {"simulation": "Uncorrected", "reconstruction": "Reconstruction", "simfree": "SimFree"}
 FIGURES: Final = ("error_over_time", "tip_displacement")
 BODY_PICTURES: Final = ("figures/body.png", "fold_*/figures/body.png", "figures/registration.png")
 MACHINE: Final = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
@@ -105,24 +95,26 @@ def main() -> None:
     """Runs the selected rows, and writes their pages; the exit code is 2 where a run failed, 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("only", nargs="*", default=["beams"], help="beams, robots, or names of them (beams)")
-    parser.add_argument("--data", type=Path, help="folder with a folder of recordings for each robot")
-    parser.add_argument("--budget", choices=["full", "quick"], default="full", help="quick for a first look")
-    parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the runs (runs)")
+    parser.add_argument("--data", type=Path, default=Path("recordings"), help="folder with one for each robot")
     parser.add_argument("--results", type=Path, default=Path("outputs/reproduce"), help="folder of the pages")
-    parser.add_argument("--overrides", nargs="*", default=[], help="of every run, such as seed=1")
+    parser.add_argument("--overrides", nargs="*", default=[], help="of every run, such as budget=quick")
     options = parser.parse_args()
-    beyond = [*options.overrides, *([] if options.budget == "full" else [f"budget={options.budget}"])]
+    beyond = options.overrides
     try:
         beams, robots = selected(options.only)
-        runs = [beam_run(*pair, beyond, options.runs) for pair in beams]
-        places = {name: _place(name, options.data) for name in robots}
+        runs = []
+        for name, variant in beams:
+            overrides = [*ROWS["variants"][variant]["overrides"], *beyond]
+            runs.append(run_of(f"{name}/{variant}", name, overrides))
+        folders = {name: ROWS["robots"][name].get("recordings") for name in robots}  # none where a simulation plays
+        places = {name: folder and options.data / folder for name, folder in folders.items()}
         present = {name: place for name, place in places.items() if place is None or place.is_dir()}
         if absent := sorted(places.keys() - present.keys()):
             print(f"--data has no recordings of {', '.join(absent)}", file=sys.stderr)
             if not (present or beams):
                 sys.exit(USER_ERROR)
         kept = kept_results(options.results / "robots.json", present, beyond)
-        robot_runs = [robot_run(name, place, beyond, options.runs) for name, place in present.items()]
+        robot_runs = [robot_run(name, place, beyond) for name, place in present.items()]
         for run in (*runs, *robot_runs):
             print(f"run {run.name}", file=sys.stderr, flush=True)
             run.execute()
@@ -163,41 +155,29 @@ def selected(only: Iterable[str]) -> tuple[list[tuple[str, str]], list[str]]:
     return beams, [name for name in ROWS["robots"] if {"robots", name} & wanted]
 
 
-def beam_run(name: str, variant: str, beyond: Sequence[str], runs: Path) -> Run:
-    """Returns the run of a beam with the settings of a column."""
-    overrides = [*ROWS["variants"][variant]["overrides"], *beyond]
-    return Run(f"{name}/{variant}", [f"experiment={name}", *overrides], _folder(runs, name, overrides))
+def run_of(name: str, experiment: str, overrides: Sequence[str]) -> Run:
+    """Returns a run, in the folder that the command itself would choose."""
+    folder = RUNS / experiment / run_label(overrides, ("experiment", "device"))
+    return Run(name, [f"experiment={experiment}", *overrides], folder)
 
 
-def robot_run(name: str, place: Path | None, beyond: Sequence[str], runs: Path) -> Run:
+def robot_run(name: str, place: Path | None, beyond: Sequence[str]) -> Run:
     """Returns the run of a robot, whose recordings are in a folder; without one, a simulation plays the robot.
 
     Raises:
         ResphysError: the recordings are not those of the row.
     """
     robot = ROWS["robots"][name]
-    experiment, overrides = robot["experiment"], [*robot.get("overrides", ()), *beyond]
-    run = Run(name, [f"experiment={experiment}", *overrides], _folder(runs, experiment, overrides))
+    run = run_of(name, robot["experiment"], [*robot.get("overrides", ()), *beyond])
     if place is not None:
         files = sorted(place.glob(robot["files"]))
         if hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest() != robot["sha256"]:
             raise ResphysError(f"the files {place / robot['files']} are not those of the page: fetch them again.")
         if "converted" in robot:
-            place = runs / "recordings" / name
+            place = RUNS / "recordings" / name
             convert_segment(files[0], place)
         run.arguments.append(f"data.folder={_quoted(place.resolve())}")
     return run
-
-
-def _place(name: str, data: Path | None) -> Path | None:
-    """Folder with the recordings of a robot; None where a simulation plays it."""
-    recordings = ROWS["robots"][name].get("recordings")
-    return None if recordings is None else (data or Path("recordings")) / recordings
-
-
-def _folder(runs: Path, experiment: str, overrides: Sequence[str]) -> Path:
-    """Run folder that the command itself would choose, below the folder of runs."""
-    return runs / experiment / run_label(overrides, ("experiment", "device"))
 
 
 def _quoted(path: Path) -> str:
@@ -230,7 +210,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     how = "each held out once" if len(folds) > 1 else "held out"
     if run.data.get("train_fraction", 1.0) < 1.0 and {*tested} <= {*run.data["train"]}:
         how = "in the part that was not used for training"
-    errors = {model: own for model, own in trial_errors(metrics).items() if model in MODELS}
+    errors = {model: own for model, own in trial_errors(metrics).items() if model in COMPARED}
     intervals = metrics.get("intervals", {}).get("models", {}).get("resphys")
     return {
         "day": str(made["finished"]).partition("T")[0],
@@ -239,8 +219,8 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
         "beyond": list(beyond),
         "tested": tested,
         "how": how,
-        "errors_mm": {model: metrics["errors_mm"][model] for model in MODELS if model in metrics["errors_mm"]},
-        "beside": _best_pair(errors),
+        "errors_mm": {model: metrics["errors_mm"][model] for model in COMPARED if model in metrics["errors_mm"]},
+        "beside": best_of(errors),
         "gains": {"sysid": _gain(errors, "simulation", "sysid"), "resphys": _gain(errors, "sysid", "resphys")},
         "intervals": intervals and {key: intervals[key] for key in ("coverage", "half_width_mm")},
         "seconds": sum(sum(part["seconds"].values()) for part in (metrics, *folds.values())),
@@ -248,7 +228,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _best_pair(errors: Errors) -> dict[str, Any] | None:
+def best_of(errors: Errors) -> dict[str, Any] | None:
     """The corrected model of least mean error beside the best of all others; None where one of them is missing."""
     corrected, other = best_pair(known_errors(errors))
     gain = _gain(errors, other, corrected)
@@ -333,8 +313,8 @@ def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[st
     text = f"Tested on {count} trial{'s' if count > 1 else ''}, {row['how']}: {', '.join(row['tested'])}."
     if pair := row["beside"]:
         own, other = (number_text(row["errors_mm"][pair[key]]["mean"]) for key in ("corrected", "other"))
-        text += f" The best corrected model, {MODELS[pair['corrected']][1]}, has an error of {own} mm; "
-        text += f"the best of all others, {MODELS[pair['other']][1]}, {other} mm."
+        text += f" The best corrected model, {model_name(pair['corrected'])}, has an error of {own} mm; "
+        text += f"the best of all others, {model_name(pair['other'])}, {other} mm."
     if row["moved_mm"] is not None:
         text += f" A finer mesh moves the markers of the identified simulator by {number_text(row['moved_mm'])} mm."
     blocks = []
@@ -381,12 +361,13 @@ def beams_page(runs: Sequence[Run], figures: Path) -> str:
         first, kinds = next(iter(columns.values())), FIGURES if name in PUBLISHED_MM else ("marker_ablation",)
         for kind in kinds:
             copy_picture(first.folder, [f"figures/{kind}.png"], figures / f"{name}_{kind}.png")
+        labels = ["Published", *(str(ROWS["variants"][variant]["label"]) for variant in columns)]
         sections += [f"## {ROWS['beams'][name]['title']}"]
-        sections += _errors_table(name, columns) if name in PUBLISHED_MM else _markers_table(name, first)
+        sections += _errors_table(name, labels, columns) if name in PUBLISHED_MM else _markers_table(name, first)
         sections += [f"![{kind.replace('_', ' ')}]({figures.name}/{name}_{kind}.png)" for kind in kinds]
         sections += ["Reasons for deviations:", _items(ROWS["beams"][name]["deviations"])]
         if name == "beam_oscillation":
-            sections += ["## Time benchmark", *_time_table(columns)]
+            sections += ["## Time benchmark", *_time_table(labels, columns)]
     lines = []
     for run in runs:
         command = shlex.join(["warp-resphys", *run.arguments])
@@ -397,28 +378,24 @@ def beams_page(runs: Sequence[Run], figures: Path) -> str:
     return "\n\n".join(["# Reproduction of the published beams", *sections])
 
 
-def _columns(columns: Mapping[str, Run]) -> list[str]:
-    return ["Published", *(str(ROWS["variants"][variant]["label"]) for variant in columns)]
-
-
-def _errors_table(name: str, columns: Mapping[str, Run]) -> list[str]:
+def _errors_table(name: str, labels: Sequence[str], columns: Mapping[str, Run]) -> list[str]:
     published, measured = PUBLISHED_MM[name], [run.metrics["errors_mm"] for run in columns.values()]
     rows = [
         [
-            label,
+            f"**{MODELS[model][0]}**" if model == "resphys" else MODELS[model][0],
             " ".join(published_parts(published[model])) if model in published else NONE,
             *(" ".join(error_parts(errors[model])).strip() if model in errors else NONE for errors in measured),
         ]
-        for model, label in {**IN_BEAMS, "resphys": "**ResPhys**"}.items()
+        for model in ("simulation", "reconstruction", "simfree", "resphys")
     ]
     note = (
         "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. There is no "
         "mean if a roll-out diverged. Reconstruction: the simulator with forces fitted to the test trajectory itself."
     )
-    return [_table(["Roll-out error [mm]", *_columns(columns)], rows), note]
+    return [_table(["Roll-out error [mm]", *labels], rows), note]
 
 
-def _time_table(columns: Mapping[str, Run]) -> list[str]:
+def _time_table(labels: Sequence[str], columns: Mapping[str, Run]) -> list[str]:
     timing = ROWS["timing"]
     steps = [run.data["steps"] for run in columns.values()]
     seconds = [run.metrics["seconds_per_test_trajectory"] for run in columns.values()]
@@ -431,7 +408,7 @@ def _time_table(columns: Mapping[str, Run]) -> list[str]:
         ours = [text(own[key]["mean"], own[key]["std"], n) for own, n in zip(seconds, steps, strict=True)]
         rows.append([label, text(mean, std, timing["steps"]), *ours])
     note = f"Published: trajectories of {timing['steps']} steps; here: of {' and '.join(sorted({*map(str, steps)}))}."
-    table = _table(["Time per trajectory [s]", *_columns(columns)], rows)
+    table = _table(["Time per trajectory [s]", *labels], rows)
     return [table, note, "Reasons for deviations:", _items(timing["deviations"])]
 
 

@@ -68,7 +68,7 @@ def test_every_row_is_an_experiment():
 
 def test_gains_and_the_best_models_are_those_of_the_trials():
     errors = {"rest": [9.0, 8.0], "simulation": [2.0, 2.0], "sysid": [1.0, 1.0], "resphys": [3.0, None]}
-    pair = reproduce._best_pair(errors)
+    pair = reproduce.best_of(errors)
     assert (pair["corrected"], pair["other"], pair["gain"]["share"]) == ("sysid", "simulation", 0.5)
     assert reproduce._gain(errors, "sysid", "resphys") is None
     kept = json.loads((DOCS / "robots.json").read_text())
@@ -85,7 +85,7 @@ def test_rows_with_other_settings_and_other_recordings_are_refused(monkeypatch, 
         reproduce.kept_results(DOCS / "robots.json", ["sopra"], ["budget=quick"])
     (tmp_path / "m1.csv").write_text("0,1")
     with pytest.raises(ResphysError, match="are not those of the page"):
-        reproduce.robot_run("tentacle", tmp_path, [], Path("runs"))
+        reproduce.robot_run("tentacle", tmp_path, [])
     assert end_of(monkeypatch, "tentacle", "--data", tmp_path, "--results", tmp_path / "out") == 2
     assert capsys.readouterr().err == "--data has no recordings of tentacle\n"
     assert not (tmp_path / "out").exists()

@@ -8,8 +8,8 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
+from statistics import fmean
 
 import torch
 
@@ -29,7 +29,7 @@ _RECONSTRUCTION = 8.0  # steps that take as long as a reconstructed one, before 
 _VARIED = 0.2  # time of one more set of parameters, over that of a step
 _ITERATION = 2.0  # of L-BFGS: losses with their gradients, over roll-outs
 _BATCH = 1e-3  # time of a batch of a small network [s]
-_SUPPORTED, _MOST_TRIALS = 0.2, 16  # share of the weight, and trials that are timed
+_SUPPORTED, _MOST_TRIALS, _MOST_STEPS = 0.2, 16, 5  # share of the weight; trials and steps that are timed
 
 
 def announcement(
@@ -57,7 +57,9 @@ def announcement(
         for reconstructed, number in ((False, steps), (True, forces)):
             if number and reconstructed not in paces:
                 paces[reconstructed] = pace_of(experiments[name], reconstructed)
-        shared = min(workers.count, _parts(experiments[name].settings))
+        one = own[name]  # workers share trials that are reconstructed, and calibration trials
+        names = one.reconstructed if one.reads("reconstructed") else one.groups["1"] if one.reads("calibration") else ()
+        shared = min(workers.count, max(math.ceil(len(names) / (one.batch or len(names) or 1)), 1))
         seconds[name] = times * (steps * paces.get(False, 0.0) + forces * paces.get(True, 0.0) + training) / shared
     if sum(seconds.values()) < _LEAST_SECONDS:
         return ""
@@ -118,13 +120,6 @@ def steps_of(experiment: Experiment, model: str, names: Sequence[str]) -> float:
     return total
 
 
-def _parts(settings: StageSettings) -> int:
-    """Number of parts of a stage that workers can do at the same time."""
-    names = settings.reconstructed if settings.reads("reconstructed") else ()
-    names = settings.groups["1"] if settings.reads("calibration") else names
-    return max(math.ceil(len(names) / (settings.batch or len(names) or 1)), 1)
-
-
 def pace_of(experiment: Experiment, reconstructed: bool) -> float:
     """Returns the time of a step of one of several trials, or of the reconstruction of its forces [s]."""
     settings = experiment.settings
@@ -139,7 +134,7 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
         method = method.with_constants(constants)
     support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None] * torch.ones_like(state.q)
     middle = round(float(replay.trials.times.max()) / simulator.time_step) // 2  # where inputs act
-    for k in count():
+    for k in range(_MOST_STEPS):
         acting = resting if replay.is_static else inputs.at(middle + k)
         begin = time.perf_counter()
         with torch.no_grad():
@@ -149,6 +144,6 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
             target = method.step(state, replay.observe(target.q), acting).state.detach()
         state = state if replay.is_static else target
         seconds.append(time.perf_counter() - begin)
-        if k == 4 or sum(seconds[1:]) > 0.5 or seconds[0] > 2.0:  # The first step may compile kernels.
-            return (sum(seconds[1:]) or seconds[0]) / max(k, 1) / len(names)
-    raise AssertionError
+        if sum(seconds[1:]) > 0.5 or seconds[0] > 2.0:
+            break
+    return fmean(seconds[1:] or seconds) / len(names)  # The first step may compile kernels.

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -38,32 +37,42 @@ _TIP_MASS: Final = 0.1  # [kg]
 _PRESSURE: Final = 2e4  # [Pa]
 
 
-@dataclass(frozen=True)
-class Rollout:
-    """A roll-out of a body of an experiment."""
+def task_of(
+    settings: RunSettings, solver: str, material: str, batch: int, steps: int, straight: bool = False
+) -> tuple[Simulator, Callable[[], dict[str, float]]]:
+    """Returns the simulator of an experiment's body, and a task, which has run once and compiled kernels.
 
-    simulator: Simulator
-    start: State
-    steps: int
-    inputs: Inputs
-    moduli: Mapping[str, torch.Tensor]
+    The task times a step of the whole batch without gradients (plain), with them, and in the backward pass. The
+    gradient is that of the sum of squares of the last state, with respect to the first state, a force on every vertex
+    at every step, and Young's modulus.
 
-    def measure(self) -> dict[str, float]:
-        """Times a step of the whole batch without gradients (plain), with them, and in the backward pass.
+    Args:
+        settings: of a run.
+        solver: its name.
+        material: a key of `MATERIALS`.
+        batch: number of environments.
+        steps: of a roll-out.
+        straight: whether the body starts from its shape at rest.
+    """
+    settings = settings.changed(solver=settings.solver.changed(name=solver))
+    law = settings.simulation.changed(**MATERIALS[material])
+    simulator = build_simulator(settings, law, build_body(settings))
+    start, inputs = simulator.rest_state(batch), Inputs()
+    if not straight:
+        start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
+    constants = {_MODULUS: simulator.tensor([law.constants[_MODULUS]])} if _MODULUS in law.constants else {}
+    device = start.q.device
 
-        The gradient is that of the sum of squares of the last state, with respect to the first state, a force on every
-        vertex at every step, and Young's modulus.
-        """
-        device, steps, batch = self.start.q.device, self.steps, len(self.start.q)
+    def measure(steps: int = steps, inputs: Inputs = inputs) -> dict[str, float]:
         began = now(device)
         with torch.no_grad():
-            path = self.simulator.rollout(self.start, steps, self.inputs, self.moduli)
+            path = simulator.rollout(start, steps, inputs, constants)
         plain = now(device) - began
-        q, v = (tensor.detach().clone().requires_grad_() for tensor in (self.start.q, self.start.v))
+        q, v = (tensor.detach().clone().requires_grad_() for tensor in (start.q, start.v))
         force = q.new_zeros(steps, *q.shape).requires_grad_()
-        moduli = {name: value.clone().requires_grad_() for name, value in self.moduli.items()}
+        moduli = {name: value.clone().requires_grad_() for name, value in constants.items()}
         began = now(device)
-        path = self.simulator.rollout(State(q, v), steps, self.inputs.replace(external_force=force), moduli)
+        path = simulator.rollout(State(q, v), steps, inputs.replace(external_force=force), moduli)
         forward = now(device) - began
         loss = path.q[-1].square().sum() + path.v[-1].square().sum()
         began = now(device)
@@ -73,29 +82,8 @@ class Rollout:
         speed = {"steps_per_s": batch * steps / plain, **solves(path)}
         return {**{name: 1e3 * seconds / steps for name, seconds in times.items()}, **speed}
 
-
-def rollout_of(
-    settings: RunSettings, solver: str, material: str, batch: int, steps: int, straight: bool = False
-) -> Rollout:
-    """Returns a roll-out, after two steps and their gradient, which compile kernels.
-
-    Args:
-        settings: of a run.
-        solver: its name.
-        material: a key of `MATERIALS`.
-        batch: number of environments.
-        steps: of the roll-out.
-        straight: whether the body starts from its shape at rest.
-    """
-    settings = settings.changed(solver=settings.solver.changed(name=solver))
-    law = settings.simulation.changed(**MATERIALS[material])
-    simulator = build_simulator(settings, law, build_body(settings))
-    start, inputs = simulator.rest_state(batch), Inputs()
-    if not straight:
-        start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
-    moduli = {_MODULUS: simulator.tensor([law.constants[_MODULUS]])} if _MODULUS in law.constants else {}
-    Rollout(simulator, start, 2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}), moduli).measure()
-    return Rollout(simulator, start, steps, inputs, moduli)
+    measure(2, Inputs(**{key: value[:2] for key, value in inputs.fields.items()}))
+    return simulator, measure
 
 
 def loaded(simulator: Simulator, batch: int, steps: int, sign: float = 1.0) -> tuple[State, Inputs]:
@@ -131,14 +119,14 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
     device = choose_device(arguments.device)
     settings = run_settings(arguments, *(FLOOR if arguments.floor else ()))
     cases = [*product(arguments.solvers, arguments.materials, arguments.batches or BATCHES[device.type])]
-    rollouts = [rollout_of(settings, *case, arguments.steps) for case in cases]
-    measured, yardstick = take_turns("steps", [rollout.measure for rollout in rollouts], arguments.repeats)
+    simulators, tasks = zip(*(task_of(settings, *case, arguments.steps) for case in cases), strict=True)
+    measured, yardstick = take_turns("steps", tasks, arguments.repeats)
     steps, parts = Rows(), Rows()
-    for (solver, material, batch), rollout, times in zip(cases, rollouts, measured, strict=True):
+    for (solver, material, batch), simulator, times in zip(cases, simulators, measured, strict=True):
         head: dict[str, Any] = {"solver": solver, "material": material, "batch": batch}
         relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
-        steps.append({**head, "unknowns": free_unknowns(rollout.simulator), **times, **relative})
-        parts.append({**head, **part_times(rollout.simulator, batch, arguments.repeats)})
+        steps.append({**head, "unknowns": free_unknowns(simulator), **times, **relative})
+        parts.append({**head, **part_times(simulator, batch, arguments.repeats)})
     tables: dict[str, Any] = {"yardstick_ms": yardstick, STEPS: steps, "parts of an iteration": parts}
     if arguments.run is not None:
         counts = arguments.batches or (1, 16, 64)
@@ -195,8 +183,8 @@ def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:
         settings = run_settings(arguments, f"solver.linear_solver={linear}")
         if refinement != 1.0:
             settings = settings.changed(mesh=finer(settings.mesh, refinement))
-        rollout = rollout_of(settings, "quasi_newton", material, 1, 2, straight=True)
-        head = {"material": material, "linear_solver": linear, "unknowns": free_unknowns(rollout.simulator)}
-        ((times,), _) = take_turns(f"{linear} {refinement:g}", [rollout.measure], arguments.repeats)
+        simulator, task = task_of(settings, "quasi_newton", material, 1, 2, straight=True)
+        head = {"material": material, "linear_solver": linear, "unknowns": free_unknowns(simulator)}
+        ((times,), _) = take_turns(f"{linear} {refinement:g}", [task], arguments.repeats)
         rows.append({**head, **times, "memory_gib": peak_memory_gib()})  # of this process, so far
     return {"a step by size": rows}

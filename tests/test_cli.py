@@ -366,15 +366,10 @@ def _is_key(name):
     return name.startswith(free) or any(re.fullmatch(pattern, name) for pattern in _patterns())
 
 
-class TestSettingsOfARun:
-    @pytest.fixture(autouse=True)
-    def _elsewhere(self, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-
-    def test_all_keys_are_shown_with_their_defaults_and_nothing_is_written(self, tmp_path):
-        shown = OmegaConf.create(outcome("--cfg", "job", "seed=3", "mesh=rod").out)
-        assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.processes) == (3, "rod", 0.0, 1)
-        assert list(tmp_path.iterdir()) == []
+def test_all_keys_are_shown_with_their_defaults_and_nothing_is_written(folder):
+    shown = OmegaConf.create(outcome("--cfg", "job", "seed=3", "mesh=rod").out)
+    assert (shown.seed, shown.mesh.kind, shown.mesh.grading, shown.parallel.processes) == (3, "rod", 0.0, 1)
+    assert list(folder.iterdir()) == []
 
 
 class TestProcess:

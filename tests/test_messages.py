@@ -1,13 +1,11 @@
 """The error messages that users meet most, word for word: what is wrong, where, and what to do."""
 
 import re
-from pathlib import Path
 
 import pytest
 import torch
 
 import warp_resphys as wr
-from support.configured import check, composed
 from warp_resphys.dynamics.statics import find_equilibrium
 
 BOX = wr.box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))
@@ -18,8 +16,8 @@ def beam(body=CLAMPED, **settings):
     return wr.Simulator(body, solver=wr.SolverSettings(**settings))
 
 
-def pushed(newtons, *shape):
-    return wr.Inputs(torch.full((1, *(shape or BOX.vertices.shape)), newtons, dtype=torch.float64))
+def pushed(newtons):
+    return wr.Inputs(torch.full((1, *BOX.vertices.shape), newtons, dtype=torch.float64))
 
 
 def collapsed():
@@ -35,11 +33,9 @@ def buckling(share, x):
 
 
 MESSAGES = {
-    "unknown key 'sed', did you mean 'seed'?": lambda: check({**composed(), "sed": 1}),
     "Unknown input presure. This body accepts external_force, fixed_positions, attached_mass.": (
         lambda: beam().step(beam().rest_state(), wr.Inputs(presure=torch.zeros(1, 2)))
     ),
-    "arm.vtu: there is no such mesh file": lambda: wr.read_mesh(Path("arm.vtu")),
     "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "
     "them": collapsed,
     "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their size; lower the "
@@ -50,10 +46,6 @@ MESSAGES = {
     "smaller time step or loads, raise solver.max_iterations, or choose solver.name=newton.": (
         lambda: beam(max_iterations=1).step(beam().rest_state(), pushed(0.1))
     ),
-    "external_force has shape (1, 3, 3): it must be (1, 20, 3) in N.": (
-        lambda: beam().step(beam().rest_state(), pushed(0.0, 3, 3))
-    ),
-    "swing.h5 does not exist: check the path, or run the stage that writes it": lambda: wr.read_recording("swing.h5"),
     "youngs_modulus is -100000: it must be positive, in Pa.": lambda: wr.Corotated(-1e5),
     "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle with "
     "friction, within the distance of contact.": (lambda: beam(FREE).static_equilibrium()),
@@ -61,8 +53,7 @@ MESSAGES = {
 
 
 @pytest.mark.parametrize("message", MESSAGES)
-def test_message(message, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_message(message):
     with pytest.raises(wr.ResphysError) as caught:
         MESSAGES[message]()
     assert re.sub(r"\d\.\d\de[+-]\d\d", "SIZE", str(caught.value)) == message

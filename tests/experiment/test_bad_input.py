@@ -91,36 +91,25 @@ def test_absent_cuda_device():
         Simulator(BODY, device="cuda")
 
 
-NAMES = {"q": "state.q", "v": "state.v", "external_force": "external_force", "fixed_positions": "fixed_positions"}
+STATE = {"q": "state.q", "v": "state.v", "q_back": r"state.previous\[0\]", "v_back": r"state.previous\[1\]"}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_states_and_inputs_that_are_not_finite_or_misshapen(name, simulator):
-    rest = simulator.rest_state(2)
-    given = {"q": rest.q, "v": rest.v, "external_force": torch.zeros_like(rest.q)}
-    given["fixed_positions"] = rest.q[:, simulator.fixed]
-    wrong = given[name].clone()
-    wrong[1, 2, 0] = NAN
-    shape = rf" has shape .*it must be \(2, {FIXED if name == 'fixed_positions' else VERTICES}, 3\)"
-    cases = [(wrong, " is not finite in environment 1, vertex 2")]
-    cases += [(x, " has shape" if name == "q" else shape) for x in (wrong[:, :-1], wrong[..., :2], wrong[0])]
-    for value, message in cases:
-        q, v, *inputs = (given | {name: value}).values()
-        with pytest.raises(InputError, match=NAMES[name] + message):
-            simulator.step(State(q, v), Inputs(*inputs))
-
-
-@pytest.mark.parametrize("which", [0, 1])
-def test_the_state_before_is_checked_like_the_state(which):
+@pytest.mark.parametrize("name", [*STATE, "external_force", "fixed_positions"])
+def test_states_and_inputs_that_are_not_finite_or_misshapen(name):
     simulator = Simulator(BODY, integrator="bdf2")
     rest = simulator.rest_state(2)
-    wrong = rest.v.clone()
-    wrong[1, 2, 0] = INF
-    for value, message in ((wrong, "is not finite in environment 1, vertex 2"), (rest.q[:1], ""), (rest.q.numpy(), "")):
-        pair = [rest.q, rest.v]
-        pair[which] = value
-        with pytest.raises(InputError, match=rf"state.previous\[{which}\] {message}"):
-            simulator.step(State(rest.q, rest.v, tuple(pair)))
+    given = {"q": rest.q, "v": rest.v, "q_back": rest.q, "v_back": rest.v, "external_force": torch.zeros_like(rest.q)}
+    given["fixed_positions"] = rest.q[:, simulator.fixed]
+    wrong, infinite = given[name].clone(), given[name].clone()
+    wrong[1, 2, 0], infinite[1, 2, 0] = NAN, INF
+    shape = rf" has shape .*it must be \(2, {FIXED if name == 'fixed_positions' else VERTICES}, 3\)"
+    cases = [(x, " is not finite in environment 1, vertex 2") for x in (wrong, infinite)]
+    cases += [(x, " has shape" if name == "q" else shape) for x in (wrong[:, :-1], wrong[..., :2], wrong[0])]
+    cases += [(wrong.numpy(), "")] if name.endswith("back") else []
+    for value, message in cases:
+        q, v, q_back, v_back, *inputs = (given | {name: value}).values()
+        with pytest.raises(InputError, match=STATE.get(name, name) + message):
+            simulator.step(State(q, v, (q_back, v_back)), Inputs(*inputs))
 
 
 @pytest.mark.parametrize("name", ["external_force", "fixed_positions", "start"])

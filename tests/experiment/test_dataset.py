@@ -1,7 +1,6 @@
 """The file of a dataset; what drives its trials at their frames, and since when that has not changed."""
 
 import numpy as np
-import pytest
 
 from warp_resphys.experiment.files import Dataset, driving, read_dataset, since_change
 from warp_resphys.io.files import read_hdf5
@@ -19,25 +18,19 @@ def dataset(begins, names="abc", resting=None, **inputs):
     return Dataset(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), **fields)
 
 
-@pytest.mark.parametrize(
-    ("name", "unit"),
-    [
-        ("pressure", "Pa"),
-        ("tendon_tension", "N"),
-        ("tendon_contraction", "m"),
-        ("muscle_stress", "Pa"),
-        ("muscle_contraction", "1"),
-    ],
-)
-def test_inputs_have_the_unit_of_their_quantity(tmp_path, name, unit):
-    values = np.arange(24.0).reshape(1, 12, 2)
-    own = dataset(("rest",), **{name: values})
+UNITS = {"pressure": "Pa", "tendon_tension": "N", "tendon_contraction": "m", "muscle_stress": "Pa"}
+UNITS["muscle_contraction"] = "1"
+
+
+def test_inputs_are_kept_with_the_unit_of_their_quantity(tmp_path):
+    own = dataset(("rest",), **{name: k + np.arange(24.0).reshape(1, 12, 2) for k, name in enumerate(UNITS)})
     own.write(tmp_path / "dataset.h5")
-    with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
-        assert file[name].attrs["units"] == unit
     again = read_dataset(tmp_path / "dataset.h5")
     assert again.channels == own.channels
-    np.testing.assert_array_equal(again.inputs[name], values)
+    with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
+        assert {name: file[name].attrs["units"] for name in UNITS} == UNITS
+    for name, values in own.inputs.items():
+        np.testing.assert_array_equal(again.inputs[name], values)
 
 
 def test_inputs_before_the_trials_are_kept_and_joined_with_trials_at_rest(tmp_path):

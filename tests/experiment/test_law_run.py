@@ -8,7 +8,7 @@ import torch
 
 import warp_resphys
 from support.configured import check, composed, settings
-from support.main_job import run_without_report
+from support.main_job import means, run_without_report
 from warp_resphys import select_vertices
 from warp_resphys.experiment import identify_law
 from warp_resphys.experiment.experiment import LAW
@@ -48,10 +48,6 @@ def short_stride():
 @pytest.fixture(scope="module")
 def rubber(tmp_path_factory, short_stride):
     return run_without_report(tmp_path_factory.mktemp("rubber"), *RUBBER)
-
-
-def means(folder):
-    return {model: errors["mean"] for model, errors in read_json(folder / "metrics.json")["errors_mm"].items()}
 
 
 def by_trial(folder):

@@ -27,31 +27,26 @@ class TestScore:
         assert score.error == pytest.approx(2.0)
         assert Score((np.array([1.0, np.nan]),)).error == math.inf
 
-    def test_a_small_but_certain_gain_counts(self):
+    def test_a_small_but_certain_gain_counts_and_an_uncertain_one_does_not(self):
         better, worse = Score(frames(0, 0.97)), Score(frames(1))
         assert better.beats(worse)
         assert not worse.beats(better)
-
-    def test_an_uncertain_gain_does_not(self):
-        less = np.where(np.arange(400) < 200, 0.9, 1.07)  # in one half of the time alone
-        trial = frames(0)
+        less, trial = np.where(np.arange(400) < 200, 0.9, 1.07), frames(0)  # in one half of the time alone
         better = Score(tuple(less * own for own in trial))
         assert better.error < Score(trial).error
         assert not better.beats(Score(trial))
         assert not Score(trial).beats(Score(trial))
 
-    def test_of_static_poses_the_trials_are_compared(self):
-        poses = [np.array([x]) for x in (1.0, 2.0, 3.0)]
-        below = Score(tuple(poses))
-        assert Score(tuple(0.9 * pose for pose in poses)).beats(below)
-        assert not Score((0.5 * poses[0], 0.7 * poses[1], 1.2 * poses[2])).beats(below)
-        assert Score((np.array([0.8]),)).beats(Score((np.array([1.0]),)))
-        assert not Score((np.array([0.99]),)).beats(Score((np.array([1.0]),)))
+    def test_of_static_poses_the_trials_are_compared_and_one_that_fails_loses(self):
+        def score(*poses):
+            return Score(tuple(np.array([x]) for x in poses))
 
-    def test_one_that_fails_loses(self):
-        failed = Score((np.array([1.0, np.inf]),))
-        assert Score((np.array([5.0, 5.0]),)).beats(failed)
-        assert not failed.beats(Score((np.array([5.0, 5.0]),)))
+        assert score(0.9, 1.8, 2.7).beats(score(1.0, 2.0, 3.0))
+        assert not score(0.5, 1.4, 3.6).beats(score(1.0, 2.0, 3.0))
+        assert score(0.8).beats(score(1.0))
+        assert not score(0.99).beats(score(1.0))
+        assert score(5.0).beats(score(np.inf))
+        assert not score(np.inf).beats(score(5.0))
 
 
 def test_terms_branches_and_families_that_hardly_resist_are_left_out_and_the_others_numbered_anew():

@@ -35,13 +35,12 @@ from support.main_job import (
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment.build import build_mesh, build_simulator
 from warp_resphys.experiment.checks import check_run
-from warp_resphys.experiment.parts import TrialPart
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.files import read_checkpoint, read_hdf5
+from warp_resphys.io.progress import Progress
 from warp_resphys.io.stages import fingerprint, package_versions
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.reconstruction import LBFGSB
-from warp_resphys.learning.training import EpochTrainer
 
 LEARNED_FILES = (("", "safetensors"), ("training_", "json"))
 
@@ -177,12 +176,7 @@ class TestOtherRuns:
         environment = {**os.environ, "PYTHONHASHSEED": "2", "OMP_NUM_THREADS": "2"}
         command = [sys.executable, "-m", "warp_resphys", *TINY, IN_RUN]
         subprocess.run(command, env=environment, check=True, capture_output=True, timeout=300)
-        first, second = (numbers(metrics(place)) for place in (finished[0], "run"))
-        assert sum(isinstance(value, float) for value in first.values()) >= 14
-        assert second.keys() == first.keys()
-        for key, value in first.items():
-            wanted = pytest.approx(value, rel=1e-6, abs=0.0) if isinstance(value, float) else value
-            assert second[key] == wanted, key
+        same_errors(errors(), errors(finished[0]))
 
     def test_a_mesh_from_a_file_is_told_by_its_content(self, folder, finished):
         box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
@@ -196,16 +190,6 @@ class TestOtherRuns:
         meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
         finish(*arguments)
         assert ran(before) == STAGES
-
-
-def numbers(data, place=""):
-    """Every entry of metrics by where it stands, but for times, memory and versions."""
-    if place in ("/seconds", "/seconds_per_test_trajectory", "/peak_memory_gib", "/versions"):
-        return {}
-    entries = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else None
-    if entries is None:
-        return {place: data}
-    return {k: v for key, value in entries for k, v in numbers(value, f"{place}/{key}").items()}
 
 
 def options(group):
@@ -251,58 +235,35 @@ class TestConfiguration:
         assert dict(run.physics) == {"mass": "per_vertex", "volume_integration": "full"}
 
 
-class Interruption:
-    """Sends a signal to this process at a chosen step or epoch, and counts the work done."""
-
-    def __init__(self, monkeypatch):
-        self.at, self.signal = None, signal.SIGINT
-        self.done = Counter()
-        write, run_epoch = TrialPart.write, EpochTrainer.run_epoch
-
-        def interrupted_write(part, work, advance):
-            def counted(part, report):
-                def reported(**shown):
-                    report(**shown)
-                    self.count(work.__name__)
-
-                return work(part, reported)
-
-            write(part, counted, advance)
-
-        def interrupted_epoch(trainer):
-            record = run_epoch(trainer)
-            self.count("epochs")
-            return record
-
-        monkeypatch.setattr(TrialPart, "write", interrupted_write)
-        monkeypatch.setattr(EpochTrainer, "run_epoch", interrupted_epoch)
-
-    def count(self, kind):
-        self.done[kind] += 1
-        if self.at == (kind, self.done[kind]):
-            signal.raise_signal(self.signal)
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_report")
 class TestInterruption:
     @pytest.fixture
     def interruption(self, monkeypatch):
+        """Counts frames and epochs by the stage, and sends a signal to this process at a chosen one."""
+        done, cut, advance = Counter(), {}, Progress.advance
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        yield Interruption(monkeypatch)
+
+        def counted(bar, *count, **shown):
+            advance(bar, *count, **shown)
+            done[bar.description] += 1
+            if (chosen := cut.get((bar.description, done[bar.description]))) is not None:
+                signal.raise_signal(chosen)
+
+        monkeypatch.setattr(Progress, "advance", counted)
+        yield done, cut
         signal.signal(signal.SIGINT, before)
 
     def test_ctrl_c_in_every_stage(self, folder, interruption):
         """The last time by SIGTERM, with which clusters end a process."""
-        arguments = [*TINY, "integrator=bdf2"]
+        arguments, (done, cut) = [*TINY, "integrator=bdf2"], interruption
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
-        whole = Counter(interruption.done)
-        assert whole == {"_free_motion": 13, "_of_trials": 13, "epochs": 80, "_rolled_out": 39}
-        interruption.done.clear()
-        cuts = {"_free_motion": ("simulate", 1), "_of_trials": ("reconstruct_resphys", 7)}
-        cuts |= {"epochs": ("train_resphys", 25), "_rolled_out": ("evaluate", 18)}
-        for kind, (stage, at) in cuts.items():
-            interruption.at, interruption.signal = (kind, at), signal.SIGTERM if stage == "evaluate" else signal.SIGINT
+        whole = {stage: done[stage] for stage in STAGES[:5]}
+        assert [*whole.values()] == [14, 14, 40, 40, 42]  # frames and their file, epochs, and frames of three models
+        done.clear()
+        for stage, at in {"simulate": 1, "reconstruct_resphys": 7, "train_resphys": 25, "evaluate": 18}.items():
+            cut.clear()
+            cut[stage, at] = signal.SIGTERM if stage == "evaluate" else signal.SIGINT
             code, err = run(*arguments, IN_RUN)
             assert code == 130
             assert f"interrupted in stage '{stage}'" in err
@@ -310,11 +271,10 @@ class TestInterruption:
             assert "Traceback" not in err
             assert not Path("run/metrics.json").exists()
             assert not list(Path("run").rglob("*.partial"))
-        interruption.at = None
         assert run(*arguments, IN_RUN)[0] == 0
-        repeated = interruption.done - whole
-        assert repeated.pop("epochs", 0) <= 1  # the epoch that the signal fell into
-        assert repeated == {"_free_motion": 1, "_of_trials": 7, "_rolled_out": 18 - 13}  # the first model is kept
+        repeated = [done[stage] - count for stage, count in whole.items()]
+        assert repeated.pop(2) <= 1  # the epoch that the signal fell into
+        assert repeated == [1, 7, 0, 18 - 14]  # the first model is kept
         same_errors(errors(), errors("whole"))
         assert not list(Path("run").glob("*_parts"))
         assert not list(Path("run").glob("train_*.safetensors"))

@@ -96,13 +96,6 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
     np.testing.assert_allclose(pressure[0], recording.actuation[1:])
 
 
-def test_the_reconstruction_reaches_the_smoothed_markers(finished):
-    assert read_json(finished / "reconstruction.json")["resphys"]["mean_mm"] < 0.2
-    with read_hdf5(finished / "reconstruction_resphys.h5", "reconstruction") as file:
-        assert list(file.attrs["names"]) == ["t000", "t001", "t002"]
-        assert read_array(file, "force").shape == (3, 13, read_array(file, "q").shape[2], 3)
-
-
 def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch):
     stage = stage_of(finished, "train_resphys", StageSettings)
     assert stage.force_frame == "corotated"

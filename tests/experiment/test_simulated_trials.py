@@ -177,13 +177,11 @@ def test_the_quick_budget_picks_evenly(experiment, unit, factor):
     amounts = {trial.name: trial.amount for trial in trials_of(runs[1])}
     assert tuple(amounts) == split.names
     for name, limit in dict(quick.limit).items():
-        row, picked = [f"{x:g}{unit}" for x in getattr(full.amounts, name)], list(getattr(split, name))
+        values, picked = np.array(getattr(full.amounts, name)), getattr(split, name)
+        row = [f"{x:g}{unit}" for x in values]
         assert list(getattr(whole, name)) == row
-        places = [row.index(name) for name in picked]
+        places = [row.index(one) for one in picked]
         assert len(picked) == limit < len(row)
-        if limit > 1:
-            assert (places[0], places[-1]) == (0, len(row) - 1)
-            assert np.ptp(np.diff(places)) <= 1  # strides differ by one at most
-            assert np.diff(places).min() >= 1
-        chosen = np.array([getattr(full.amounts, name)[place] for place in places])
-        np.testing.assert_allclose([amounts[name] for name in picked], factor * chosen)
+        assert limit == 1 or [places[0], places[-1]] == [0, len(row) - 1]
+        assert limit == 1 or np.ptp(np.diff(places)) <= 1 <= np.diff(places).min()  # strides differ by one at most
+        np.testing.assert_allclose([amounts[one] for one in picked], factor * values[places])

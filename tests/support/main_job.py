@@ -77,6 +77,11 @@ def metrics(folder="run"):
     return json.loads((Path(folder) / "metrics.json").read_text())
 
 
+def means(folder="run"):
+    """Mean errors of all models [mm]."""
+    return {model: summary["mean"] for model, summary in metrics(folder)["errors_mm"].items()}
+
+
 def errors(folder="run"):
     """All errors of a run as one list [mm]."""
     content = metrics(folder)

@@ -9,6 +9,7 @@ import torch
 
 from support.contact import BLOCK, KAPPA, SIDE, SOFT, WEIGHT, D, G, distances, resting_floor
 from support.contact import on_obstacles as simulator
+from support.slopes import check_slopes
 from warp_resphys import (
     Body,
     Corotated,
@@ -211,28 +212,6 @@ def test_a_floor_that_moves_carries_a_block():
     assert v[:, :2].numpy() == pytest.approx(expected[:, :2].numpy(), abs=1e-3)
 
 
-def compare(losses, values, sizes, seed=3):
-    """Compares gradients of losses (B,), one for each environment, with differences along random directions.
-
-    Args:
-        losses: function of the values by name.
-        values: (B, ...) by name.
-        sizes: of the changes by name, so small that no point begins or ends to touch or slide.
-        seed: of the directions.
-    """
-    random = torch.Generator().manual_seed(seed)
-    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    losses(leaves).sum().backward()
-    for name, value in values.items():
-        change = sizes[name] * torch.randn(value.shape, generator=random, dtype=torch.float64)
-        slopes = (leaves[name].grad * change).flatten(1).sum(1)
-        with torch.no_grad():
-            near = [losses({**values, name: value + factor * change}) for factor in (-2.0, -1.0, 1.0, 2.0)]
-        difference = (8.0 * (near[2] - near[1]) - (near[3] - near[0])) / 12.0
-        error = float((slopes - difference).norm() / difference.norm())
-        assert error < 1e-6, f"{name}: {error:.1e}"
-
-
 @pytest.mark.parametrize(("integrator", "moves"), [("implicit_euler", False), ("bdf2", True)])
 def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, moves):
     floor = HalfSpace(position=(0.0, 0.0, -1.2e-3), axis=(0.03, -0.02, 1.0), moves=moves)
@@ -290,7 +269,7 @@ def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, move
         ]
         assert slides[0] < slip < 10.0 * slip < slides[1]
         assert float(gaps[:, 2].min()) < D < float(gaps[-1, 2].min())
-    compare(losses, values, sizes)
+    check_slopes(losses, values, sizes)
 
 
 BEAM = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
@@ -334,7 +313,7 @@ def test_gradients_of_a_leaning_beam_with_friction():
     ]
     assert bool((aside[0] < 0.9 * aside[1]).all())
     sizes = {"push": 1e-5, "friction": 1e-4, "shift": 1e-7, "stiffness": 5.0, "young": 1.0}
-    compare(lambda values: (weights * solve(values)[1]).flatten(1).sum(1), values, sizes)
+    check_slopes(lambda values: (weights * solve(values)[1]).flatten(1).sum(1), values, sizes)
 
 
 def test_a_free_block_rests_on_a_floor_by_friction():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from support.chambered import BRICK, KINDS, chambered, hollow_box
+from support.slopes import check_slopes
 from warp_resphys import Body, Corotated, Inputs, Pressure, Simulator, SolverSettings
 from warp_resphys.energies.fibres import Fibres
 from warp_resphys.energies.placement import PlacedEnergy
@@ -106,23 +107,12 @@ def test_gradients_with_fibres(kind, taut):
     values = {"pressure": s.tensor([[2e4, 1e4]]), "stiffness": s.tensor([2e3, 1e3]), "q": start}
     weights = noise(*start.shape)
 
-    def loss(**changed):
-        x = {**values, **changed}
-        inputs, parameters = Inputs(pressure=x["pressure"]), {"fibre_stiffness": x["stiffness"]}
-        end = s.rollout(State(x["q"], 0.0 * start), 3, inputs, parameters)
+    def loss(given):
+        inputs, parameters = Inputs(pressure=given["pressure"]), {"fibre_stiffness": given["stiffness"]}
+        end = s.rollout(State(given["q"], 0.0 * start), 3, inputs, parameters)
         return (weights * end.q[-1]).sum()
 
-    for name, value in values.items():
-        variable = value.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(loss(**{name: variable}), variable)
-        direction = noise(*value.shape, seed=1) * float(value.abs().mean()) * (1e-3 if taut else 1e-4)
-
-        def along(k, name=name, value=value, direction=direction):
-            return float(loss(**{name: value + k * direction}))
-
-        with torch.no_grad():
-            difference, _ = central_difference(along)
-        assert float((gradient * direction).sum()) == pytest.approx(difference, rel=1e-6)
+    check_slopes(loss, values, {name: 1e-4 * float(value.abs().mean()) for name, value in values.items()})
 
 
 @pytest.mark.parametrize("kind", KINDS)

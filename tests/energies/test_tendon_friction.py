@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.slopes import check_slopes
 from warp_resphys import (
     Body,
     Corotated,
@@ -19,7 +20,7 @@ from warp_resphys import (
 )
 from warp_resphys.dynamics import statics
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.studies.gradient_check import central_difference, check_gradients
+from warp_resphys.studies.gradient_check import check_gradients
 
 SIZE = (0.12, 0.04, 0.02)
 BEAM = box_hexahedra(SIZE, (6, 2, 1))
@@ -131,37 +132,26 @@ def test_gradients_of_a_rollout_equal_differences(integrator, routes, more):
 
 def test_gradients_of_a_pose_equal_differences():
     s = simulator(STRAIGHT, stiffness=400.0, entry_angle=0.2, directions=[[[0.0, 0.0, -1.0]]])
-    base = {"tendon_friction": MU, "youngs_modulus": 264e3, "tendon_offset_1": 0.0, "tension": 1.5, "shorter": 2e-3}
-    steps = {"tendon_friction": 0.1, "youngs_modulus": 2e4, "tendon_offset_1": 1e-3, "tension": 0.1, "shorter": 1e-3}
+    values = {"tendon_friction": MU, "youngs_modulus": 264e3, "tendon_offset_1": 0.0, "tension": 1.5, "shorter": 8e-3}
+    sizes = {"tendon_friction": 1e-2, "youngs_modulus": 2e3, "tendon_offset_1": 1e-4, "tension": 1e-2, "shorter": 1e-4}
+    weights = torch.linspace(-1.0, 1.0, s.rest_positions.numel()).double().reshape(s.rest_positions.shape)
 
-    def loss(values):
-        parameters = {name: value for name, value in values.items() if name not in ("tension", "shorter")}
-        pull, shorter = (
-            torch.as_tensor(values.get(name, 0.0), dtype=torch.float64).reshape(1, 1) for name in ("tension", "shorter")
-        )
-        q = s.static_equilibrium(Inputs(tendon_tension=pull, tendon_contraction=shorter), parameters).q
-        return (q[0] * torch.linspace(-1.0, 1.0, q[0].numel()).double().reshape(q[0].shape)).sum()
+    def loss(given):
+        parameters = {name: given[name] for name in ("tendon_friction", "youngs_modulus", "tendon_offset_1")}
+        acting = Inputs(tendon_tension=given["tension"][None], tendon_contraction=given["shorter"][None])
+        return (s.static_equilibrium(acting, parameters).q[0] * weights).sum()
 
-    for name, value in base.items():
-        variable = torch.tensor([value], dtype=torch.float64, requires_grad=True)
-        (gradient,) = torch.autograd.grad(loss(base | {name: variable}), variable)
-        difference, _ = central_difference(
-            lambda x, name=name: float(loss(base | {name: base[name] + x * steps[name]}))
-        )
-        assert float(gradient) * steps[name] == pytest.approx(difference, rel=1e-6), name
+    check_slopes(loss, {name: torch.tensor([value]).double() for name, value in values.items()}, sizes)
 
 
 def test_gradients_from_a_straight_rest_are_finite_and_right():
     """Angles are zero there, where that of a chord has no derivative."""
     s = simulator(STRAIGHT)
-    pull = torch.tensor([[0.5]], dtype=torch.float64, requires_grad=True)
 
-    def loss(pull):
-        return s.rollout(s.rest_state(), 4, Inputs(tendon_tension=pull)).q[-1].square().sum()
+    def loss(given):
+        return s.rollout(s.rest_state(), 4, Inputs(tendon_tension=given["pull"])).q[-1].square().sum()
 
-    (gradient,) = torch.autograd.grad(loss(pull), pull)
-    difference, _ = central_difference(lambda x: float(loss(pull.detach() + 0.05 * x)))
-    assert 0.05 * float(gradient) == pytest.approx(difference, rel=1e-6)
+    check_slopes(loss, {"pull": torch.tensor([[0.5]], dtype=torch.float64)}, {"pull": 0.02})
 
 
 @pytest.mark.parametrize(

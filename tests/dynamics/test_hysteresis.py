@@ -135,12 +135,20 @@ def test_a_slider_that_sticks_is_a_spring_for_every_integrator():
         torch.testing.assert_close(ends[0], ends[1], rtol=0.0, atol=1e-9)
 
 
-def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments():
-    simulator = Simulator(CLAMPED, TWO_SLIDERS, integrator="bdf2", solver=TIGHT)
+@pytest.mark.parametrize(
+    ("material", "memory"),
+    [
+        (TWO_SLIDERS, "plastic_strain"),
+        (replace(TWO_SLIDERS, hysteresis=(), prony=[(0.4, 0.02), (0.2, 0.3)]), "viscous_strain"),
+    ],
+    ids=["sliders", "branches"],
+)
+def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments(material, memory):
+    simulator = Simulator(CLAMPED, material, integrator="bdf2", solver=TIGHT)
     forces = torch.cat([pull(0.2).external_force, pull(-0.1).external_force])
     whole = simulator.rollout(simulator.rest_state(2), 8, Inputs(forces))
     half = simulator.rollout(simulator.rest_state(2), 4, Inputs(forces)).final
-    assert half.memory["plastic_strain"].shape[:2] == (2, 2)
+    assert half.memory[memory].shape[:2] == (2, 2)
     again = State.from_tensors({name: tensor.clone() for name, tensor in half.tensors().items()})
     torch.testing.assert_close(simulator.rollout(again, 4, Inputs(forces)).q[-1], whole.q[-1], rtol=0, atol=1e-11)
     forgotten = replace(again, memory={})

@@ -44,11 +44,17 @@ def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
 
 
 @pytest.mark.parametrize(
-    ("integrator", "order", "moving"), [("implicit_euler", 1, False), ("bdf2", 2, True), ("midpoint", 2, True)]
+    ("integrator", "order", "moving", "prony"),
+    [
+        ("implicit_euler", 1, False, ()),
+        *((integrator, 2, True, ()) for integrator in ("bdf2", "midpoint")),
+        *((integrator, 2, False, [(0.4, 0.02), (0.2, 0.3)]) for integrator in ("bdf2", "midpoint")),
+    ],
 )
-def test_order_of_convergence(integrator, order, moving):
-    """Large rotations and strains with both dampings: positions and velocities converge at the method's order."""
-    results = [swing(integrator, steps, moving=moving) for steps in (32, 64, 128)]
+def test_order_of_convergence(integrator, order, moving, prony):
+    """Large rotations and strains, dampings and branches: positions and velocities converge at the order."""
+    material = replace(SOFT, prony=prony)
+    results = [swing(integrator, steps, material, moving=moving) for steps in (32, 64, 128)]
     free = torch.as_tensor(np.setdiff1d(np.arange(len(MESH.vertices)), CLAMPED.fixed_vertices))
     for quantity in (0, 1):
         coarse, middle, fine = (r[quantity][:, free] for r in results)

@@ -1,16 +1,12 @@
 """Prony branches against closed forms, their gradients, and what becomes of them between steps."""
 
-import cmath
-import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
@@ -38,49 +34,23 @@ def sag(q):
     return q[..., TIP, 2].mean(-1) - float(np.mean(MESH.vertices[TIP, 2]))
 
 
-def test_a_load_creeps_as_the_standard_linear_solid():
-    """A step of load gives 1 - g / (1 + g) exp(-t / (tau (1 + g))) of what it gives in the end."""
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_load_creeps_as_the_standard_linear_solid(integrator):
+    """A step of load gives 1 - g / (1 + g) exp(-t / (tau (1 + g))) of what it gives in the end.
+
+    Means of two steps are compared, about which the midpoint rule goes to and fro.
+    """
     (ratio, time), h = CREEPING.prony[0], 0.01
     light = replace(CREEPING, density=1e-3)  # without inertia
-    simulator = Simulator(CLAMPED, light, h, WEIGHTLESS, "bdf2", TIGHT)
+    simulator = Simulator(CLAMPED, light, h, WEIGHTLESS, integrator, TIGHT)
     sags = sag(simulator.rollout(simulator.rest_state(), 60, pull(1e-4)).q[1:, 0])
     end = sag(simulator.static_equilibrium(pull(1e-4)).q[0])
     t = h * torch.arange(1, 61, dtype=torch.float64)
     expected = 1.0 - ratio / (1.0 + ratio) * torch.exp(-t / (time * (1.0 + ratio)))
-    np.testing.assert_allclose(sags / end, expected, atol=1e-2)
-    np.testing.assert_allclose((sags / end)[20:], expected[20:], atol=4e-3)
-    assert float(sags[0] / end) < 0.7  # without creep it would be there at once
-
-
-def test_a_small_vibration_has_the_complex_modulus():
-    """Of omega^2 = omega_0^2 (1 + g i omega tau / (1 + i omega tau)), the root says period and decay."""
-    h, (ratio, time) = 5e-4, (0.3, 0.01)
-    elastic = Simulator(CLAMPED, ELASTIC, h, WEIGHTLESS, "midpoint", TIGHT)
-    forces = vibration_modes(elastic, 1)[:, 0].view(-1, 3)  # the inertia of the slowest vibration
-    mode = forces / elastic.prepare().mass[0, :, None]
-    rest = elastic.rest_state()
-    start = replace(rest, q=rest.q + 1e-5 * mode / mode.abs().max())
-
-    def exponent(material, steps=400):
-        """Frequency and decay, from the passages through zero and the peaks between."""
-        moved = replace(elastic, material=material).rollout(start, steps).q[:, 0] - rest.q[0]
-        q = (moved * forces).sum((1, 2)).numpy()
-        crossings = np.flatnonzero(q[:-1] * q[1:] < 0)
-        at = crossings + q[crossings] / (q[crossings] - q[crossings + 1])
-        peaks = [np.abs(q[a:b]).max() for a, b in pairwise(crossings)]
-        omega = math.pi / (h * np.diff(at).mean())
-        decay = -np.polyfit(h * at[:-1], np.log(peaks), 1)[0]
-        return omega, decay
-
-    omega_0, lost = exponent(ELASTIC)
-    assert lost < 0.1
-    omega = complex(omega_0)
-    for _ in range(100):
-        omega = omega_0 * cmath.sqrt(1.0 + ratio * 1j * omega * time / (1.0 + 1j * omega * time))
-    rate = exponent(replace(ELASTIC, prony=[(ratio, time)]))
-    assert omega.imag > 3.0  # otherwise nothing is seen
-    assert rate[0] == pytest.approx(omega.real, rel=5e-3)
-    assert rate[1] == pytest.approx(omega.imag, rel=0.03)
+    shares, expected = (0.5 * (s[1:] + s[:-1]) for s in (sags / end, expected))
+    np.testing.assert_allclose(shares, expected, atol=1e-2)
+    np.testing.assert_allclose(shares[20:], expected[20:], atol=4e-3)
+    assert float(shares[0]) < 0.7  # without creep it would be there at once
 
 
 def test_a_branch_much_shorter_than_a_step_is_kelvin_voigt_viscosity():
@@ -90,20 +60,6 @@ def test_a_branch_much_shorter_than_a_step_is_kelvin_voigt_viscosity():
     positions = [Simulator(CLAMPED, m, solver=TIGHT).rollout(state, 5).q[-1] for m in (maxwell, kelvin, ELASTIC)]
     torch.testing.assert_close(positions[0], positions[1], rtol=0.0, atol=1e-9)
     assert float((positions[1] - positions[2]).abs().max()) > 1e-4
-
-
-@pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
-def test_the_order_of_an_integrator_is_kept(integrator):
-    ends = []
-    damped = replace(TWO_BRANCHES, poissons_ratio=0.3, stiffness_damping=3e-3)  # fast vibrations die out
-    for steps in (32, 64, 128):
-        simulator = Simulator(CLAMPED, damped, 0.04 / steps, integrator=integrator, solver=TIGHT)
-        state = simulator.rest_state()
-        x = state.q[..., :1] / 0.04
-        state = replace(state, v=1.5 * torch.cat([0 * x, x**2, -0.5 * x**2], dim=-1))
-        ends.append(simulator.rollout(state, steps).q[-1])
-    coarse, fine = ((ends[i] - ends[i + 1]).abs().max() for i in (0, 1))
-    assert float(torch.log2(coarse / fine)) == pytest.approx(2.0, abs=0.3)
 
 
 def test_the_state_of_the_branches_turns_with_the_body():
@@ -116,17 +72,6 @@ def test_the_state_of_the_branches_turns_with_the_body():
     first = simulator.rollout(carried, 5, parameters={"gravity": gravity})
     second = simulator.rollout(turned, 5, parameters={"gravity": gravity @ turn.T})
     torch.testing.assert_close(second.q[-1], first.q[-1] @ turn.T, rtol=0.0, atol=1e-10)
-
-
-def test_a_roll_out_goes_on_from_its_last_state():
-    simulator = Simulator(CLAMPED, TWO_BRANCHES, integrator="bdf2", solver=TIGHT)
-    whole = simulator.rollout(simulator.rest_state(2), 8, pull(0.2, 2))
-    half = simulator.rollout(simulator.rest_state(2), 4, pull(0.2, 2)).final
-    assert half.memory["viscous_strain"].shape[:2] == (2, 2)
-    again = State.from_tensors({name: tensor.clone() for name, tensor in half.tensors().items()})
-    torch.testing.assert_close(simulator.rollout(again, 4, pull(0.2, 2)).q[-1], whole.q[-1], rtol=0.0, atol=1e-11)
-    relaxed = replace(again, memory={})
-    assert float((simulator.rollout(relaxed, 4, pull(0.2, 2)).q[-1] - whole.q[-1]).abs().max()) > 1e-5
 
 
 def test_poses_know_nothing_of_branches_and_branches_that_do_nothing_cost_nothing():

@@ -78,18 +78,6 @@ def test_a_contraction_shares_the_strain_with_the_solid():
     assert slack == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize(("pull", "modulus"), [(1.0, 3.0 * MODULUS), (-1.0, MODULUS)])
-def test_fibres_of_a_stiffness_reinforce_what_is_stretched_alone(pull, modulus):
-    sim = simulator(whole(BEAM), stiffness=2.0 * MODULUS, toe=1e-9)
-    tip, force = select_vertices(BEAM, x=SIZE[0]), torch.zeros(1, len(BEAM.vertices), 3, dtype=torch.float64)
-    share = np.where(np.isin(BEAM.vertices[tip][:, 1:], (0.0, SIZE[1])).all(1), 1.0, 2.0)
-    share[(BEAM.vertices[tip][:, 1:] == SIZE[1] / 2).all(1)] = 4.0
-    force[0, tip, 0] = pull * torch.as_tensor(share / share.sum())
-    ratio, off = stretch(sim, Inputs(external_force=force))
-    assert ratio == pytest.approx(1.0 + pull / (modulus * SIZE[1] * SIZE[2]), abs=1e-6)
-    assert off < 1e-8
-
-
 @pytest.mark.parametrize(("integrator", "start"), [*zip(INTEGRATORS, POSES, strict=True)])
 def test_gradients(start, integrator):
     solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra, check_mesh
+from warp_resphys.mesh.mesh import boundary_triangles, check_mesh
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.mesh.rod import boxes_hexahedra
 
@@ -33,12 +33,6 @@ def test_a_cross_with_a_fin_is_filled_without_cracks(size, nodes):
     assert area(mesh) == pytest.approx(2 * section + around * 0.06 + 2 * (0.01 + 0.03) * 0.02, rel=1e-9)
     corners = mesh.vertices[mesh.cells[:, :8]]
     assert (corners.max(1) - corners.min(1)).max() <= size + 1e-12
-
-
-def test_one_box_is_a_box():
-    mesh, box = boxes_hexahedra([((0, 0, 0), (0.1, 0.03, 0.03))], 0.01), box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
-    np.testing.assert_allclose(mesh.vertices, box.vertices, atol=1e-15)
-    np.testing.assert_array_equal(mesh.cells, box.cells)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Closed surfaces filled with tetrahedra."""
 
-import sys
-
 import numpy as np
 import pytest
 import trimesh
@@ -91,12 +89,6 @@ def test_files_that_are_no_closed_surface(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(MeshError, match="export"):
             fill_surface(tmp_path / name, 0.01)
-
-
-def test_without_gmsh_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "gmsh", None)
-    with pytest.raises(MeshError, match=r"tetrahedra of .*robot.stl need gmsh, which cannot be imported .*pip install"):
-        fill_surface(written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0))), 0.01, "mm")
 
 
 @pytest.mark.usefixtures("_gmsh")

@@ -50,13 +50,6 @@ def test_a_marker_is_at_its_pinhole_projection():
     np.testing.assert_allclose(shown, np.column_stack([FOCAL * x / z, FOCAL * y / z]) + CENTRE, rtol=1e-12)
 
 
-def test_the_derivative_is_that_of_differences():
-    sees, at = camera(), torch.as_tensor(MESH.vertices)[None]
-    way = torch.as_tensor(np.random.default_rng(1).normal(size=at.shape))
-    numeric = (sees(at + 1e-6 * way) - sees(at - 1e-6 * way)).flatten() / 2e-6
-    torch.testing.assert_close(sees.transposed_jacobian(at)[0].T @ way.flatten(), numeric, rtol=1e-7, atol=1e-5)
-
-
 def test_youngs_modulus_is_recovered_from_pixels():
     # A hundred and fifty numbers with noise of a pixel, while the tip moves by some twenty.
     result = wr.identify(beam(180e3), let_go(noise=1.0), {"youngs_modulus": (1e5, 1e6)})

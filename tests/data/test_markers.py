@@ -79,17 +79,16 @@ def test_derivatives(kind):
     """At rest, where the square face that the rigid ones follow is symmetric, bent, twisted and turned far."""
     markers, q = bind(kind), poses(MESH)
     step = 1e-6
-    for seed in (0,):
-        direction = torch.randn(q.shape, generator=torch.Generator().manual_seed(seed), dtype=q.dtype)
-        expected = (markers(q + step * direction) - markers(q - step * direction)) / (2.0 * step)
-        transposed = markers.transposed_jacobian(q)
-        assert transposed.shape == (4, q[0].numel(), POINTS.size)
-        result = (transposed.mT @ direction.flatten(1)[:, :, None]).view_as(expected)
-        np.testing.assert_allclose(result, expected, rtol=0, atol=2e-6)
-        along = q.clone().requires_grad_(True)
-        weights = torch.randn(expected.shape, generator=torch.Generator().manual_seed(9 + seed), dtype=q.dtype)
-        (markers(along) * weights).sum().backward()
-        assert float((along.grad * direction).sum()) == pytest.approx(float((expected * weights).sum()), rel=1e-6)
+    direction = torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    expected = (markers(q + step * direction) - markers(q - step * direction)) / (2.0 * step)
+    transposed = markers.transposed_jacobian(q)
+    assert transposed.shape == (4, q[0].numel(), POINTS.size)
+    result = (transposed.mT @ direction.flatten(1)[:, :, None]).view_as(expected)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=2e-6)
+    along = q.clone().requires_grad_(True)
+    weights = torch.randn(expected.shape, generator=torch.Generator().manual_seed(9), dtype=q.dtype)
+    (markers(along) * weights).sum().backward()
+    assert float((along.grad * direction).sum()) == pytest.approx(float((expected * weights).sum()), rel=1e-6)
 
 
 def test_a_stem_along_the_normal_turns_with_it_and_keeps_its_length():

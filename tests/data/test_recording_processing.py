@@ -4,7 +4,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release
+from warp_resphys.data.recordings.processing import (
+    Release,
+    fill_gaps,
+    find_release,
+    release_of,
+    resample,
+    trim_to_release,
+)
 from warp_resphys.data.recordings.quality import (
     check_base,
     compare_base,
@@ -216,3 +223,28 @@ def test_base_markers_that_were_moved():
     bumped.positions[:, 3] = np.nan
     with pytest.raises(DataFileError, match="'base 2' is never seen"):
         check_base([first, bumped], BASE)
+
+
+@pytest.mark.parametrize("release", [60.0, 60.5])
+def test_release_of_a_free_fall_is_found_between_frames(release):
+    time = np.maximum(np.arange(120) - release, 0.0) / 100.0
+    path = np.zeros((120, 3))
+    path[:, 2] = -0.01 * (1.0 - np.cos(48.0 * time) * np.exp(-2.5 * time))
+    path += np.random.default_rng(0).normal(scale=5e-6, size=path.shape)
+    path[:13] += [0.0, 3e-4, 0.0]  # a marker that was mistaken at first
+    path[30, 2] += 8e-3  # one sample gone astray
+    result = find_release(path, 100.0)
+    assert result.frame == pytest.approx(release, abs=0.25)
+    assert 13 <= result.rest[0] < result.rest[1] <= 61
+
+
+def test_no_release():
+    still = np.random.default_rng(0).normal(scale=1e-5, size=(200, 3))
+    with pytest.raises(DataFileError, match=r"never moves by more than 0\.\d\d mm"):
+        find_release(still, 100.0)
+    swinging = np.zeros((200, 3))
+    swinging[:, 2] = 0.01 * np.cos(0.5 * np.arange(200))
+    with pytest.raises(DataFileError, match="not still"):
+        find_release(swinging, 100.0)
+    with pytest.raises(DataFileError, match="No release"):
+        find_release(still[:1], 100.0)

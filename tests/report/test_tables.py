@@ -5,8 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from support.made_up_run import vertex_settings, write_vertex_run
+from support.report_page import report
 from warp_resphys.data.recordings.quality import quality_table
 from warp_resphys.io.errors import InputError
+from warp_resphys.io.files import write_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, median_filter, published_errors
 from warp_resphys.mesh.mesh import box_hexahedra
@@ -24,7 +27,11 @@ from warp_resphys.report.sections import (
     published_beside,
     published_growth,
     residual_table,
+    rest_table,
     scale_table,
+    shapes_table,
+    share_text,
+    trials_section,
 )
 from warp_resphys.settings.learning import RangeSettings
 
@@ -309,3 +316,80 @@ def test_published_growth_and_filtered_errors():
     assert largest_filtered({}) == ""
     filtered = largest_filtered({"median_filtered": {"resphys": 1.5, "sysid": None}})
     assert "reaches 1.500 mm (ResPhys)" in filtered.replace(NO_BREAK_SPACE, " ")
+
+
+def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
+    rows = [
+        {"name": name, "errors_mm": {"sysid": error}, "amplitude_mm": 20.0} for name, error in [("a", 1.0), ("b", 2.0)]
+    ]
+    covered = {"models": {"sysid": {"by_trial": {"a": 0.93}}}}
+    metrics = {"per_trajectory": rows, "errors_mm": {"sysid": {"mean": 1.5}}, "intervals": covered}
+    data = SimpleNamespace(metrics=metrics, others=("b",), pages={}, driven=None)
+    (table,) = trials_section(data, None).blocks
+    assert [(row.head, row.cells[0].text, row.small) for row in table.rows] == [
+        ("a", "1.000", "amplitude 20 mm, coverage 93 %"),
+        ("b", "2.000", "amplitude 20 mm, other loads"),
+    ]
+    assert trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None) is None
+
+
+def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
+    def fit(name, error, **left):
+        return {"name": name, "as_is_mm": error, "left_mm": left, "values": {"scale": 0.05, "zero": 2.0}}
+
+    quantity = SimpleNamespace(shown=lambda value: f"{value:g} kPa")
+    fits = {"sysid": [fit("a", 2.0, scale=1.0, zero=0.5), fit("b", 4.0, scale=1.0)], "simulation": [fit("a", 9.0)]}
+    (table,) = rest_table(fits, quantity)
+    assert table.columns == ["As it is", "Refitted gain", "Refitted offset"]
+    assert [[(cell.text, cell.small) for cell in row.cells] for row in table.rows] == [
+        [("2.000", ""), ("1.000", "+5.0 %"), ("0.500", "2 kPa")],
+        [("4.000", ""), ("1.000", "+5.0 %"), (NONE, "")],
+        [("3.000", ""), ("1.000", ""), ("2.250", "")],
+    ]
+    assert rest_table({}, None) == rest_table({"sysid": [fit("a", 2.0)]}, None) == []
+
+
+def result(simulation, sysid=None, law=None, **more):
+    errors = {"simulation": simulation, "sysid": sysid, "law": law}
+    kept = {model: error for model, error in errors.items() if error is not None}
+    return {"vertices": 225, "moved_mm": 12.5, "errors_mm": kept, **more}
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (0.5, "50 %"),
+        (0.897, "90 %"),
+        (0.9958, "99.58 %"),
+        (0.99976, "99.976 %"),
+        (1.0, "100 %"),
+        (-0.2, "\N{MINUS SIGN}20 %"),
+    ],
+)
+def test_shares_have_digits_for_what_is_left(share, text):
+    assert share_text(share) == text
+
+
+def test_a_model_that_diverges_on_a_body():
+    lost = result(1.0, 0.2)
+    lost["errors_mm"]["law"] = None
+    rows = {row.head: [cell.text for cell in row.cells] for row in shapes_table({"rod": lost}).rows}
+    assert rows == {"rod": ["1.000", "0.200", "diverged"]}
+
+
+@pytest.mark.usefixtures("no_drawing")
+def test_page_has_the_bodies(tmp_path):
+    write_vertex_run(tmp_path, vertex_settings(), models=("simulation", "simfree", "resphys"))
+    found = {"thin <beam>": result(1.5, 0.3, 0.015, outside=0.12), "L": result(2.0, 0.5, 0.002, outside=0.0)}
+    write_json(tmp_path / "shapes.json", found)
+    shape = {"mesh": vertex_settings().mesh, "fixed": {"x": 0.0}, "held": {"twist_deg": 10.0}}
+    ranges = {"youngs_modulus": {"lower": 1e5, "upper": 1e6}}
+    page = report(tmp_path, vertex_settings().changed(identify={"parameters": ranges}, shapes={"thin": shape}))
+    for said in (
+        "Other bodies of the same material",
+        "thin <beam>",
+        "removes 99.0 %",
+        "225 vertices, moves by 12.5 mm",
+    ):
+        assert said in page.text
+    assert "was learned at, with the share of cells and times: thin <beam> (12 %)." in page.text

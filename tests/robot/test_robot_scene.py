@@ -1,4 +1,6 @@
-"""Robots in one scene: without contact they move as they do alone; in contact they push one another."""
+"""Robots in one scene, alone and in contact, and the material of a robot on another body."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,8 +8,18 @@ import torch
 
 import warp_resphys
 from support.configured import settings
-from warp_resphys import Body, Corotated, Inputs, RobotScene, SurfaceContact, box_hexahedra
-from warp_resphys.io.errors import InputError
+from warp_resphys import (
+    Body,
+    Corotated,
+    Inputs,
+    RobotScene,
+    Simulator,
+    SurfaceContact,
+    box_hexahedra,
+    select_vertices,
+)
+from warp_resphys.energies.materials import ConvexMaterial
+from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import MaterialSettings, SimulatorSettings
@@ -18,10 +30,10 @@ SIZE = (0.1, 0.02, 0.02)  # m
 CONTACT = SurfaceContact(1e5, 0.3, distance=1e-3, slip_speed=1e-2)
 
 
-def beam(*given, model="corotated", **constants):
+def beam(*given):
     """A clamped beam as a robot without a learned force."""
     run = settings(f"mesh={{kind:box_hexahedra,size:{list(SIZE)},divisions:[5,1,1]}}", "integrator=bdf2", *given)
-    own = MaterialSettings.model_validate({**run.simulation.plain(), "model": model, **constants})
+    own = MaterialSettings.model_validate({**run.simulation.plain(), "model": "corotated"})
     return Robot(Description("beam", "sysid", SimulatorSettings.of(run), own, box_hexahedra(SIZE, (5, 1, 1))))
 
 
@@ -123,3 +135,31 @@ def test_what_does_not_fit_is_refused(finished):
         scene.begin(inputs={"hand": {}})
     with pytest.raises(InputError, match=r"surfaces cross at rest: an edge at vertex \d+ in 'one' .* in 'two'"):
         RobotScene({"one": (robot, AWAY), "two": (robot, AWAY)}, {}, CONTACT)
+
+
+LAW = {"c10": 30e3, "ogden_3": 20e3, "bulk_1": 4e6, "prony_modulus_1": 1e4, "prony_time_1": 0.05, "density": 1000.0}
+LONG = box_hexahedra((0.15, 0.02, 0.02), (6, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def of_a_law():
+    """A beam with an identified law and a damping that is its own."""
+    law = MaterialSettings.model_validate({"model": "law", **LAW, "mass_damping": 9.0})
+    return Robot(replace(beam().description, material=law, parameters={"c10": 44e3, "mass_damping": 9.0}))
+
+
+def test_its_law_moves_another_body_as_a_simulator_of_it_does(of_a_law):
+    other = of_a_law.on(LONG, fixed={"x": 0.0})
+    material = ConvexMaterial(44e3, bulk_1=4e6, density=1000.0, ogden={3: 20e3}, prony=[(1e4, 0.05)])
+    alone = Simulator(Body(LONG, fixed=select_vertices(LONG, x=0.0)), material, integrator="bdf2")
+    state, expected = other.state(LONG.vertices), alone.rest_state()
+    for _ in range(3):
+        state, expected = other.step(state), alone.step(expected)[0]
+    torch.testing.assert_close(state.q, expected.q, rtol=0.0, atol=1e-9)
+    assert (state.q - alone.rest_positions).abs().max() > 1e-3
+    kept = other.description
+    assert (kept.learned, kept.markers, kept.intervals) == (None, None, None)
+    with pytest.raises(InputError, match="no_such_key"):
+        of_a_law.on(LONG, no_such_key=1)
+    with pytest.raises(MeshError, match="no vertex"):
+        of_a_law.on(LONG, fixed={"x": 5.0})

@@ -10,7 +10,7 @@ from support.command_line import refusal, settings_of
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm, name_surfaces
 from warp_resphys.mesh.cavities import open_cavities
-from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic, select_vertices
+from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from warp_resphys.studies.inspection import Inspection, inspect, inspect_mesh
@@ -187,11 +187,3 @@ def test_a_file_of_a_surface_is_filled(tmp_path):
     rows = inspected(f"files=[{tmp_path / 'box.stl'}]", "mesh.size=0.01")
     assert rows["cells"].endswith("tetrahedron10")
     assert rows["volume"] == "8.0 cm3"
-
-
-def test_a_place_without_vertices_proposes_a_range():
-    """The range lies within the mesh, and finds vertices."""
-    mesh = box_hexahedra((0.1, 0.03, 0.03), (20, 2, 2))
-    with pytest.raises(MeshError, match=r"give a range for a face that is not flat, as in x=\[0, 0\.01\]"):
-        select_vertices(mesh, x=-0.2)
-    assert len(select_vertices(mesh, x=(0.0, 0.01)))

@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from support.configured import composed
+from support.configured import settings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.experiment.files import Dataset
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
-from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import marker_errors, median_filter, summarise, summarise_trajectories
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.data import mean_distance
-from warp_resphys.settings.run import RunSettings
 
 GRAVITY = np.array([0.0, 0.02, -9.8])
 
@@ -82,9 +80,12 @@ def _errors(simulated, measured, names, labels=()):
     return content
 
 
-TRIALS = {"bare": 0.0, "load52": 0.0520154, "load101": 0.1020303}
-TRACKED = {"Tip - 1": [0.1, 0.015, 0.036], "Tip - 2": [0.1, -0.006, 0.024], "Tip - 3": [0.1, 0.036, 0.006]}
-REFERENCE = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], "Base - 3": [0.006, 0.04, 0.0]}
+BEAM = settings(
+    *("experiment=beam_real", "mesh.divisions=[6,2,2]", "data.folder=recordings", "data.seconds=0.4"),
+    *("data.folds=null", "in_the_loop.epochs=5", "time_step=0.01"),
+)
+TRIALS = {name: trial.payload for name, trial in BEAM.data.trials.items()}
+TRACKED, REFERENCE = BEAM.markers.plain()["tracked"], BEAM.markers.plain()["reference"]
 STEP, SECONDS, FRAMES = 0.01, 0.4, 45
 BOUND = np.array(list(TRACKED.values())) + 1e-4
 _SWINGS = {  # Period, damping and level of a model of the beam, over those of the reality.
@@ -98,23 +99,6 @@ _SWINGS = {  # Period, damping and level of a model of the beam, over those of t
 }
 BEAM_MODELS = tuple(_SWINGS)
 _FOUND = {"youngs_modulus": 251.3e3, "poissons_ratio": 0.499, "mass_damping": 0.94, "stiffness_damping": 2.9e-3}
-
-
-def beam_settings(**data):
-    """Settings of an experiment on recordings of a beam that is let go."""
-    plain = composed("mesh.divisions=[6,2,2]")
-    published = {**plain["simulation"], "youngs_modulus": 215e3, "poissons_ratio": 0.45}
-    plain |= {
-        "name": "beam_real",
-        "title": "Real beam",
-        "simulation": {**plain["simulation"], "youngs_modulus": 264e3, "poissons_ratio": 0.499},
-        "published": {"simulation": published, "physics": {}, "integrator": "implicit_euler"},
-        "markers": {"tracked": TRACKED, "reference": REFERENCE},
-        "in_the_loop": {"epochs": 5},
-        "data": {"kind": "recorded", "folder": "recordings", "seconds": SECONDS, "folds": None, **data},
-        "time_step": STEP,
-    }
-    return parse(RunSettings, plain)
 
 
 def sag(rest, times, payload, model=None):
@@ -212,16 +196,6 @@ def write_folds(folder: Path, models=BEAM_MODELS):
 
 ARM_MODELS = ("simulation", "sysid", "simfree", "resphys")
 ARM_STEP, LIMIT = 0.02, 20e3
-BASE = {"Base - 1": [-0.03, -0.02, -0.005], "Base - 2": [-0.03, 0.02, -0.005], "Base - 3": [0.03, 0.0, -0.005]}
-LABORATORY = {
-    "mesh": {"kind": "arm_generated"},
-    "time_step": 0.01,
-    "integrator": "bdf2",
-    "material": {},
-    "fibres": {"angles": [8.0], "stiffness": 1e4},
-    "noise": 0.0,
-    "placement_noise": 0.0,
-}
 _BENDS = {  # Size and lag [s] of a model of the arm, beside the reality.
     None: (1.0, 0.0),
     "simulation": (1.35, 0.08),
@@ -231,32 +205,10 @@ _BENDS = {  # Size and lag [s] of a model of the arm, beside the reality.
 }
 
 
-def data(**changes):
-    """The settings group ``data`` of an arm."""
-    own = {"folder": None, "input_limit": LIMIT, "train_fraction": 1.0, "input_scales": []}
-    return {"kind": "recorded", **own, **changes}
-
-
-def arm_settings(name="sopra", chambers=6, **changes):
+def arm_settings(*overrides, name="sopra"):
     """Settings of an experiment on the arm that comes with the package."""
-    heights, radii = (-0.13, -0.15, -0.27), (0.022, 0.022, 0.018)
-    tracked = {
-        f"Ring {k + 1} - {at + 1}": [radii[k] * np.cos(0.3 + 1.6 * at), radii[k] * np.sin(0.3 + 1.6 * at), heights[k]]
-        for k in range(3)
-        for at in range(4)
-    }
-    plain = composed("mesh=arm_coarse")
-    plain |= {
-        "name": name,
-        "title": "Pneumatic arm",
-        "fixed": {"z": 0.0},
-        "markers": {"tracked": tracked, "reference": BASE},
-        "laboratory": LABORATORY,
-        "chambers": {"count": chambers, "axis": [0.0, 0.0, -1.0]},
-        "data": data(),
-        "time_step": ARM_STEP,
-    }
-    return parse(RunSettings, {**plain, **changes})
+    own = (f"data.input_limit={LIMIT}", "data.input_scales=[]", "data.train_fraction=1", f"time_step={ARM_STEP}")
+    return settings(f"experiment={name}", "mesh=arm_coarse", *own, *overrides)
 
 
 def pressures(trials, steps, chambers, factor=1.0):
@@ -288,7 +240,7 @@ def bent(points, pressure, model=None, sag=0.0):
 
 def write_arm_run(
     folder: Path,
-    settings,
+    run,
     *,
     train=2,
     test=3,
@@ -302,9 +254,9 @@ def write_arm_run(
     sag=0.0,
 ):
     """Writes all files of a run of an arm; bodies hang lower by the sag [m]."""
-    mesh, rng = build_mesh(settings.mesh), np.random.default_rng(0)
-    labels = list(settings.markers.tracked)
-    bound = np.array(list(settings.markers.tracked.values())) + 1e-4
+    mesh, rng = build_mesh(run.mesh), np.random.default_rng(0)
+    labels = list(run.markers.tracked)
+    bound = np.array(list(run.markers.tracked.values())) + 1e-4
     nominal = [f"test_{number:02d}" for number in range(test)]
     driven = pressures([*(f"train_{n:02d}" for n in range(train)), *nominal], steps, chambers)
     for scale in scales:
@@ -328,9 +280,7 @@ def write_arm_run(
         observed[model][0, 60:] = films[model][film >= 60] = np.nan
     _write_rollouts(folder, rolled, ARM_STEP, film, rolled[0], observed, films)
     write_json(folder / "errors.json", _arm_errors(observed, markers[train:], rolled, test, labels, scales, horizons))
-    _write_recordings(
-        folder, list(driven)[:2], dict(zip(labels, bound, strict=True)), settings.markers.reference, rng, None
-    )
+    _write_recordings(folder, list(driven)[:2], dict(zip(labels, bound, strict=True)), run.markers.reference, rng, None)
     if simulated:
         material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
         write_json(folder / "truth.json", {"material": material, "noise_mm": 0.08})
@@ -378,9 +328,9 @@ PERIODS = {"simulation": 0.16, "reconstruction": 0.14, "simfree": 0.143, "resphy
 OFFSETS = {"reconstruction": 1e-9, "resphys": 2e-6}  # m
 
 
-def vertex_settings(**changes):
+def vertex_settings():
     """Settings of an experiment with observed vertices."""
-    return parse(RunSettings, {**composed("mesh.divisions=[4,1,1]"), "time_step": STEP, **changes})
+    return settings("mesh.divisions=[4,1,1]", f"time_step={STEP}")
 
 
 def swinging(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
@@ -392,9 +342,9 @@ def swinging(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):
     return positions
 
 
-def write_vertex_run(folder, settings, *, models=tuple(PERIODS)[:-1], diverged=(), steps=STEPS, begins="given"):
+def write_vertex_run(folder, run, *, models=tuple(PERIODS)[:-1], diverged=(), steps=STEPS, begins="given"):
     """Writes every file of a run whose vertices are observed."""
-    vertices = build_mesh(settings.mesh).vertices
+    vertices = build_mesh(run.mesh).vertices
     names, test = tuple(AMPLITUDES), list(AMPLITUDES)[1:]
     target = np.stack([swinging(vertices, size, steps=steps) for size in AMPLITUDES.values()])
     times = np.tile(STEP * np.arange(steps + 1), (3, 1))

@@ -119,13 +119,12 @@ def test_a_twin_follows_the_trials_of_a_run(finished, measured, capsys):
     assert "engine is 'half'" in capsys.readouterr().err
 
 
-class TestGripper:
-    @pytest.mark.slow
-    def test_all_hold_the_ball_and_nothing_crosses(self, measured):
-        result = measured("gripper", "--batches=2", "--repeats=1")
-        (row,) = result["a step of 10 ms of all grippers"]
-        assert (row["grippers"], row["held"], row["crossings"]) == (2, 2, 0)
-        assert row["without_contact_ms"] < row["grasp_ms"]
+@pytest.mark.slow
+def test_all_grippers_hold_the_ball_and_nothing_crosses(measured):
+    result = measured("gripper", "--batches=2", "--repeats=1")
+    (row,) = result["a step of 10 ms of all grippers"]
+    assert (row["grippers"], row["held"], row["crossings"]) == (2, 2, 0)
+    assert row["without_contact_ms"] < row["grasp_ms"]
 
 
 class TestPeers:

@@ -1,5 +1,6 @@
-"""What is known of the machine; Windows and macOS, imitated: modules and functions of Linux alone are missing."""
+"""The machine and how modules are imported on it; Windows and macOS, imitated: what Linux has alone is missing."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from warp_resphys.io import atomic, fan_out, memory
+from warp_resphys.io.imports import uncollected
 from warp_resphys.io.machine import available_cores, commit, hardware
 
 REPOSITORY = Path(__file__).parents[2]
@@ -85,3 +87,16 @@ def test_cores_are_those_that_the_process_may_use():
 def test_the_commit_is_that_of_the_repository():
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert commit() is None if head.returncode else head.stdout.startswith(str(commit()).partition(" ")[0])
+
+
+@pytest.mark.parametrize("error", [None, ImportError])
+def test_nothing_is_collected_meanwhile_and_what_was_made_is_not_searched(error):
+    gc.unfreeze()
+    with pytest.raises(error) if error else uncollected(), uncollected():
+        assert not gc.isenabled()
+        made = [[] for _ in range(10)]
+        if error:
+            raise error
+    assert gc.isenabled()
+    assert not {id(x) for x in gc.get_objects()} & {id(x) for x in made}
+    gc.unfreeze()

@@ -369,7 +369,7 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     console = Console()
     tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
     for table in (
-        errors_table(metrics, run),
+        errors_table(metrics, run, brief=True),
         horizon_table(metrics, {}),
         scale_table(metrics.get("scales", {})),
         tracking_table(tracking) if tracking else None,

@@ -81,9 +81,10 @@ class PageTable:
         import rich.table
         import rich.text
 
-        table = rich.table.Table(title=self.summary or None)
-        for column in (self.head, *self.columns):
-            table.add_column(rich.text.Text(column), justify="left" if column is self.head else "right")
+        table = rich.table.Table(title=self.summary or self.head)
+        table.add_column(self.head if self.summary else "", no_wrap=True)
+        for column in self.columns:
+            table.add_column(rich.text.Text(column), justify="right")
         for row in self.rows:
             cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
             table.add_row(*map(rich.text.Text, (row.head, *cells)), style="bold" if row.answer else None)

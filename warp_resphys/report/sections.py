@@ -50,16 +50,22 @@ _CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the 
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
 
 
-def errors_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
-    """Return the errors of the models in the test trials, beside the published ones."""
+def errors_table(metrics: Mapping[str, Any], settings: RunSettings, brief: bool = False) -> PageTable:
+    """Return the errors of the models in the test trials.
+
+    Args:
+        metrics: Of a split or of folds.
+        settings: Of the run.
+        brief: Whether to leave out deviations, published errors and those against the reconstruction, for a terminal.
+    """
     errors = metrics["errors_mm"]
     idle, by_trial = untrained(metrics), trial_errors(metrics)
     chosen, places = recommended(known_errors(by_trial, idle)), standings(known_errors(by_trial))
-    published = published_beside(published_errors(settings.name), list(errors))
+    published = {} if brief else published_beside(published_errors(settings.name), list(errors))
     by_load = errors_by_load(metrics, other_trials(settings))
     with_intervals = any(interval for interval, _ in places.values())
     columns = ["Mean error", *(["90 % interval"] if with_intervals else []), "Against the best other", *by_load]
-    reconstructed = metrics.get("errors_vs_reconstruction_mm", {})
+    reconstructed = {} if brief else metrics.get("errors_vs_reconstruction_mm", {})
     columns += [*(["Against the reconstruction"] if reconstructed else []), *(["Published"] if published else [])]
     rows: list[Row] = []
     for model, (name, meaning) in MODELS.items():
@@ -73,6 +79,7 @@ def errors_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable
             meaning = "the learned force on the identified simulator"
         interval, ratio = places.get(model, (None, None))
         cells = [Cell.of(error_parts(errors[model])) if model in errors else Cell(NONE)]
+        cells = [Cell(cell.text) for cell in cells] if brief else cells
         ends = NONE if interval is None else " to ".join(map(number_text, interval))
         cells += [Cell(ends)] if with_intervals else []
         cells.append(Cell(NONE if ratio is None else ratio_text(ratio)))

@@ -1,1 +1,1 @@
-"""What scripts/benchmark.py measures, a module a subject."""
+"""Measurements of scripts/benchmark.py, a module a subject."""

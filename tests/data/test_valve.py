@@ -13,7 +13,6 @@ from warp_resphys.data.recordings.segment import (
     CLAMP_LABELS,
     MARKERS,
     SEGMENT_LABELS,
-    SEGMENT_NOMINAL,
     TIP_LABELS,
     convert_segment,
     mask_repeats,
@@ -23,6 +22,13 @@ from warp_resphys.io.errors import DataFileError
 
 RATE = 100.0
 DECAY = 4.0  # [1/s]
+# Nominal positions [m]: four markers on the clamp, three at the tip, in the order of the labels.
+SEGMENT_NOMINAL = np.array(
+    [
+        *((-0.0505, -0.0205, 0.002), (-0.0305, -0.0505, 0.002), (-0.0105, 0.0505, 0.002), (-0.0505, 0.0235, 0.002)),
+        *((-0.0096, -0.0265, -0.1), (-0.0096, 0.0265, -0.1), (-0.0282, 0.0, -0.1)),
+    ]
+)
 
 
 def swing(opening, amplitude=5e-3, frames=150, noise=5e-6, seed=0):

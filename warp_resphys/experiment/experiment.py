@@ -193,7 +193,7 @@ class Experiment:
         return tuple(name for name in names if self.begins(name) != STATIC)
 
     def begins(self, name: str) -> str:
-        """How a trial begins."""
+        """Returns the kind of a trial's beginning: given, released, rest or static."""
         return self.dataset.begins[self.dataset.names.index(name)]
 
     def start(self, replay: Replay, model: str = "simulation", parameters: Mapping[str, float] | None = None) -> Start:

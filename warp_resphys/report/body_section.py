@@ -262,7 +262,7 @@ def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int])
 
 
 def _band_note(data: RunReport, bands: Mapping[str, FloatArray]) -> str:
-    """What the prediction intervals of the drawn band should contain, and what they contain in all test trials."""
+    """Sentence on the drawn band: its intended coverage, and its coverage and width in all test trials."""
     if not bands:
         return ""
     intervals = data.metrics["intervals"]

@@ -329,7 +329,7 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
         summary = f"{trial}: {result['frames']} frames at {result['rate_hz']:g} Hz"
         summary += "" if release is None else f", released in frame {release:.1f}"
         rows = [Row(label, [*map(Cell, cells)]) for label, cells in quality_table(result["markers"]).items()]
-        tables.append(PageTable("Marker", [*QUALITY_COLUMNS], rows, "", summary, len(quality) == 1))
+        tables.append(PageTable("Marker", [*QUALITY_COLUMNS], rows, summary=summary, unfolded=len(quality) == 1))
     listed = Items(warnings) if warnings else Text("No warnings.")
     return Part("Quality of the recordings", [listed, *tables, Text(note, note=True)])
 

@@ -78,7 +78,7 @@ ObstacleMotions = dict[str, MotionSettings]  # by obstacle
 
 
 class _Performed(Settings):
-    """What trials of a configuration and of a run have in common."""
+    """Recording and inputs of a trial, in a configuration and in a run."""
 
     file: Word | None = setting(None, "recording, in the folder of the data")
     inputs: Some[float] | None = setting(None, "constant inputs, one for each chamber, tendon or muscle")
@@ -200,7 +200,7 @@ class _Simulated(Settings):
 
 
 class HeldSettings(Settings):
-    """How a body is held before its release, in a test trial of its own."""
+    """Weight or twist that holds a body before its release, in a test trial of its own."""
 
     weight_g: NotNegative = setting(0.0, "weight", unit="g")
     direction: Direction = setting((0.0, 0.0, -1.0), "direction in which it pulls")

@@ -458,7 +458,7 @@ class Twin:
 
     @property
     def disagreement(self) -> Disagreement | None:
-        """How far the last predictions were off; None before one has come to its end."""
+        """Errors of the last predictions; None before one has come to its end."""
         if self._origin is None:
             return None
         self._update()

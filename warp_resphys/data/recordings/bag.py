@@ -10,6 +10,7 @@ the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or
 """
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -113,7 +114,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise DataFileError(f"{path} is damaged, or no bag of ROS ({what}): record it with ROS again.") from error
 
 
-class _Source:
+class _Source(ABC):
     """A topic, a member of its messages, and their times and values."""
 
     def __init__(self, path: Path, text: str) -> None:
@@ -138,9 +139,9 @@ class _Source:
         self.received.append(received)
         self.values.append(value)
 
+    @abstractmethod
     def read(self, kind: str, message: Any) -> Sequence[float] | None:
         """Returns the value in a message of a type; None where it lacks the member."""
-        raise NotImplementedError
 
     def series(self, late: float) -> tuple[FloatArray, FloatArray]:
         """Times (n,) [s] that grow, and values (n, ...); ``late`` is the clock of the bag less that of the headers."""

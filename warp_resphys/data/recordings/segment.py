@@ -16,13 +16,6 @@ from .processing import valve_opening
 from .reading import numbers, write_recording
 from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
 
-# Nominal positions [m]: four markers on the clamp, three at the tip, in the order of the labels.
-SEGMENT_NOMINAL: Final = np.array(
-    [
-        *((-0.0505, -0.0205, 0.002), (-0.0305, -0.0505, 0.002), (-0.0105, 0.0505, 0.002), (-0.0505, 0.0235, 0.002)),
-        *((-0.0096, -0.0265, -0.1), (-0.0096, 0.0265, -0.1), (-0.0282, 0.0, -0.1)),
-    ]
-)
 CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
 TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
 SEGMENT_LABELS: Final = (*CLAMP_LABELS, *TIP_LABELS)

@@ -33,9 +33,9 @@ from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.stages import package_versions
+from warp_resphys.io.tables import show
 from warp_resphys.linalg.choice import LINEAR_SOLVERS
 from warp_resphys.report.page import PageTable
-from warp_resphys.studies.tables import show
 
 
 def main(words: Sequence[str]) -> int:

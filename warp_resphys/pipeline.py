@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 import warp as wp
-from rich.console import Console
 
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
@@ -64,6 +63,7 @@ from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
+from .io.tables import show
 from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
 from .report.sections import errors_table, horizon_table, scale_table, shapes_table
@@ -366,17 +366,12 @@ def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     """Prints the errors, by model and in the tables of the report, and the conclusions."""
-    console = Console()
     tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
-    for table in (
+    tables = (
         errors_table(metrics, run, brief=True),
         horizon_table(metrics, {}),
         scale_table(metrics.get("scales", {})),
         tracking_table(tracking) if tracking else None,
         shapes_table(shapes) if shapes else None,
-    ):
-        if table is not None:
-            console.print(table)
-    for sentence in verdict(metrics, run):
-        console.print(sentence, soft_wrap=True)
-    console.print(f"Report: {folder / REPORT}", soft_wrap=True)
+    )
+    show(*filter(None, tables), *verdict(metrics, run), f"Report: {folder / REPORT}")

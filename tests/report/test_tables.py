@@ -1,9 +1,11 @@
 """Tables of the page, and which trials, markers and frames are shown."""
 
+from io import StringIO
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
@@ -18,7 +20,17 @@ from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import along_body, at_times, drawn_markers, mean_distance, shown_models, tip_markers
 from warp_resphys.report.error_section import largest_filtered
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
-from warp_resphys.report.page import MINUS, NO_BREAK_SPACE, NONE, Cell, duration_text, error_parts, number_text
+from warp_resphys.report.page import (
+    MINUS,
+    NO_BREAK_SPACE,
+    NONE,
+    Cell,
+    PageTable,
+    Row,
+    duration_text,
+    error_parts,
+    number_text,
+)
 from warp_resphys.report.render import axes_from_below, motion_axes
 from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.sections import (
@@ -36,6 +48,16 @@ from warp_resphys.report.sections import (
 from warp_resphys.settings.learning import RangeSettings
 
 DOWN = np.array([0.0, 0.0, -9.8])
+
+
+@pytest.mark.parametrize("summary", ["", "Trial [1]"])
+def test_units_in_brackets_reach_the_terminal(summary):
+    table = PageTable("Error [mm]", ["Mean [mm]"], [Row("At rest [2]", [Cell("1.2", beside="[3]")])], summary=summary)
+    console = Console(width=80, file=StringIO())
+    console.print(table)
+    words = console.file.getvalue().split()
+    assert {"Error", "[mm]", "Mean", "[2]", "[3]", *summary.split()} <= {*words}
+    assert words.count("[mm]") == 2
 
 
 def summary(mean, diverged=0):

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 
 from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..io.stages import Stage, StageContext, package_versions, resources_used
+from ..io.tables import show
 from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..settings.run import RunSettings
@@ -61,9 +61,7 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     from ..report.ablation_page import ablation_table  # matplotlib
 
-    console = Console()
-    console.print(ablation_table(metrics["by_markers"]))
-    console.print(f"Report: {folder / REPORT}", soft_wrap=True)
+    show(ablation_table(metrics["by_markers"]), f"Report: {folder / REPORT}")
 
 
 def generate_motion(context: StageContext) -> None:

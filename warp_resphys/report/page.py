@@ -81,10 +81,11 @@ class PageTable:
         import rich.table
         import rich.text
 
-        table = rich.table.Table(title=self.summary or self.head)
-        table.add_column(self.head if self.summary else "", no_wrap=True)
-        for column in self.columns:
-            table.add_column(rich.text.Text(column), justify="right")
+        head, *heads = map(rich.text.Text, (self.head if self.summary else "", *self.columns))  # "[mm]" is no markup
+        table = rich.table.Table(title=rich.text.Text(self.summary or self.head))
+        table.add_column(head, no_wrap=True)
+        for column in heads:
+            table.add_column(column, justify="right")
         for row in self.rows:
             cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
             table.add_row(*map(rich.text.Text, (row.head, *cells)), style="bold" if row.answer else None)

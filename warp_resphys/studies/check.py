@@ -31,6 +31,7 @@ from ..fem.scene import Scene
 from ..io.errors import ResphysError
 from ..io.progress import Progress
 from ..io.settings import Settings, Word, setting
+from ..io.tables import show
 from ..linalg.choice import LINEAR_SOLVERS
 from ..linalg.pardiso import has_pardiso
 from ..mesh.chambers import find_chambers
@@ -39,7 +40,6 @@ from ..report.page import PageTable
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .gradient_check import check_gradients, pose
-from .tables import show
 
 SIZE: Final = (0.1, 0.03, 0.03)  # of a beam [m]
 BATCH, STEPS = 3, 4  # of a motion

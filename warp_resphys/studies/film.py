@@ -15,6 +15,7 @@ from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
+from ..io.tables import show
 from ..learning.baselines import BASELINES
 from ..report.bodies import ComparedMotion
 from ..report.control_section import compared_controllers
@@ -23,7 +24,6 @@ from ..report.obstacles import ObstacleSurface
 from ..report.render import DrawingError, RenderScene, hangs, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
-from .tables import show
 
 _MOST_VIEWS: Final = 3  # of controllers, side by side
 _MOST_MARKERS: Final = 6  # vertices of the tip that are shown where every vertex is observed

@@ -12,6 +12,7 @@ from ..data.recordings.reading import READERS
 from ..experiment.build import build_mesh
 from ..io.errors import InputError, MeshError
 from ..io.settings import Many, Positive, Word, setting
+from ..io.tables import aligned
 from ..mesh.arm import name_surfaces
 from ..mesh.cavities import open_cavities
 from ..mesh.chambers import find_chambers
@@ -22,7 +23,6 @@ from ..mesh.tetrahedra import SURFACE_SUFFIXES
 from ..report.body_picture import MeshSummary, draw_mesh
 from ..settings.mesh import FileMesh, GeneratedArm, MeshSettings, PlaceSettings, SurfaceMesh
 from .recording_quality import RecordingInspection, inspect_recording
-from .tables import aligned
 
 _MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6

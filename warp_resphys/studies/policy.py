@@ -16,9 +16,9 @@ from ..io.files import read_json, write_json
 from ..io.progress import Progress
 from ..io.settings import Count, Natural, Settings, Some, Word, setting
 from ..io.stages import finished_record
+from ..io.tables import show
 from ..report.page import PageTable
 from ..settings.trials import Labels, different
-from .tables import show
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at

@@ -26,11 +26,11 @@ from ..experiment.trials import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
 from ..io.stages import StageInterrupted, run_stages
+from ..io.tables import show
 from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import PageTable, number_text
 from ..settings.learning import TrainingSettings
 from ..settings.run import RunSettings
-from .tables import show
 
 _SHOWN = 5  # trials
 _FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)

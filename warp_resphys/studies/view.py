@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..io.errors import InputError, ResphysError
 from ..io.settings import Count, Positive, Settings, Word, setting
+from ..io.tables import show
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..report.bodies import sharp_edges
 from ..report.figures import TONES
@@ -28,7 +29,6 @@ from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
 from .live import LiveRobot, range_of
 from .live_twin import LiveTwin, TwinSettings
-from .tables import show
 
 if TYPE_CHECKING:
     import viser

@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from rich.console import Console
 
 from ...data.camera import CORRECTIONS, PlacedCamera
 from ...energies.catalogue import LAW_FORMAT, unit_of
@@ -23,6 +22,7 @@ from ...io.errors import InputError
 from ...io.files import atomic_hdf5, create, read_json, write_json
 from ...io.progress import Progress
 from ...io.stages import Stage, StageContext, package_versions, resources_used
+from ...io.tables import show
 from ...learning.identification import ParameterSearch
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.misfit import PictureMisfit, values_of
@@ -392,11 +392,8 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     metrics = picture_metrics(folder, run)
     write_json(folder / METRICS, metrics)
     results = [PictureResult(**row) for row in metrics["poses"]]
-    console = Console()
-    console.print(distance_table(results))
     identified = read_json(folder / IDENTIFICATION)["sysid"]
     material = {name: v for name, v in identified["parameters"].items() if split_name(name)[0] not in _PLACED}
-    for row in parameter_rows({**identified, "parameters": material}, {}, {}):
-        console.print(f"{row.head}: {row.cells[1].text} {row.cells[1].beside}", soft_wrap=True, markup=False)
-    console.print(picture_verdict(results), soft_wrap=True)
-    console.print(f"Report: {folder / REPORT}", soft_wrap=True)
+    rows = parameter_rows({**identified, "parameters": material}, {}, {})
+    values = (f"{row.head}: {row.cells[1].text} {row.cells[1].beside}" for row in rows)
+    show(distance_table(results), *values, picture_verdict(results), f"Report: {folder / REPORT}")

@@ -1,4 +1,4 @@
-"""Tables of the commands: in a terminal and as text."""
+"""Tables and sentences in a terminal, and tables as text."""
 
 import sys
 from collections.abc import Sequence

@@ -134,7 +134,7 @@ class LawTrials:
 
     def bounds_of_others(self, simulator: Simulator) -> dict[str, Bounds]:
         """Returns the ranges of the identified parameters that are not those of the material."""
-        if self.settings.identify is None:
+        if not self.settings.reads("identify"):
             return {}
         return {name: bounds_of(self.settings.identify.parameters[name]) for name in self.others(simulator)}
 
@@ -258,7 +258,8 @@ class LawTrials:
 
     def _prior_of_modulus(self) -> Prior | None:
         """Returns the prior of c10 that corresponds to one of Young's modulus, if there is one."""
-        wanted = None if self.settings.identify is None else self.settings.identify.parameters.get("youngs_modulus")
+        parameters = self.settings.identify.parameters if self.settings.reads("identify") else {}
+        wanted = parameters.get("youngs_modulus")
         if wanted is None or wanted.prior is None:
             return None
         share = self.guess["c10"] / self.sysid["youngs_modulus"]

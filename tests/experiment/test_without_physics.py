@@ -12,6 +12,7 @@ from warp_resphys.settings.learning import ReleaseSettings
 
 FRAMES, STEP = 40, 0.01
 TIMES = 2.0 * STEP * np.arange(FRAMES)  # of every second step
+MODELS = ("rest", "interpolation", "regression", "linear")
 SHAPE = np.array([[1.0, 0.0, 0.5], [0.2, 0.0, 0.1]])  # of two markers
 
 
@@ -45,11 +46,15 @@ def experiment(levels, begins, learned, **changes):
 
 def test_trials_are_predicted_from_training_trials_that_begin_in_the_same_way():
     fake = experiment([1.0, 2.0, 3.0, 1.5, 2.5], ("rest",) * 3 + ("released", "rest"), ["a", "b", "c"])
-    assert without_physics(fake, ["e", "d"]) == ({}, {})  # Nothing was learned of released bodies.
-    values, settings = without_physics(fake, ["e"])
-    assert values.keys() == settings.keys() == {"rest", "interpolation", "regression", "linear"}
+    values, _, missing = without_physics(fake, ["e", "d"])  # Nothing was learned of released bodies.
+    assert [*values] == ["rest"]
+    assert missing == dict.fromkeys(MODELS[1:], "no other training trial begins like d")
+    np.testing.assert_array_equal(values["rest"], np.broadcast_to(fake.dataset.held[[4, 3], None], (2, FRAMES, 2, 3)))
+    values, settings, missing = without_physics(fake, ["e"])
+    assert (*values,) == (*settings,) == MODELS
+    assert not missing
     truth = fake.dataset.observed[[4]]
-    for model in ("interpolation", "regression", "linear"):
+    for model in MODELS[1:]:
         np.testing.assert_allclose(values[model][0], truth[0], atol=1e-2)
     np.testing.assert_array_equal(values["rest"][0], np.broadcast_to(fake.dataset.held[4], (FRAMES, 2, 3)))
 
@@ -73,9 +78,12 @@ def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.learned_steps = lambda steps: steps // 2
     fake.dataset.observed[:2, FRAMES // 2 + 1 :] = 1e6
-    values, _ = without_physics(fake, ["c"])
-    assert values.keys() == {"rest", "linear"}  # The others know nothing of its end.
-    assert np.nanmax(np.abs(values["linear"])) < 10.0
+    values, _, missing = without_physics(fake, ["c"])
+    assert missing == {"regression": "needs three training trials that differ in inputs or loads"}
+    assert np.abs(values["linear"]).max() < 10.0
+    halfway = values["interpolation"][:, FRAMES // 2 - 1]
+    np.testing.assert_allclose(halfway, fake.dataset.observed[2:, FRAMES // 2 - 1], atol=1e-6)
+    np.testing.assert_array_equal(values["interpolation"][:, -1], halfway)
     assert fake.dataset.observed.max() == 1e6  # The data are as they were.
 
 
@@ -84,7 +92,7 @@ def test_a_pose_is_interpolated_in_its_last_input():
     fake.dataset.inputs["pressure"][:, :-1] = 7.0
     one = {name: getattr(fake.dataset, name)[:, -1:] for name in ("times", "observed")}
     fake = experiment([1.0, 2.0, 1.5], ("static",) * 3, ["a", "b"], inputs=fake.dataset.inputs, **one)
-    values, _ = without_physics(fake, ["c"])
+    values, *_ = without_physics(fake, ["c"])
     np.testing.assert_allclose(values["interpolation"][0], fake.dataset.observed[2], atol=1e-6)
 
 
@@ -100,15 +108,30 @@ def test_released_bodies_come_to_rest_where_the_training_ends_and_are_told_apart
         held=ends + held,
         observed=ends + held[:, None] * decay,
     )
-    values, _ = without_physics(fake, ["c"])
+    values, *_ = without_physics(fake, ["c"])
     np.testing.assert_allclose(values["rest"][0, 0], ends, atol=1e-6)
     np.testing.assert_allclose(values["interpolation"], fake.dataset.observed[2:], atol=1e-3)
+
+
+def test_released_bodies_are_compared_at_the_same_times_whatever_the_rate_of_their_recordings():
+    times = np.stack([TIMES, 0.3 * TIMES + 0.004, 1.5 * TIMES + 0.002])
+    levels = np.array([1.0, 2.0, 1.5])
+    waves = np.cos(3.0 * times) * levels[:, None]
+    held = levels[:, None, None] * SHAPE
+    more = {"inputs": {}, "held": held, "observed": waves[..., None, None] * SHAPE, "times": times}
+    fake = experiment(levels, ("released",) * 3, ["a", "b"], **more)
+    values, *_ = without_physics(fake, ["c"])
+    assert values["interpolation"].shape == (1, FRAMES, 2, 3)
+    seen = times[2] <= times[1, -1]  # While both are known; the shape of a motion does not depend on its level.
+    np.testing.assert_allclose(values["interpolation"][0, seen], fake.dataset.observed[2, seen], atol=2e-3)
+    last = values["interpolation"][0, times[2] >= TIMES[-1] + STEP]
+    np.testing.assert_allclose(last, np.broadcast_to(last[0], last.shape), atol=1e-6)
 
 
 def test_a_marker_of_other_trials_stays_at_rest():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.dataset.observed[:2, :, 1] = np.nan
-    values, _ = without_physics(fake, ["c"])
+    values, *_ = without_physics(fake, ["c"])
     for model in ("interpolation", "linear"):
         np.testing.assert_allclose(values[model][0, :, 0], fake.dataset.observed[2, :, 0], atol=2e-2)
         np.testing.assert_array_equal(values[model][0, :, 1], values["rest"][0, :, 1])
@@ -128,8 +151,8 @@ def test_a_payload_and_the_motion_of_a_base_are_inputs(driven_by):
     base = np.zeros((4, 2 * FRAMES + 1, 6))
     base[:, :, 0] = levels[:, None]
     more = {"payload": {"payload": 0.05 * levels}, "base": {"base": base}}.get(driven_by, {})
-    values, _ = without_physics(experiment(levels, ("rest",) * 4, ["a", "b", "c"], inputs={}, **more), ["d"])
-    assert ("interpolation" in values) == (driven_by is not None)
+    values, *_ = without_physics(experiment(levels, ("rest",) * 4, ["a", "b", "c"], inputs={}, **more), ["d"])
+    assert ("regression" in values) == (driven_by is not None)
     if driven_by:
         expected = experiment(levels, ("rest",) * 4, []).dataset.observed[3]
         np.testing.assert_allclose(values["interpolation"][0], expected, atol=1e-6)

@@ -101,8 +101,38 @@ def test_a_linear_model_predicts_a_linear_system_from_its_inputs():
     assert error("linear", trials, asked) < 0.1 * error("regression", trials, asked)
 
 
-def test_poses_and_trials_that_nothing_distinguishes_have_fewer_baselines():
+def test_a_model_linear_in_time_finds_the_degree_of_its_inputs():
+    curved = lambda seed: motions(driven(seed).values, np.cbrt(driven(seed).inputs))  # noqa: E731
+    predicted = predictions(curved(1), curved(2))["linear"]
+    assert predicted.settings.startswith("degree 3")
+    assert np.abs(predicted.values - driven(2).values).max() < 0.02 * np.abs(driven(2).values).max()
+
+
+def test_after_the_end_of_the_training_the_last_value_holds_and_the_model_in_time_goes_on():
+    trials, asked = driven(1), driven(2)
+    trials.values[:, 120:] = np.nan
+    trials.values[0, 100:] = np.nan
+    made = predictions(trials, asked)
+    assert made.keys() == {"rest", "interpolation", "regression", "linear"}
+    for model in ("interpolation", "regression"):
+        held = np.broadcast_to(made[model].values[:, 119:120], (4, 80, 3))
+        np.testing.assert_array_equal(made[model].values[:, 120:], held)
+    assert np.abs(made["linear"].values - asked.values).max() < 0.02 * np.abs(asked.values).max()
+
+
+def test_a_coordinate_that_a_trial_never_shows_follows_from_the_others():
+    trials, asked = driven(1), driven(2)
+    trials.values[0, :, 2] = np.nan
+    assert error("linear", trials, asked) < 0.02 * np.abs(asked.values).max()
+    trials.values[1, :, :2] = np.nan  # No coordinate is common to all of them.
+    assert error("linear", trials, asked) < 0.02 * np.abs(asked.values).max()
+
+
+def test_a_single_trial_is_a_line_from_zero_inputs_and_trials_that_nothing_distinguishes_have_their_mean():
+    assert error("interpolation", steps([2.0], lambda x: x), steps([0.5, 1.5], lambda x: x)) < 1e-6
     pose = motions(np.ones((4, 1, 3)), np.arange(4.0).reshape(4, 1, 1))
     assert [*predictions(pose, pose)] == ["rest", "interpolation", "regression"]
-    alike = motions(np.random.default_rng(0).normal(size=(2, 9, 3)))
-    assert [*predictions(alike, alike)] == ["rest", "linear"]
+    alike = motions(np.random.default_rng(0).normal(size=(3, 9, 3)))
+    made = predictions(alike, alike)
+    assert [*made] == ["rest", "interpolation", "linear"]
+    np.testing.assert_allclose(made["interpolation"].values[0], alike.values.mean(0), atol=1e-6)

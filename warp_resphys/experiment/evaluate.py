@@ -50,7 +50,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     work_on([*chain(*parts.values(), *calibrating.values())], _rolled_out, workers)
     order = [*chain(*experiment.batches(names))]
     rows = [order.index(name) for name in names]
-    observed, plain = without_physics(experiment, names)
+    observed, plain, missing = without_physics(experiment, names)
     frames = experiment.dataset.observed.shape[1]
     observed |= {model: read_parts(its_parts, "observed", frames)[rows] for model, its_parts in parts.items()}
     test = settings.groups["1"]
@@ -76,6 +76,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
         if model in LEARNED and settings.range_guard
     }
     errors = summary(context, experiment, settings.groups, observed, left) | {"baselines": plain}
+    errors |= {"missing_baselines": missing} if missing else {}
     sideways = np.concatenate([part.read("sideways") for part in parts["resphys"]])
     if known := {name: size for name, size in zip(order, sideways.tolist(), strict=True) if math.isfinite(size)}:
         errors["sideways_mm"] = {name: known[name] for name in test if name in known}

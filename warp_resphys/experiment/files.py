@@ -339,7 +339,7 @@ def driving(dataset: Dataset, names: Sequence[str]) -> dict[str, FloatArray]:
     series |= {} if dataset.base is None else {"base": dataset.base[rows]}
     series |= {f"obstacle {name}": poses[rows] for name, poses in dataset.obstacles.items()}
     steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
-    posed = np.array([dataset.begins[row] == STATIC for row in rows])
+    posed = np.array([dataset.begins[row] == STATIC for row in rows], dtype=bool)
     steps[posed] = np.iinfo(np.int64).max
     return {
         name: np.take_along_axis(values, np.minimum(steps, values.shape[1] - 1)[..., None], 1)

@@ -83,7 +83,7 @@ def intervals_of(
     observed[learned, experiment.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
     linear = linearised(experiment, names, uncertain=True)
     changes = {model: left_out_changes(experiment, model, names, own) for model, own in linear.items()}
-    simulated, _ = without_physics(experiment, names, left_out=True)
+    simulated, *_ = without_physics(experiment, names, left_out=True)
     simulated |= {m: x if (change := changes.get(m)) is None else x + change for m, x in calibrating.items()}
     calibrating_spreads = spreads_of(experiment, names, linear, left_out=True)
     models: dict[str, Any] = {}

@@ -1,31 +1,38 @@
 """Predictions without physics of the trials of an experiment."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..learning.baselines import BASELINES, REST, PlainTrials, predictions
+from ..data.trials import Trials
+from ..learning.baselines import BASELINES, REST, PlainTrials, at_rest, predictions
 from ..learning.release import least_delays
 from ..learning.replay import sample
-from .experiment import Experiment
-from .files import GIVEN, RESTING, driving
+from .experiment import Experiment, at_steps
+from .files import GIVEN, RESTING, Dataset, driving
 
 FloatArray = NDArray[np.float64]
 
 _SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest
 
+_LACKING: Final = {  # why a model is missing although trials were learned from
+    "regression": "needs three training trials that differ in inputs or loads",
+    "linear": "is for motions, and poses have none",
+}
+
 
 def without_physics(
     experiment: Experiment, names: Sequence[str], *, left_out: bool = False
-) -> tuple[dict[str, FloatArray], dict[str, str]]:
+) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
     """Predicts trials with `learning.baselines`, from the training trials that begin in the same way.
 
-    Coordinates that no training trial shows stay at rest. A model that does not predict all frames of all trials, such
-    as interpolation after the end of the training, is left out. Where simulators estimate the delay of a trial's inputs
-    from its first frames (`learning.release.begin_inputs`), so do these.
+    Coordinates that no training trial shows stay at rest. Released bodies are compared at the time steps, as each
+    recording has its own frames. Where simulators estimate the delay of a trial's inputs from its first frames
+    (`learning.release.begin_inputs`), so do these.
 
     Args:
         experiment: the experiment.
@@ -33,33 +40,51 @@ def without_physics(
         left_out: whether a trial is predicted without itself if it is a training trial.
 
     Returns:
-        By model: the observed points (R, T, M, 3) [m], and the settings in words.
+        By model: the observed points (R, T, M, 3) [m], the settings in words, and of models that cannot predict all
+        trials, the reason.
     """
-    shape = (len(names), *experiment.dataset.observed.shape[1:])
+    dataset = experiment.dataset
+    shape = (len(names), *dataset.observed.shape[1:])
     values: dict[str, FloatArray] = {}
     settings: dict[str, str] = {}
+    missing: dict[str, str] = {}
     for batch in _batches(experiment, names, left_out):
         begins, without = _kind(experiment.begins(batch[0])), batch if left_out else ()
         train = [name for name in experiment.settings.split.train if name not in without]
         learned = [name for name in train if _kind(experiment.begins(name)) == begins]
-        if not learned:
-            continue
-        trials, asked = _motions(experiment, learned, batch)
+        shown = _at_steps(dataset, learned, batch) if begins == "released" else dataset
+        trials, asked = _motions(experiment, shown, learned, batch)
         trials = trials.select(np.asarray(np.isfinite(trials.values).any((1, 2))))
-        if not len(trials.values):
-            continue
+        made = predictions(trials, asked) if len(trials.values) else {REST: at_rest(asked)}
         rows = [names.index(name) for name in batch]
-        made = predictions(trials, asked)
         for model, own in made.items():
-            shown = np.isfinite(own.values).any(1, keepdims=True)
-            known = np.where(shown, own.values, made[REST].values).reshape(-1, *shape[1:])
-            if begins == RESTING[0] and experiment.settings.release.delay > 0.0:
+            seen = np.isfinite(own.values).any(1, keepdims=True)
+            known = np.where(seen, own.values, made[REST].values).reshape(len(batch), -1, *shape[2:])
+            if begins == "released":
+                times = torch.from_numpy(dataset.times[dataset.rows(batch)])
+                known = sample(torch.from_numpy(known), times, dataset.time_step).numpy()
+            elif begins == RESTING[0] and experiment.settings.release.delay > 0.0:
                 known = _on_time(experiment, batch, known)
             values.setdefault(model, np.full(shape, np.nan))[rows] = known
             settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), own.settings))))
-    seen = np.isfinite(experiment.dataset.observed[experiment.dataset.rows(names)])
-    whole = [model for model in BASELINES if model in values and np.isfinite(values[model][seen]).all()]
-    return {model: values[model] for model in whole}, {model: settings[model] for model in whole}
+        for model in (model for model in BASELINES if model not in made):
+            reason = _LACKING[model] if len(trials.values) else f"no other training trial begins like {batch[0]}"
+            missing.setdefault(model, reason)
+    whole = [model for model in BASELINES if model in values and model not in missing]
+    return {model: values[model] for model in whole}, {model: settings[model] for model in whole}, missing
+
+
+def _at_steps(dataset: Dataset, learned: Sequence[str], asked: Sequence[str]) -> Dataset:
+    """A dataset with the observations of some trials at the time steps, as far as these and others last."""
+    rows, step = dataset.rows(learned), dataset.time_step
+    last = float(dataset.times[[*rows, *dataset.rows(asked)]].max())
+    times = step * np.arange(int(np.ceil(last / step - 1e-6)) + 1)
+    observed = np.full((len(dataset.names), len(times), *dataset.observed.shape[2:]), np.nan)
+    if rows:
+        own_times, seen, held = (torch.from_numpy(x[rows]) for x in (dataset.times, dataset.observed, dataset.held))
+        positions = at_steps(Trials(tuple(learned), own_times, seen, held), step)
+        observed[rows, : positions.shape[1]] = positions
+    return replace(dataset, times=np.broadcast_to(times, (len(dataset.names), len(times))), observed=observed)
 
 
 def _kind(begins: str) -> str:
@@ -96,22 +121,25 @@ def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> It
             yield others
 
 
-def _motions(experiment: Experiment, learned: Sequence[str], asked: Sequence[str]) -> tuple[PlainTrials, PlainTrials]:
+def _motions(
+    experiment: Experiment, dataset: Dataset, learned: Sequence[str], asked: Sequence[str]
+) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
-    dataset, made = experiment.dataset, list[PlainTrials]()
+    made = list[PlainTrials]()
     for names in (learned, asked):
         rows = dataset.rows(names)
         values, first = (
-            x[rows].reshape(len(rows), *x.shape[1:-2], -1).copy() for x in (dataset.observed, dataset.held)
+            x[rows].reshape(len(rows), *x.shape[1:-2], 3 * x.shape[-2]) for x in (dataset.observed, dataset.held)
         )
         acting, loads = driving(dataset, names), dataset.payload[rows][:, None]
         if not made:
             values[:, experiment.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
             sizes, load = {name: _size(own) for name, own in acting.items()}, _size(loads)
-            at_rest = np.array([_mean(column) for column in np.array([_end(own) for own in values]).T])
+            ends = np.array([_end(own) for own in values]).reshape(-1, first.shape[1])
+            rest = np.array([_mean(column) for column in ends.T])
         settles = experiment.begins(asked[0]) in ("released", GIVEN)  # at rest where the training ends
         frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
-        origin = np.broadcast_to(at_rest, first.shape) if settles else first
+        origin = np.where(np.isfinite(rest), rest, first) if settles else first
         made.append(PlainTrials(values, origin, first, np.concatenate(frames, 2), loads / load))
     return made[0], made[1]
 
@@ -130,4 +158,4 @@ def _mean(values: FloatArray) -> float:
 
 def _size(values: FloatArray) -> float:
     """The root of the mean over trials and frames of the squared norm, or one if all are zero."""
-    return float(np.sqrt(np.square(values).sum(-1).mean())) or 1.0
+    return float(np.sqrt(np.square(values).sum(-1).mean())) or 1.0 if len(values) else 1.0

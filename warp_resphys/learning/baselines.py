@@ -1,12 +1,14 @@
 """Predictions without physics: a body at rest, interpolation and regression over trials, a linear model in time.
 
-They have what simulators have, the inputs of a trial and the points before time zero, and learn from the same trials.
+They have what simulators have, the inputs of a trial and the points before time zero, learn from the same trials, and
+predict all frames: interpolation and regression hold their last value after the end of the longest training trial.
 Their settings are chosen by leaving training trials out.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations_with_replacement, product
 from typing import Final
 
 import numpy as np
@@ -25,6 +27,8 @@ _WIDTHS: Final = (0.25, 0.5, 1.0, 2.0)  # of Gaussian kernels, over the median d
 _EXACT: Final = 1e-8  # ridge of an interpolation
 _MODES: Final = (2, 4, 8, 16)
 _LINEAR_RIDGES: Final = (1e-9, 1e-6, 1e-4, 1e-2)
+_DEGREES: Final = (1, 2, 3)  # of a linear model in the inputs
+_MOST_TERMS: Final = 100  # products of inputs
 _FOLDS: Final = 4
 _LARGEST: Final = 1e3  # coordinate of a linear model, over the root mean square displacement in its training
 
@@ -57,13 +61,14 @@ class PlainTrials:
         return self.values - self.origin[:, None]
 
     def features(self, like: "PlainTrials") -> FloatArray:
-        """(R, T C + F + P) what distinguishes trials: inputs at all frames, loads, and displacements before time zero.
+        """(R, T' C + F + P) what distinguishes trials: inputs, loads, and displacements before time zero.
 
         Args:
-            like: the training trials, whose mean displacement before time zero is the unit of displacements.
+            like: the training trials, whose mean displacement before time zero is the unit of displacements. Inputs
+                count in the T' frames up to their end.
         """
-        frames = self.inputs.shape[1]
-        parts = [self.inputs.reshape(len(self.inputs), -1) / np.sqrt(frames), self.known]
+        frames = int(np.flatnonzero(np.isfinite(like.values).any((0, 2)))[-1]) + 1
+        parts = [self.inputs[:, :frames].reshape(len(self.inputs), -1) / np.sqrt(frames), self.known]
         size = np.linalg.norm(like.displaced, axis=1).mean()
         return np.concatenate([*parts, *([self.displaced / size] if size > 0.0 else [])], 1)
 
@@ -84,24 +89,37 @@ class Prediction:
 def predictions(trials: PlainTrials, asked: PlainTrials) -> dict[str, Prediction]:
     """Predicts trials without physics.
 
+    Coordinates that no training trial shows are NaN.
+
     Args:
         trials: training trials.
         asked: trials to predict; their values are not used.
 
     Returns:
         ``rest``: nothing moves. ``interpolation``: straight lines from zero inputs through the trials, frame by frame,
-        constant beyond the outermost, if inputs or loads distinguish them. ``regression``: kernel ridge regression in
-        their place, with three trials or more. ``linear``: a linear state-space model with inputs (Proctor, Brunton and
-        Kutz, SIAM Journal on Applied Dynamical Systems 15(1), 2016), for motions.
+        constant beyond the outermost; the mean of trials that nothing distinguishes. ``regression``: kernel ridge
+        regression in their place, where `distinguished`. ``linear``: a linear state-space model with powers and
+        products of the inputs (Proctor, Brunton and Kutz, SIAM Journal on Applied Dynamical Systems 15(1), 2016), for
+        motions.
     """
-    result = {REST: Prediction(np.broadcast_to(asked.origin[:, None], asked.values.shape).copy())}
-    if np.ptp(trials.features(trials), axis=0).any():
-        result["interpolation"] = _predicted(trials, asked, _spline, _EXACT, 0.0)
-        if len(trials.values) > 2:
-            result["regression"] = regression(trials, asked)
+    result = {REST: at_rest(asked)}
+    constant = 0.0 if trials.features(trials).any() else 1.0
+    result["interpolation"] = _predicted(trials, asked, _spline, _EXACT, constant)
+    if distinguished(trials):
+        result["regression"] = regression(trials, asked)
     if trials.values.shape[1] > 2:
         result["linear"] = linear(trials, asked)
     return result
+
+
+def at_rest(asked: PlainTrials) -> Prediction:
+    """Predicts that nothing moves."""
+    return Prediction(np.broadcast_to(asked.origin[:, None], asked.values.shape).copy())
+
+
+def distinguished(trials: PlainTrials) -> bool:
+    """Returns whether there are three trials or more, whose inputs, loads or displacements before time zero differ."""
+    return len(trials.values) > 2 and bool(np.ptp(trials.features(trials), axis=0).any())
 
 
 def _spline(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -170,21 +188,29 @@ def _predicted(trials: PlainTrials, asked: PlainTrials, kernel: Kernel, ridge: f
             result[:, columns] = across[:, rows] @ np.linalg.solve(
                 gram[np.ix_(rows, rows)], flat[np.ix_(rows, columns)]
             )
-    return Prediction(asked.origin[:, None] + result.reshape(len(across), *moved.shape[1:]))
+    return Prediction(asked.origin[:, None] + _held(result.reshape(len(across), *moved.shape[1:])))
+
+
+def _held(values: FloatArray) -> FloatArray:
+    """(Q, T, P) values, the last one where a frame has none, and before the first frame the first one."""
+    seen = np.isfinite(values)
+    frames = np.arange(values.shape[1])[:, None]
+    last = np.maximum.accumulate(np.where(seen, frames, seen.argmax(1)[:, None]), axis=1)
+    return np.take_along_axis(values, last, 1)
 
 
 def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
-    """Predicts motions by a linear model of the displacements in two frames and the inputs, in principal components.
+    """Predicts motions by a linear model of the displacements in two frames, in principal components, and of inputs.
 
-    The number of components and the ridge are those of the least error of roll-outs of trials that are left out, or of
-    the only training trial. Coordinates that a trial never shows are not predicted.
+    The model is linear in the powers and products of the inputs up to a degree. The degree, the number of components
+    and the ridge are those of the least error of roll-outs of trials that are left out; a single training trial is
+    itself rolled out, with a degree of one. Coordinates that some trials do not show follow from the components.
     """
-    shown = np.isfinite(trials.moved).any(1).all(0)
-    if trials.displaced.any():  # then the start of a coordinate must be known
-        shown &= np.isfinite(trials.first).all(0) & np.isfinite(asked.first).all(0)
-    values = np.full(asked.values.shape, np.nan)
-    if not shown.any():
-        return Prediction(values)
+    seen = np.asarray(np.isfinite(trials.moved).any(1))  # (R, P)
+    if not (common := seen.all(0)).any():
+        return linear(trials.select(seen[:, seen.sum(0).argmax()]), asked)
+    begun = np.isfinite(np.concatenate([trials.first, asked.first])).all(0)
+    shown = common & begun if trials.displaced.any() and (common & begun).any() else common
     moved = [_without_gaps(own) for own in trials.moved[..., shown]]
     everything = np.concatenate(moved)
     size = float(np.sqrt(np.square(everything).sum(1).mean())) or 1.0
@@ -195,29 +221,42 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
         largest = [max(count - _MODES[-1], 0), count - 1]
         vectors = scipy.linalg.eigh(everything.T @ everything, subset_by_index=largest)[1][:, ::-1]
     basis = vectors / size
-    starts, driving = trials.displaced[:, shown] @ basis, _driving(trials)
+    starts, most = trials.displaced[:, shown] @ basis, basis.shape[1]
     z = [np.concatenate([start[None], own @ basis]) for start, own in zip(starts, moved, strict=True)]
     squares = [np.square(own / size).sum() for own in moved]
-    folds, best, chosen = min(_FOLDS, len(moved)), np.inf, (1, _LINEAR_RIDGES[-1])
-    for modes, ridge in product(sorted({min(m, basis.shape[1]) for m in _MODES}), _LINEAR_RIDGES):
-        error = 0.0
-        for fold in range(folds):
-            out = [k for k in range(len(z)) if k % folds == fold]
-            kept = [k for k in range(len(z)) if folds == 1 or k % folds != fold]
-            matrix = _fitted([z[k][:, :modes] for k in kept], driving[kept], ridge)
-            rolled = _rolled(matrix, starts[out, :modes], driving[out])
-            for row, k in zip(rolled, out, strict=True):  # the components that are left out do not move
-                seen = z[k][1:, :modes]
-                off = np.square(row[: len(seen)] - seen).sum() + squares[k] - np.square(seen).sum()
-                error += float(np.sqrt(max(off, 0.0) / len(seen)))
-        if error < best * (1.0 - 1e-9):
-            best, chosen = error, (modes, ridge)
-    modes, ridge = chosen
-    matrix = _fitted([own[:, :modes] for own in z], driving, ridge)
-    rolled = _rolled(matrix, (asked.displaced[:, shown] @ basis)[:, :modes], _driving(asked))
-    settings = f"{modes} component{'s' if modes > 1 else ''}, ridge {ridge:g}"
+    sizes, folds = sorted({min(m, most) for m in _MODES}), min(_FOLDS, len(moved))
+    best, chosen = np.inf, (1, 1, _LINEAR_RIDGES[-1])
+    for degree in _degrees(trials):
+        driving = _driving(trials, trials, degree)
+        sums = [_sums(own, acting) for own, acting in zip(z, driving, strict=True)]
+        for modes, ridge in product(sizes, _LINEAR_RIDGES):
+            error = 0.0
+            for fold in range(folds):
+                out = [k for k in range(len(z)) if k % folds == fold]
+                kept = [k for k in range(len(z)) if folds == 1 or k % folds != fold]
+                matrix = _fitted([sums[k] for k in kept], most, modes, ridge)
+                rolled = _rolled(matrix, starts[out, :modes], driving[out])
+                for row, k in zip(rolled, out, strict=True):  # the components that are left out do not move
+                    known = z[k][1:, :modes]
+                    off = np.square(row[: len(known)] - known).sum() + squares[k] - np.square(known).sum()
+                    error += float(np.sqrt(max(off, 0.0) / len(known)))
+            if error < best * (1.0 - 1e-9):
+                best, chosen = error, (degree, modes, ridge)
+    degree, modes, ridge = chosen
+    driving = _driving(trials, trials, degree)
+    matrix = _fitted([_sums(own, acting) for own, acting in zip(z, driving, strict=True)], most, modes, ridge)
+    rolled = _rolled(matrix, (asked.displaced[:, shown] @ basis)[:, :modes], _driving(asked, trials, degree))
+    values = np.full(asked.values.shape, np.nan)
     values[..., shown] = asked.origin[:, None, shown] + rolled @ basis[:, :modes].T * size**2
-    return Prediction(values, settings)
+    for column in np.flatnonzero(seen.any(0) & ~shown):
+        there = [np.isfinite(own[: len(of) - 1, column]) for own, of in zip(trials.moved, z, strict=True)]
+        known = np.concatenate([of[1:, :modes][where] for of, where in zip(z, there, strict=True)])
+        wanted = np.concatenate(
+            [own[: len(where), column][where] for own, where in zip(trials.moved, there, strict=True)]
+        )
+        values[..., column] = asked.origin[:, None, column] + rolled @ np.linalg.lstsq(known, wanted, rcond=_EXACT)[0]
+    powers = f"degree {degree}, " if degree > 1 else ""
+    return Prediction(values, f"{powers}{modes} component{'s' if modes > 1 else ''}, ridge {ridge:g}")
 
 
 def _without_gaps(moved: FloatArray) -> FloatArray:
@@ -231,29 +270,57 @@ def _without_gaps(moved: FloatArray) -> FloatArray:
     return result
 
 
-def _driving(motions: PlainTrials) -> FloatArray:
+def _degrees(trials: PlainTrials) -> list[int]:
+    """Degrees of a linear model in the inputs, fewer than trials, among which leaving trials out can choose."""
+    count = len(_acting(trials))
+    few = [degree for degree in _DEGREES if math.comb(count + degree, degree) <= _MOST_TERMS + 1]
+    return [1, *(degree for degree in few if 1 < degree < len(trials.values) and count)]
+
+
+def _acting(trials: PlainTrials) -> NDArray[np.int64]:
+    """(A,) columns of inputs and loads that act in any trial."""
+    return np.flatnonzero(np.concatenate([trials.inputs.any((0, 1)), trials.known.any(0)]))
+
+
+def _driving(motions: PlainTrials, trials: PlainTrials, degree: int) -> FloatArray:
+    """(R, T, D) powers and products of the inputs and loads of motions that act in training trials, and a constant."""
     frames = motions.inputs.shape[1]
     known = np.broadcast_to(motions.known[:, None], (len(motions.known), frames, motions.known.shape[1]))
-    return np.concatenate([motions.inputs, known, np.ones((len(known), frames, 1))], 2)
+    inputs = np.concatenate([motions.inputs, known], 2)
+    chosen = (c for d in range(1, degree + 1) for c in combinations_with_replacement(_acting(trials).tolist(), d))
+    columns = [inputs[..., list(own)].prod(-1) for own in chosen]
+    return np.stack([*columns, np.ones(inputs.shape[:2])], 2)
 
 
 def _rows(z: FloatArray, before: FloatArray, driving: FloatArray) -> FloatArray:
     return np.concatenate([z, before, driving[..., :-1, :], driving[..., 1:, :]], -1)
 
 
-def _fitted(series: Sequence[FloatArray], driving: FloatArray, ridge: float) -> FloatArray:
+def _sums(z: FloatArray, driving: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Matrix and right-hand side of the normal equations of a trial, from two frames to the next.
+
+    Args:
+        z: (1 + T', m) coordinates before time zero and at the frames.
+        driving: (T, D) what drives both ends of each interval.
+    """
+    rows = _rows(z[1:-1], z[:-2], driving[: len(z) - 1])
+    return rows.T @ rows, rows.T @ z[2:]
+
+
+def _fitted(sums: Sequence[tuple[FloatArray, FloatArray]], most: int, modes: int, ridge: float) -> FloatArray:
     """The matrix from coordinates of two frames, and what drives both ends of the next interval, to the next frame.
 
     Args:
-        series: (1 + T', m) coordinates before time zero and at the frames of each trial.
-        driving: (R, T, D) of these trials.
+        sums: normal equations of each trial.
+        most: number of their coordinates.
+        modes: number of coordinates of the matrix.
         ridge: over the mean of the diagonal.
     """
-    rows = [_rows(z[1:-1], z[:-2], own[: len(z) - 1]) for z, own in zip(series, driving, strict=True)]
-    known, wanted = np.concatenate(rows), np.concatenate([z[2:] for z in series])
-    gram = known.T @ known
+    gram, moment = (np.sum(parts, axis=0) for parts in zip(*sums, strict=True))
+    kept = np.r_[:modes, most : most + modes, 2 * most : len(gram)]
+    gram = gram[np.ix_(kept, kept)]
     gram += (ridge * np.trace(gram) / len(gram) or 1.0) * np.eye(len(gram))  # Too few frames predict no motion.
-    return np.asarray(np.linalg.solve(gram, known.T @ wanted))
+    return np.asarray(np.linalg.solve(gram, moment[kept, :modes]))
 
 
 def _rolled(matrix: FloatArray, starts: FloatArray, driving: FloatArray) -> FloatArray:

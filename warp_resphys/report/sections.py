@@ -67,11 +67,16 @@ def errors_table(metrics: Mapping[str, Any], settings: RunSettings, brief: bool 
     columns = ["Mean error", *(["90 % interval"] if with_intervals else []), "Against the best other", *by_load]
     reconstructed = {} if brief else metrics.get("errors_vs_reconstruction_mm", {})
     columns += [*(["Against the reconstruction"] if reconstructed else []), *(["Published"] if published else [])]
+    missing = (
+        {} if brief else {m: why for own in folds_in(metrics) for m, why in own.get("missing_baselines", {}).items()}
+    )
     rows: list[Row] = []
     for model, (name, meaning) in MODELS.items():
-        if model not in errors and model not in published:
+        if model not in errors and model not in published and model not in missing:
             continue
-        if model in idle:
+        if model in missing:
+            meaning = f"without physics: {missing[model]}"
+        elif model in idle:
             meaning = "no force: no epoch of its training was kept"
         elif model == "resphys" and "law" in errors:
             meaning = "the learned force on the simulator with the identified law"

@@ -104,7 +104,8 @@ def main() -> None:
         beams, robots = selected(options.only)
         runs = []
         for name, variant in beams:
-            overrides = [*ROWS["variants"][variant]["overrides"], *beyond]
+            own = ROWS["beams"][name].get("overrides", ())
+            overrides = [*own, *ROWS["variants"][variant]["overrides"], *beyond]
             runs.append(run_of(f"{name}/{variant}", name, overrides))
         folders = {name: ROWS["robots"][name].get("recordings") for name in robots}  # none where a simulation plays
         places = {name: folder and options.data / folder for name, folder in folders.items()}

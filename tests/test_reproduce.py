@@ -64,6 +64,8 @@ def test_every_row_is_an_experiment():
     assert {*reproduce.ROWS["beams"]} <= experiments
     every = [*reproduce.ROWS["robots"].values(), *reproduce.ROWS["variants"].values()]
     assert configuration("config", *(override for row in every for override in row.get("overrides", ())))
+    for name, beam in reproduce.ROWS["beams"].items():
+        assert configuration("config", f"experiment={name}", *beam.get("overrides", ())).get("law") is None
 
 
 def test_gains_and_the_best_models_are_those_of_the_trials():

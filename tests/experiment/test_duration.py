@@ -14,6 +14,7 @@ from warp_resphys.io.stages import run_stages
 from warp_resphys.pipeline import _announce, acquire, learning_stages
 
 TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "trainer.epochs=40", "trainer.rollout_every=20")
+TINY += ("~law", "~data.others", "timing=true")
 ALWAYS = {
     "_SHORT": 0.0,
     "_LEAST_SECONDS": 0.0,

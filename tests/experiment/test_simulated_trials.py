@@ -117,7 +117,8 @@ def test_the_base_moves_in_the_steps_of_the_target(tmp_path):
     swing = "{frequency:5.0,translation:[0,0,0.004],rotation:[0,0.1,0]}"
     data = ("data.kind=moving_base", "data.steps=4", f"data.base_motion={{swings:{{a:{swing}}}}}")
     data += ("data.amplitudes={train:[1.0],validation:[1.5],test:[2.0]}",)
-    dataset, run = simulated(tmp_path, COARSE[0], *OWN[:3], "~data.load", "~data.weights_g", *data)
+    gone = ("~law", "~data.load", "~data.weights_g", "~data.others")
+    dataset, run = simulated(tmp_path, COARSE[0], *OWN[:3], *gone, *data)
     body = build_body(run)
     clamp = body.mesh.vertices[body.fixed_vertices]
     for row in range(3):
@@ -165,10 +166,10 @@ def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured
 
 @pytest.mark.parametrize(
     ("experiment", "unit", "factor"),
-    [("beam_twist", "°", np.pi / 180.0), ("beam_oscillation", " g", 1e-3)],
+    [(["experiment=beam_twist"], "°", np.pi / 180.0), (["~data.others"], " g", 1e-3)],
 )
 def test_the_quick_budget_picks_evenly(experiment, unit, factor):
-    runs = [settings(f"experiment={experiment}", f"budget={budget}") for budget in ("full", "quick")]
+    runs = [settings(*experiment, f"budget={budget}") for budget in ("full", "quick")]
     full, quick = (run.data for run in runs)
     assert full.limit is None
     assert quick.amounts == full.amounts

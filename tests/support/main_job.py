@@ -16,7 +16,10 @@ LEARNED = ["train_resphys", "train_simfree", "evaluate", "time", "report"]
 CORRECTED = ["reconstruct_resphys", "train_resphys", "evaluate", "time", "report"]
 MODELS = ("simulation", "resphys", "reconstruction")
 SMALL = ["mesh.divisions=[4,2,2]"]
-SHORT = [
+SHORT = [  # without the law and the loads of another kind
+    "~law",
+    "~data.others",
+    "timing=true",
     "data.steps=12",
     "data.weights_g.train=[50,90,130]",
     "data.weights_g.validation=[110]",

@@ -22,11 +22,12 @@ from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..settings.run import RunSettings
 from ..settings.stages import ReportStage, StageSettings
+from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on, workers_for
-from .simulate import build_target, under_forces
+from .simulate import build_target, weights
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
@@ -70,8 +71,8 @@ def generate_motion(context: StageContext) -> None:
     data = settings.data
     target, simulation = build_target(settings, settings.target), build_simulator(settings, settings.simulation)
     with torch.no_grad():
-        weights = 1e-3 * np.array(data.weights_g.observed)[:, None] * np.asarray(target.simulator.gravity)
-        held = under_forces(target.simulator, data.load, weights)
+        total = 1e-3 * np.array(data.weights_g.observed)[:, None] * np.asarray(target.simulator.gravity)
+        held = target.simulator.static_equilibrium(Inputs(weights(target.simulator, data.load, total)))
         moved = target.simulator.rollout(held, data.steps * target.substeps).q[:: target.substeps, 0]
         start = State(target.seen(held.q), target.seen(held.v))
         motion = {"q": target.seen(moved), "uncorrected_q": simulation.rollout(start, data.steps).q[:, 0]}

@@ -249,7 +249,8 @@ def _check_target(run: RunSettings, body: Body) -> None:
         with naming(f"{key}.mesh: "):
             vertices_in(simulator.body.mesh, body.mesh)
         if isinstance(run.data, ReleaseFromLoad):
-            places = {f"data.others.{name}.at": held.at for name, held in run.data.others.items() if held.at}
+            others = run.data.others.items()
+            places = {f"data.others.{name}.at": one.at for name, held in others for one in held if one.at}
             for place, at in {"data.load": run.data.load, **places}.items():
                 with naming(f"{place}: "):
                     select_vertices(simulator.body.mesh, **at.arguments())

@@ -5,6 +5,7 @@ and its integrator. It is held or inflated, released, and its state at the relea
 simulated trials of a run (`experiment.simulate`).
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -30,7 +31,7 @@ from .build import build_body, build_simulator
 from .experiment import LAW, Experiment
 from .files import LAW_FILE, SHAPES
 from .identify import Checkpoint
-from .simulate import held_alone, substeps_of, target_settings, vertices_in
+from .simulate import loads, substeps_of, target_settings, twist, vertices_in
 
 
 def try_shapes(context: StageContext) -> None:
@@ -120,7 +121,9 @@ def _target(settings: StageSettings, shape: ShapeSettings) -> Simulator:
 def _held(simulator: Simulator, shape: ShapeSettings) -> State:
     """Returns the state before the release."""
     if shape.held is not None:
-        return held_alone(simulator, shape.held, shape.held.at or shape.fixed or PlaceSettings(), "held.at")
+        if shape.held.twist_deg:
+            return replace(simulator.rest_state(), q=twist(simulator, shape.held))
+        return simulator.static_equilibrium(Inputs(loads(simulator, [shape.held], PlaceSettings(), "held.at")))
     quantity = driving_quantity(shape)
     assert quantity is not None
     return simulator.static_equilibrium(Inputs(**{quantity.name: simulator.tensor([list(shape.inputs or ())])}))

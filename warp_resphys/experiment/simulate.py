@@ -8,7 +8,6 @@ positions and velocities are interpolated to other vertices x by the shape funct
 which is exact for fields of the degree of the cells (tests/experiment/test_target.py).
 """
 
-import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -38,7 +37,6 @@ from ..settings.trials import (
     MotionSettings,
     MovingBase,
     ReadingSettings,
-    ReleaseFromLoad,
     ReleaseFromTwist,
     SimulatedData,
     Trial,
@@ -48,8 +46,6 @@ from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET, GIVEN, Dataset
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
-
-log = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
 
@@ -243,47 +239,58 @@ def _free_motion(part: TrialPart, report: Report) -> Arrays:
 
 
 def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Trial]) -> State:
-    """Initial states of trials, by ``data.kind``, or as a trial is held by itself."""
-    rows = [row for row, trial in enumerate(trials) if trial.load is None]
-    amounts, q = np.array([trials[row].amount for row in rows]), simulator.rest_state(len(trials)).q.clone()
-    if rows and isinstance(data, MovingBase):
-        q[rows] = simulator.static_equilibrium(Inputs(), batch=len(rows)).q
-    elif rows and isinstance(data, ReleaseFromTwist):
-        q[rows] = twisted(simulator.rest_positions, simulator.tensor(amounts), "xyz".index(data.twist_axis))
-    elif rows and isinstance(data, ReleaseFromLoad):
-        log.info("computing the equilibrium under %d weights", len(rows))
-        q[rows] = under_forces(simulator, data.load, amounts[:, None] * np.asarray(simulator.gravity)).q
-    for row, trial in enumerate(trials):
-        if trial.load is not None:
-            assert isinstance(data, ReleaseFromLoad)
-            key = "data.others" if trial.load.at else "data.load"
-            q[row] = held_alone(simulator, trial.load, trial.load.at or data.load, key).q[0]
+    """Initial states of trials, by ``data.kind``, or as loads of their own hold them.
+
+    Raises:
+        InputError: a weight hangs on fixed vertices only.
+    """
+    amounts, q = np.array([trial.amount for trial in trials]), simulator.rest_state(len(trials)).q.clone()
+    if isinstance(data, MovingBase):
+        q = simulator.static_equilibrium(Inputs(), batch=len(trials)).q
+    elif isinstance(data, ReleaseFromTwist):
+        q = twisted(simulator.rest_positions, simulator.tensor(amounts), "xyz".index(data.twist_axis))
+    else:
+        forces = weights(simulator, data.load, amounts[:, None] * np.asarray(simulator.gravity))
+        twists = {row: trial.load[0] for row, trial in enumerate(trials) if trial.load and trial.load[0].twist_deg}
+        for row, trial in enumerate(trials):
+            if trial.load and row not in twists:
+                forces[row] = loads(simulator, trial.load, data.load, "data.others")
+        hanging = [row for row in range(len(trials)) if row not in twists]
+        if hanging:
+            q[hanging] = simulator.static_equilibrium(Inputs(forces[hanging])).q
+        for row, held in twists.items():
+            q[row] = twist(simulator, held)
     return State(q, torch.zeros_like(q))
 
 
-def held_alone(simulator: Simulator, held: HeldSettings, load: PlaceSettings, key: str) -> State:
-    """Returns the state (1, N, 3) of a body that is held in a way of its own.
+def twist(simulator: Simulator, held: HeldSettings) -> torch.Tensor:
+    """Positions (1, N, 3) of a twisted body [m]."""
+    angle = simulator.tensor([math.radians(held.twist_deg)])
+    return twisted(simulator.rest_positions, angle, "xyz".index(held.twist_axis))
+
+
+def loads(simulator: Simulator, held: Sequence[HeldSettings], load: PlaceSettings, key: str) -> torch.Tensor:
+    """Nodal forces (1, N, 3) of weights that act at the same time [N].
 
     Args:
         simulator: of the body.
-        held: how it is held.
-        load: vertices that carry the weight.
-        key: of these vertices in the configuration, for errors.
+        held: the weights.
+        load: vertices that carry weights without a place of their own.
+        key: of these weights in the configuration, for errors.
 
     Raises:
-        InputError: all vertices of the place are fixed.
+        InputError: all vertices of a place are fixed.
     """
-    if held.twist_deg:
-        angle = simulator.tensor([math.radians(held.twist_deg)])
-        q = twisted(simulator.rest_positions, angle, "xyz".index(held.twist_axis))
-        return State(q, torch.zeros_like(q))
-    along = np.asarray(held.direction, dtype=np.float64) / np.linalg.norm(held.direction)
-    force = 1e-3 * held.weight_g * float(np.linalg.norm(simulator.gravity)) * along
-    return under_forces(simulator, load, force[None], key)
+    total = torch.zeros_like(simulator.rest_positions)[None]
+    for one in held:
+        along = np.asarray(one.direction, dtype=np.float64) / np.linalg.norm(one.direction)
+        force = 1e-3 * one.weight_g * float(np.linalg.norm(simulator.gravity)) * along
+        total = total + weights(simulator, one.at or load, force[None], key)
+    return total
 
 
-def under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: str = "data.load") -> State:
-    """Equilibrium of the body under forces (B, 3) [N] on the vertices of a place, in equal shares.
+def weights(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: str = "data.load") -> torch.Tensor:
+    """Nodal forces (B, N, 3) of total forces (B, 3) in equal shares on the vertices of a place [N].
 
     Raises:
         InputError: all vertices of the place are fixed.
@@ -291,7 +298,7 @@ def under_forces(simulator: Simulator, load: PlaceSettings, forces: FloatArray, 
     face = select_vertices(simulator.body.mesh, **load.arguments())
     if np.isin(face, simulator.body.fixed_vertices).all():
         raise InputError(f"{key} selects fixed vertices only: hang the weights on vertices that can move.")
-    return simulator.static_equilibrium(Inputs(distributed(simulator, face, simulator.tensor(forces))))
+    return distributed(simulator, face, simulator.tensor(forces))
 
 
 def distributed(simulator: Simulator, vertices: NDArray[np.int64], forces: torch.Tensor) -> torch.Tensor:

@@ -245,9 +245,7 @@ def _to_do(metrics: Mapping[str, Any], settings: IdentifySettings | None, known:
     best, chosen, parts = _least(known, _RANKED), recommended(known), list[str]()
     count = len(known[best]) if best else 0
     if best in _BETWEEN:
-        parts.append(
-            "to judge the simulator, test it on trials unlike those of the training (experiment=law_beam does)"
-        )
+        parts.append("to judge the simulator, test it on trials unlike those of the training")
     elif 0 < count < LEAST_TRIALS:
         few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
         parts.append(f"{few} too few for an interval; use at least five")

@@ -1,6 +1,7 @@
 """Settings of trials: their source, how they begin, their markers, and their split."""
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
@@ -124,7 +125,7 @@ class Trial(_Performed):
     sequence: int | None = None  # number of its random inputs in a simulated laboratory, or None
     scale: float = 1.0  # factor of its simulated inputs
     amount: float = 0.0  # parameter of a simulated trial: a weight [kg], an angle [rad] or a factor of a motion
-    load: "HeldSettings | None" = None  # how it is held, where that differs from the other trials
+    load: "tuple[HeldSettings, ...] | None" = None  # what holds it, where that differs from the other trials
 
     @property
     def is_released(self) -> bool:
@@ -200,7 +201,7 @@ class _Simulated(Settings):
 
 
 class HeldSettings(Settings):
-    """Weight or twist that holds a body before its release, in a test trial of its own."""
+    """Weight or twist that holds a body before its release, in its own test trial; a list of weights acts at once."""
 
     weight_g: NotNegative = setting(0.0, "weight", unit="g")
     direction: Direction = setting((0.0, 0.0, -1.0), "direction in which it pulls")
@@ -218,13 +219,33 @@ class HeldSettings(Settings):
         return self
 
 
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, (Mapping, HeldSettings)) else value
+
+
+def _weights(held: tuple[HeldSettings, ...]) -> tuple[HeldSettings, ...]:
+    if len(held) > 1 and any(one.twist_deg for one in held):
+        raise ValueError("it must be one twist, or a list of weights.")
+    return held
+
+
+# One load, or a list of weights that act at the same time.
+Held = Annotated[
+    Some[HeldSettings],
+    BeforeValidator(_listed, json_schema_input_type=HeldSettings | Some[HeldSettings]),
+    AfterValidator(_weights),
+]
+
+
 class ReleaseFromLoad(_Simulated):
     """Bodies that are released from rest under weights."""
 
     kind: Literal["release_from_load"]
     load: PlaceSettings = setting(description="vertices that carry the weights, in equal shares")
     weights_g: AmountSettings = setting(description="weights", unit="g")
-    others: dict[str, HeldSettings] = setting({}, "further test trials by name, held in other ways")
+    others: dict[str, Held] = setting(
+        {}, "further test trials by name, held in other ways: by a load, or by a list of weights"
+    )
 
 
 class ReleaseFromTwist(_Simulated):

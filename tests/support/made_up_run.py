@@ -330,7 +330,7 @@ OFFSETS = {"reconstruction": 1e-9, "resphys": 2e-6}  # m
 
 def vertex_settings():
     """Settings of an experiment with observed vertices."""
-    return settings("mesh.divisions=[4,1,1]", f"time_step={STEP}")
+    return settings("mesh.divisions=[4,1,1]", f"time_step={STEP}", "~law", "~data.others", "timing=true")
 
 
 def swinging(vertices, amplitude, period=0.14, offset=0.0, steps=STEPS):

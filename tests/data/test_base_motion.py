@@ -51,12 +51,15 @@ class TestFunctions:
 
 
 class TestTables:
-    def test_a_table_gives_the_motion_of_its_point(self, tmp_path):
+    @pytest.mark.parametrize(("delimiter", "decimal", "encoding"), [(",", ".", "utf-8"), (";", ",", "utf-16")])
+    def test_a_table_gives_the_motion_of_its_point(self, tmp_path, delimiter, decimal, encoding):
         known = prescribed(SWING, TIMES)
         place, offset = np.array([0.03, 0.01, -0.02]), np.array([5.0, -2.0, 1.0])
         quaternions = Rotation.from_rotvec(known[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
         table = np.column_stack([TIMES, moved(known, place[None])[:, 0] + offset, quaternions])
-        np.savetxt(tmp_path / "shaker.csv", table, delimiter=",", header="t, x, y, z, w, i, j, k")
+        np.savetxt(tmp_path / "shaker.csv", table, delimiter=delimiter, header="t, x, y, z, w, i, j, k")
+        text = (tmp_path / "shaker.csv").read_text()
+        (tmp_path / "shaker.csv").write_text(text.replace(".", decimal), encoding=encoding)
         result = prescribed(MotionSettings(**{"file": "shaker.csv", "about": place}), TIMES[3:-3] + 0.004, tmp_path)
         np.testing.assert_allclose(moved(result), moved(prescribed(SWING, TIMES[3:-3] + 0.004)), atol=2e-5)
 

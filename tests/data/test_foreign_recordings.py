@@ -135,12 +135,30 @@ def trajectory():
     return generator.normal(size=(40, 3, 3)).cumsum(axis=0)
 
 
-def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory):
+@pytest.mark.parametrize(("unit", "size"), [("mm", 1e3), ("MM\0", 1e3), ("Meters", 1.0), (" metre ", 1.0), ("CM", 1e2)])
+def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory, caplog, unit, size):
     trajectory[7:9, 1] = np.nan
-    recording = read_recording(write_c3d(tmp_path / "small.c3d", trajectory, "abc"))
-    assert recording.labels == ("a", "b", "c")
+    trajectory[3, 2] = 0.0
+    labels = ["Arm:Tip", "Arm:Fuß", "*31"]
+    path = write_c3d(tmp_path / "small.c3d", size * trajectory, labels, unit)
+    recording = read_recording(path.rename(tmp_path / "SMALL.C3D"))
+    assert recording.labels == ("Tip", "Fuß", "*31")
     assert recording.rate == 200.0
-    np.testing.assert_allclose(recording.positions, 1e-3 * trajectory, rtol=1e-6, atol=1e-9)
+    trajectory[3, 2] = np.nan
+    np.testing.assert_allclose(recording.positions, trajectory, rtol=1e-6, atol=1e-9)
+    assert "1 positions at exactly (0, 0, 0) count as occlusions, of '*31'" in caplog.text
+
+
+def test_c3d_files_with_more_than_255_markers_and_without_model_outputs(tmp_path):
+    positions = np.random.default_rng(0).normal(size=(5, 600, 3))
+    labels = [f"Tip {number}" for number in range(600)]
+    file = read_recording(write_c3d(tmp_path / "many.c3d", positions, labels))
+    assert file.labels == tuple(labels)
+    np.testing.assert_allclose(file.positions, 1e-3 * positions, rtol=1e-6)
+    other = ezc3d.c3d(str(tmp_path / "many.c3d"))
+    other.add_parameter("POINT", "ANGLES", ["Tip 3", "Tip 599"])
+    other.write(str(tmp_path / "angles.c3d"))
+    assert read_recording(tmp_path / "angles.c3d").labels == tuple(labels[:3] + labels[4:599])
 
 
 def test_missing_and_foreign_files(tmp_path):
@@ -152,6 +170,14 @@ def test_missing_and_foreign_files(tmp_path):
     (tmp_path / "empty.c3d").touch()
     with pytest.raises(DataFileError, match="not a C3D file"):
         read_recording(tmp_path / "empty.c3d")
+
+
+def test_the_byte_order_of_sgi_is_refused(tmp_path, trajectory):
+    content = bytearray(write_c3d(tmp_path / "a.c3d", trajectory, "abc").read_bytes())
+    content[(content[0] - 1) * 512 + 3] = 86
+    (tmp_path / "a.c3d").write_bytes(content)
+    with pytest.raises(DataFileError, match=r"a\.c3d has the byte order of SGI \(MIPS\) computers, which is not read"):
+        read_recording(tmp_path / "a.c3d")
 
 
 @pytest.mark.parametrize("part", [0.001, 0.3, 0.98])

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..io.errors import DataFileError
+from ..io.text import read_rows
 from ..settings.trials import MotionSettings
 from .rigid import FloatArray, RigidTransform, kabsch
 
@@ -71,8 +72,9 @@ def _table(path: Path, times: FloatArray) -> FloatArray:
     Lines that begin with # are comments. Before and after the table, the first and the last pose stay.
     """
     try:
-        table = np.loadtxt(path, delimiter=",", ndmin=2)
-    except (OSError, ValueError) as error:
+        rows = [row for row in read_rows(path) if any(row) and not row[0].startswith("#")]
+        table = np.array(rows, dtype=np.float64, ndmin=2)
+    except ValueError as error:
         raise DataFileError(f"{path} cannot be read as a table of numbers: {error}.") from error
     if table.shape[1:] != (8,) or len(table) < 4 or not (np.diff(table[:, 0]) > 0.0).all():
         raise DataFileError(

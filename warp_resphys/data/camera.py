@@ -29,6 +29,7 @@ import yaml
 from typing_extensions import override
 
 from ..io.errors import DataFileError, InputError
+from ..io.text import read_text
 from ..stepping.rotations import rotations
 from .markers import Markers
 from .observation import Observation
@@ -79,12 +80,8 @@ class Lens:
             DataFileError: it cannot be read, or has no camera matrix of nine numbers.
             InputError: a number of coefficients that is not known.
         """
-        try:
-            text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise DataFileError(f"Cannot read {path} ({error}); give the calibration of a camera as YAML.") from error
         # OpenCV writes a directive that is not YAML's, and a tag of its own.
-        lines = [line.replace("!!opencv-matrix", "") for line in text.splitlines() if not line.startswith("%YAML")]
+        lines = [line.replace("!!opencv-matrix", "") for line in read_text(path).split("\n") if line[:5] != "%YAML"]
         try:
             content = yaml.safe_load("\n".join(lines))
             matrix, distortion = (_numbers(content, names) for names in (_MATRIX, _DISTORTION))

@@ -8,6 +8,7 @@ because that would take longer than decoding most files.
 import contextlib
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -67,16 +68,25 @@ def decode(library: str, path: Path, *names: str) -> Arrays:
 
 
 def c3d_arrays(path: str) -> Arrays:
-    """Reads points (4, M, T), labels, units and rate of a C3D file."""
+    """Reads points (4, M, T), their labels, units and rate of a C3D file, and the labels of points that are no markers.
+
+    A parameter has at most 255 labels: LABELS2, LABELS3 and so on continue the list.
+    """
     import ezc3d
 
     file = ezc3d.c3d(path)
     point = file["parameters"]["POINT"]
+    parts = sorted((name for name in point if re.fullmatch(r"LABELS\d*", name)), key=lambda name: int(name[6:] or 1))
+    computed = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS", "REACTIONS")  # model outputs of Vicon
+    texts = {
+        "labels": [label for name in parts for label in point[name]["value"]],
+        "units": point["UNITS"]["value"] if "UNITS" in point else [],
+        "computed": [label for name in computed if name in point for label in point[name]["value"]],
+    }
     return {
         "points": np.asarray(file["data"]["points"], dtype=np.float64),
-        "labels": np.array(point["LABELS"]["value"], dtype=np.str_),
-        "units": np.array(point["UNITS"]["value"] if "UNITS" in point else [], dtype=np.str_),
         "rate": np.array(point["RATE"]["value"], dtype=np.float64),
+        **{name: np.array(values, dtype=np.str_) for name, values in texts.items()},
     }
 
 

@@ -9,7 +9,6 @@ tables of DeepLabCut, or any with the columns `frame`, `tip.x` and `tip.y`, or f
 (T, M, 2) and perhaps `visibility` (T, M), as those of CoTracker.
 """
 
-import csv
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from ..data.camera import PlacedCamera
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_arrays
 from ..io.settings import Count, Many, Positive, Settings, Some, Word, parse
+from ..io.text import read_rows, read_text
 from ..settings.pictures import ColourSettings
 
 FloatArray = NDArray[np.float64]
@@ -131,11 +131,9 @@ def read_scene(path: Path, scanned: bool = False) -> SceneFile:
         DataFileError: it is missing or damaged, or an entry is missing or of a wrong shape.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8")) if path.exists() or not scanned else {}
+        content = json.loads(read_text(path)) if path.exists() or not scanned else {}
         scene = parse(_Scene, content if isinstance(content, dict) else {})
-    except OSError as error:
-        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and data.poses.") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except json.JSONDecodeError as error:
         raise DataFileError(f"{path} is no JSON ({error}): write the cameras of its pictures anew.") from error
     except InputError as error:
         raise DataFileError(f"{path}: {error}") from None
@@ -237,7 +235,7 @@ def read_depth(path: Path, unit: float) -> FloatArray:
     Raises:
         DataFileError: it is missing, or has no single number at each pixel.
     """
-    if path.suffix == ".npy":
+    if path.suffix.lower() == ".npy":
         values = read_arrays(path)[""]
     else:
         try:
@@ -265,7 +263,7 @@ def read_tracked(path: Path, names: Sequence[str], least: float, frames: Sequenc
         DataFileError: the file is missing or damaged, or lacks a point or a frame.
     """
     try:
-        if path.suffix == ".npz":
+        if path.suffix.lower() == ".npz":
             arrays = read_arrays(path)
             tracks = np.asarray(arrays["tracks"], dtype=np.float64)
             if tracks.ndim != 3 or tracks.shape[1:] != (len(names), 2):
@@ -284,8 +282,7 @@ def read_tracked(path: Path, names: Sequence[str], least: float, frames: Sequenc
 
 def _table(path: Path, names: Sequence[str], least: float) -> dict[int, FloatArray]:
     """Pixels (M, 2) by frame of a table whose first column has the numbers of the frames."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+    rows = [row for row in read_rows(path) if any(row)]
     heads, first = rows[0], 1
     if heads[0] == "scorer":
         of_head = {row[0]: row for row in rows[: len(_HEADS)] if row[0] in _HEADS}
@@ -325,11 +322,11 @@ def read_scan(path: str | Path, unit: float, seed: int = 0) -> tuple[FloatArray,
 
     path, normals = Path(path), None
     try:
-        if path.suffix == ".npy":
+        if path.suffix.lower() == ".npy":
             points = np.asarray(read_arrays(path)[""], dtype=np.float64)
-        elif path.suffix == ".pcd":
+        elif path.suffix.lower() == ".pcd":
             points = _pcd(path)
-        elif path.suffix in _READ_BY_TRIMESH:
+        elif path.suffix.lower() in _READ_BY_TRIMESH:
             if not path.is_file():
                 raise ValueError("there is no such file")
             read: Any = trimesh.load(str(path), process=False)

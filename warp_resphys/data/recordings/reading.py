@@ -13,14 +13,22 @@ from ...io.errors import DataFileError, InputError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from ...settings.trials import BagSettings, TableSettings
 from .bag import SUFFIXES, is_bag, read_raw_bag, topics_of
-from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording, Recording, to_recording
+from .recording import (
+    SI_PER_ACTUATION_UNIT,
+    FloatArray,
+    RawRecording,
+    Recording,
+    hide_zeros,
+    to_recording,
+    without_subject,
+)
 from .text import read_raw_text
 
 _KIND = "recording"
 _UNITS = {"positions": "units", "actuation": "actuation_units"}
 _NAMES = ("positions", "labels", "rate_hz", "actuation", "rest", "base", "start", "quaternions", *_UNITS.values())
 _C3D_MAGIC = 0x50
-_BIG_ENDIAN_PROCESSOR = 86
+_SGI_PROCESSOR = 86
 
 
 def read_recording(
@@ -163,6 +171,10 @@ def _read_c3d(path: Path) -> RawRecording:
         processor_at = (content[0] - 1) * 512 + 3
         if len(content) < 512 or content[0] == 0 or len(content) <= processor_at:
             raise DataFileError(f"{path} is truncated: it ends after {len(content)} bytes; copy or export it again.")
+        if content[processor_at] == _SGI_PROCESSOR:
+            raise DataFileError(
+                f"{path} has the byte order of SGI (MIPS) computers, which is not read: export it in that of Intel."
+            )
         arrays = decode("ezc3d", path)
     except OSError as error:
         raise DataFileError(f"Cannot read {path}: {error.strerror}; check the path of the recording.") from error
@@ -171,19 +183,22 @@ def _read_c3d(path: Path) -> RawRecording:
     points = arrays["points"]
     if points.ndim != 3 or points.shape[1] == 0 or points.shape[2] == 0:
         raise DataFileError(f"{path} holds no marker trajectories: give a C3D file with 3D points.")
-    order = ">" if content[processor_at] == _BIG_ENDIAN_PROCESSOR else "<"
-    first, last = struct.unpack_from(order + "2H", content, 6)
+    first, last = struct.unpack_from("<2H", content, 6)
     if points.shape[2] < last - first + 1:  # The decoder silently corrects the header.
         raise DataFileError(
             f"{path} is truncated: it holds {points.shape[2]} of the {last - first + 1} frames that its header "
             "declares; copy or export it again."
         )
-    return RawRecording(
-        positions=points[:3].transpose(2, 1, 0),
-        labels=arrays["labels"][: points.shape[1]].tolist(),
-        unit=str(arrays["units"][0]).strip() if arrays["units"].size else None,
+    labels = arrays["labels"][: points.shape[1]].tolist()
+    labels += [""] * (points.shape[1] - len(labels))
+    chosen = [column for column, label in enumerate(labels) if label not in arrays["computed"]]
+    raw = RawRecording(
+        positions=points[:3, chosen].transpose(2, 1, 0),
+        labels=without_subject([labels[column].strip() for column in chosen]),
+        unit=str(arrays["units"][0]) if arrays["units"].size else None,
         rate=float(arrays["rate"][0]) if arrays["rate"].size else None,
     )
+    return hide_zeros(raw, path)
 
 
 READERS: Final[Mapping[str, Callable[[Path], RawRecording]]] = {

@@ -1,6 +1,8 @@
 """Recordings: labelled markers over time, in metres and seconds, with occlusions as NaN."""
 
 import dataclasses
+import logging
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,10 +14,19 @@ from scipy.spatial.transform import Rotation
 from ...io.errors import DataFileError, InputError, listed
 from ..base_motion import since_first
 
+log = logging.getLogger(__name__)
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_LONG = {"": "m", "centi": "cm", "milli": "mm"}
+_SPELLED = {
+    f"{prefix}{word}": unit for prefix, unit in _LONG.items() for word in ("meter", "meters", "metre", "metres")
+}
+_UNLABELLED = re.compile(
+    r"(?:.*:)?\*|unlabell?ed|uname|[\d ]*$", re.IGNORECASE
+)  # as Vicon and OptiTrack name trajectories
 # Factors to SI units; 1 for an actuation without a unit.
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
@@ -95,6 +106,34 @@ class RawRecording:
     turns: FloatArray | None = None
 
 
+def length_unit(text: str) -> str:
+    """Returns m, cm or mm for a name of theirs in any case (Meters, MM), else the text; without blanks and zeros."""
+    word = text.replace("\0", " ").strip()
+    unit = _SPELLED.get(word.lower(), word.lower())
+    return unit if unit in METRES_PER_UNIT else word
+
+
+def without_subject(labels: Sequence[str]) -> list[str]:
+    """Returns labels as in Arm:Tip without the name of the subject, if all have the same one; unlabelled ones stay."""
+    named = [label for label in labels if not _UNLABELLED.match(label)]
+    if len({label.rpartition(":")[0] for label in named}) != 1:
+        return list(labels)
+    return [label.rpartition(":")[2] if label in named else label for label in labels]
+
+
+def hide_zeros(raw: RawRecording, path: Path) -> RawRecording:
+    """Replaces positions at exactly (0, 0, 0), which some programs write for occlusions, by NaN, with a warning."""
+    zero = (raw.positions == 0.0).all(axis=2)
+    if raw.turns is not None:
+        zero &= ~np.isfinite(raw.turns).all(axis=2)
+    if zero.any():
+        names = [label for label, hidden in zip(raw.labels or (), zero.T, strict=False) if hidden.any()]
+        log.warning(
+            "%s: %d positions at exactly (0, 0, 0) count as occlusions, of %s.", path.name, zero.sum(), listed(names)
+        )
+    return dataclasses.replace(raw, positions=np.where(zero[..., None], np.nan, raw.positions))
+
+
 def to_recording(
     raw: RawRecording,
     path: Path,
@@ -113,7 +152,7 @@ def to_recording(
             too large or too small for the unit.
         InputError: The unit, rate or list of names in the arguments is invalid.
     """
-    if units is not None and units not in METRES_PER_UNIT:
+    if units is not None and length_unit(units) not in METRES_PER_UNIT:
         raise InputError(f"units is {units!r}: set it to m, cm or mm, the unit of {path}.")
     if rate is not None and not RATES[0] <= rate <= RATES[1]:
         raise InputError(f"rate is {rate!r}: set it to the frames a second of {path}.")
@@ -122,13 +161,16 @@ def to_recording(
         raise DataFileError(
             f"{path} holds no marker trajectories: positions must be (frames, markers, 3), not {shape}."
         )
-    unit, rate = raw.unit if units is None else units, raw.rate if rate is None else rate
-    if unit is None or unit not in METRES_PER_UNIT:
-        said = "does not say in which unit its positions are" if unit is None else f"gives positions in '{unit}'"
-        raise DataFileError(f"{path} {said}: export it in m, cm or mm, or set units.")
+    unit, rate = length_unit((raw.unit if units is None else units) or ""), raw.rate if rate is None else rate
+    lacks, cures = list[str](), list[str]()
+    if unit not in METRES_PER_UNIT:
+        lacks.append(f"gives positions in '{unit}'" if unit else "does not say in which unit its positions are")
+        cures.append("units to m, cm or mm (data.units=mm, recording.units=mm)")
     if rate is None or not RATES[0] <= rate <= RATES[1]:
-        said = "does not say how many frames a second it has" if rate is None else f"gives a frame rate of {rate} Hz"
-        raise DataFileError(f"{path} {said}: export it with its rate, or set rate, in Hz.")
+        lacks.append(f"gives a frame rate of {rate} Hz" if rate else "does not say how many frames a second it has")
+        cures.append("rate in Hz (data.rate=100, recording.rate=100)")
+    if lacks or rate is None:
+        raise DataFileError(f"{path} {' and '.join(lacks)}: set {' and '.join(cures)}, or export it with them.")
     names = _names(raw, path, labels)
     factor = METRES_PER_UNIT[unit]
     positions = np.ascontiguousarray(raw.positions, dtype=np.float64) * factor

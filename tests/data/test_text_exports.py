@@ -1,0 +1,207 @@
+"""Tables of six systems and of spreadsheets, in the encodings, languages and versions that laboratories have."""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.command_line import outcome, refusal
+from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.io.errors import DataFileError, ResphysWarning
+
+FRAMES, TIME = np.arange(1, 31), np.arange(30) / 100.0
+TIP = np.stack([100 + 9 * np.sin(9 * TIME), 0 * TIME + 2, 5 * TIME + 1], -1)  # [mm]
+BASE = np.stack([0 * TIME - 40, 0 * TIME + 3, 0 * TIME + 1], -1)
+TURN = Rotation.from_rotvec(np.linspace(0.1, 1.5, 30)[:, None] * [0.6, 0.1, 0.7])
+UNSEEN = TIP * np.where(np.isin(FRAMES, (5, 6)), 0.0, 1.0)[:, None]
+
+
+def rows(separator, *columns, decimal="."):
+    lines = np.column_stack(columns).tolist()
+    return "\n".join(separator.join(f"{x:.8g}".replace(".", decimal) for x in line) for line in lines) + "\n"
+
+
+def qualisys(data, names, included="3D"):
+    keys = "NO_OF_FRAMES\t30\nFREQUENCY\t100\nDESCRIPTION\t--\nTIME_STAMP\t2026-03-04, 10:11:12.345\t123.4\n"
+    kind = "MARKER" if included == "3D" else "BODY"
+    return f"{keys}EVENT\tgo\t12\t0.12\nDATA_INCLUDED\t{included}\n{kind}_NAMES\tSpitze_Ä\tFuß\n{names}{data}"
+
+
+def pose(place, turn, seen=1.0):
+    """Columns of a rigid body of Qualisys: place, angles, residual, and the matrix by its columns."""
+    entries = turn.as_matrix().swapaxes(1, 2).reshape(30, 9)
+    return np.column_stack([place, turn.as_euler("XYZ", degrees=True), 0.0 * TIME, entries]) * np.reshape(seen, (-1, 1))
+
+
+AXES = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{entry}]" for entry in range(9))]
+NAMES_3D = "Frame\tTime\t" + "\t".join(f"{label} {axis}" for label in ("Spitze_Ä", "Fuß") for axis in "XYZ") + "\n"
+NAMES_6D = "Frame\tTime\t" + "\t".join(f"{label} {axis}" for label in ("Spitze_Ä", "Fuß") for axis in AXES) + "\n"
+POSES = [pose(TIP, TURN), pose(BASE, Rotation.identity(30))]
+
+
+def motive(kinds, axes, data, take="swing", order="Quaternion"):
+    """A heading of Motive, by (kind, name, part) of each column."""
+    lines = zip(("Type", "Name", ""), zip(*kinds, strict=True), strict=True)
+    heads = [",".join(["", head, *cells]) for head, cells in lines]
+    keys = f"Format Version,1.25,Take Name,{take},Take Notes,,Capture Frame Rate,100.0,Export Frame Rate,100.0,"
+    keys += f"Rotation Type,{order},Length Units,Millimeters,Coordinate Space,Global\n\n"
+    return keys + "\n".join([*heads, "Frame,Time (Seconds)," + axes]) + "\n" + data
+
+
+MARKERS = [("Marker", name, "Position") for name in ("Spitze_Ä", "Fuß") for _ in "XYZ"]
+BODY = [*[("Rigid Body", "plate", "Rotation")] * 3, *[("Rigid Body", "plate", "Position")] * 3]
+SOLVED = [("Rigid Body Marker", "plate:Marker1", "Position")] * 3
+
+
+def vicon(names, axes, units, data, section="Trajectories"):
+    return f"{section}\n100\n,,{names}\nFrame,Sub Frame,{axes}\n,,{units}\n{data}\n"
+
+
+def trajectories(*names):
+    heads = [",".join([text] * len(names)) for text in ("X,Y,Z", "mm,mm,mm")]
+    return vicon(",,,".join(names), *heads, rows(",", FRAMES, 0 * TIME, *[TIP, BASE, BASE][: len(names)]))
+
+
+def objects(numbers, axes="RX,RY,RZ,", units="rad,rad,rad,", name="Global Angle Tip:Tip", section="Objects"):
+    return vicon(name, f"{axes}TX,TY,TZ", f"{units}mm,mm,mm", rows(",", FRAMES, 0 * TIME, numbers, TIP), section)
+
+
+ROTVEC = TURN.as_rotvec()
+DEVICES = "Devices\n1000\n,,Force\nFrame,Sub Frame,Fx\n,,N\n1,0,1\n1,1,2\n\n"
+ENGLISH = "Time (s)\tTip X (mm)\tTip Y (mm)\tTip Z (mm)\n"
+FILES = {  # text, encoding, labels, and whether the first one turns
+    "qualisys 3D": (qualisys(rows("\t", FRAMES, TIME, TIP, BASE), NAMES_3D), "cp1252", "Spitze_Ä Fuß", False),
+    "qualisys 3D, zeros": (qualisys(rows("\t", FRAMES, TIME, UNSEEN, BASE), NAMES_3D), "utf-8", "Spitze_Ä Fuß", False),
+    "qualisys 3D, residuals": (
+        qualisys(
+            rows("\t", FRAMES, TIP, TIME, BASE, TIME), "Frame\tA X\tA Y\tA Z\tA Residual\tB X\tB Y\tB Z\tB Residual\n"
+        ),
+        *("utf-8", "Spitze_Ä Fuß", False),
+    ),
+    "qualisys 6D": (qualisys(rows("\t", FRAMES, TIME, *POSES), NAMES_6D, "6D"), "cp1252", "Spitze_Ä Fuß", True),
+    "qualisys 6D, no names": (qualisys(rows("\t", *POSES), "", "6D"), "utf-8", "Spitze_Ä Fuß", True),
+    "qualisys 6D, commas": (
+        qualisys(rows("\t", FRAMES, TIME, *POSES, decimal=","), NAMES_6D, "6D").replace("\t", ";"),
+        *("cp1252", "Spitze_Ä Fuß", True),
+    ),
+    "qualisys 6D, zeros": (
+        qualisys(rows("\t", FRAMES, TIME, pose(TIP, TURN, UNSEEN[:, 0] != 0.0), POSES[1]), NAMES_6D, "6D"),
+        *("utf-8", "Spitze_Ä Fuß", True),
+    ),
+    "motive": (
+        motive(MARKERS, "X,Y,Z,X,Y,Z", rows(",", FRAMES, TIME, TIP, BASE), "Übung, schnell, 2"),
+        *("cp1252", "Spitze_Ä Fuß", False),
+    ),
+    "motive, angles": (
+        motive(
+            [*BODY, *SOLVED],
+            "X,Y,Z,X,Y,Z,X,Y,Z",
+            rows(",", FRAMES, TIME, TURN.as_euler("ZYX", degrees=True)[:, ::-1], TIP, TIP),
+            '"swing, fast"',
+            "ZYX",
+        ),
+        *("utf-8-sig", "plate", True),
+    ),
+    "motive, solved": (motive(SOLVED, "X,Y,Z", rows(",", FRAMES, TIME, TIP)), "utf-8", "plate:Marker1", False),
+    "nexus": (trajectories("Arm:Tip", "Arm:Base", "*31"), "utf-8", "Tip Base *31", False),
+    "nexus, a colon": (trajectories("Arm:Tip", "Arm:Base", "Unlabeled:u3"), "utf-8", "Tip Base Unlabeled:u3", False),
+    "nexus, two subjects": (trajectories("Arm:Tip", "Post:Base", "*31"), "utf-8", "Arm:Tip Post:Base *31", False),
+    "tracker": (objects(ROTVEC), "utf-8", "Tip", True),
+    "tracker, degrees": (objects(np.degrees(ROTVEC), units="deg,deg,deg,", name="Tip"), "utf-16", "Tip", True),
+    "tracker, quaternions": (objects(TURN.as_quat(), "RX,RY,RZ,RW,", ",,,,"), "utf-8", "Tip", True),
+    "tracker, both": (objects(ROTVEC) + trajectories("Arm:Tip", "Arm:Base"), "utf-8", "Tip Arm:Tip Base", True),
+    "nexus, segments": (DEVICES + objects(ROTVEC, section="Segments"), "utf-8", "Tip", True),
+    "excel": (ENGLISH + rows("\t", TIME, TIP, decimal=","), "utf-16", "Tip", False),
+    "excel, little": (ENGLISH + rows("\t", TIME, TIP), "utf-16-le", "Tip", False),
+    "excel, big": (ENGLISH + rows("\t", TIME, TIP), "utf-16-be", "Tip", False),
+    "excel, german": (
+        "sep=;\nZeit [s];Spitze_Ä_x [mm];Spitze_Ä_y [mm];Spitze_Ä_z [mm]\n" + rows(";", TIME, TIP, decimal=","),
+        *("cp1252", "Spitze_Ä", False),
+    ),
+    "excel, two lines": (
+        "Run 3\n\n,Tip,,,Base\nt,x,y,z,x,y,z\ns,mm,mm,mm,mm,mm,mm\n" + rows(",", TIME, TIP, BASE),
+        *("utf-8", "Tip Base", False),
+    ),
+    "time of day": (
+        "time,Tip.x [MM],Tip.y [Millimetres],Tip.z [mm]\n"
+        + "\n".join(f"9:59:{59 + x:06.3f},{row}" for x, row in zip(TIME, rows(",", TIP).split(), strict=True)),
+        *("utf-8", "Tip", False),
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:A text is not in UTF-8")
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_an_export_is_read(tmp_path, caplog, name, end):
+    text, encoding, labels, turns = FILES[name]
+    path = tmp_path / "A.CSV"
+    path.write_bytes(text.replace("\n", end).encode(encoding))
+    read = read_recording(path)
+    assert read.labels[: len(labels.split())] == tuple(labels.split())
+    assert read.rate == 100.0
+    seen = np.ones(30, bool) if "zeros" not in name else UNSEEN[:, 0] != 0.0
+    np.testing.assert_array_equal(read.seen[:, 0], seen)
+    assert ("2 positions at exactly (0, 0, 0) count as occlusions" in caplog.text) == ("zeros" in name)
+    np.testing.assert_allclose(1e3 * read.positions[seen, 0], TIP[seen], atol=1e-5)
+    if turns:
+        first = read.labels.index(f"{read.labels[0]} +x")
+        arms = 1e3 * (read.positions[:, first : first + 3] - read.positions[:, :1])
+        np.testing.assert_allclose(arms[seen], 50.0 * TURN.as_matrix().swapaxes(1, 2)[seen], atol=1e-5)
+    else:
+        assert not any(label.endswith("+x") for label in read.labels)
+
+
+PLANAR = np.column_stack([TIP[:, :2], 0 * TIME])
+BARE = {  # of tables without units, or without a rate
+    "t,x1,y1,z1,x2,y2,z2": (rows(",", TIME, TIP, BASE), TIP, ("1", "2")),
+    "pt1_X,pt1_Y,pt1_Z,pt2_X,pt2_Y,pt2_Z": (rows(",", TIP, BASE), TIP, ("pt1", "pt2")),
+    "mass_A\nt\tx\ty": (rows("\t", TIME, TIP[:, :2]), PLANAR, ("mass_A",)),
+    "# t x y z": (rows(" ", TIME, TIP), TIP, ("marker 1",)),
+    '"Time (ms)","Ball X","Ball Y"': (
+        "\n".join(f'"{x}","{y}","{z}"'.replace(".", ",") for x, y, z in np.column_stack([1e3 * TIME, TIP[:, :2]])),
+        *(PLANAR, ("Ball",)),
+    ),
+}
+
+
+@pytest.mark.parametrize("head", BARE)
+def test_a_table_of_a_tracking_program_needs_its_unit_and_rate(tmp_path, head):
+    data, expected, labels = BARE[head]
+    path = tmp_path / "points.csv"
+    path.write_text(f"{head}\n{data}")
+    rate = None if "t" in re.split(r"\W", head.lower()) or "Time" in head else 100.0
+    lacks = "" if rate is None else " and does not say how many frames a second it has"
+    with pytest.raises(
+        DataFileError, match=rf"in which unit its positions are{lacks}: set units to m, cm or mm \(data"
+    ):
+        read_recording(path)
+    read = read_recording(path, units="MM", rate=rate)
+    assert (read.labels, read.rate) == (labels, 100.0)
+    np.testing.assert_allclose(1e3 * read.positions[:, 0], expected, atol=1e-5)
+
+
+def test_the_encoding_is_said_once_a_command_and_a_refusal_shows_what_to_write(tmp_path, monkeypatch, recwarn):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_bytes(f"t,Tür.x [mm],Tür.y [mm],Tür.z [mm]\n{rows(',', TIME, TIP)}".encode("cp1252"))
+    done = outcome("convert", "a.csv", "b.csv")
+    assert done.out.count("Tür") == 2
+    assert [str(warning.message)[:24] for warning in recwarn] == ["A text is not in UTF-8 a"]
+    (tmp_path / "log.csv").write_text(rows(",", TIME, TIP))
+    sentence = refusal("inspect", "log.csv")
+    assert "has no header that is known" in sentence
+    table = re.search(r"recording\.table=\S+: \[.*\]\}", sentence)[0].replace('"tip.y [mm]"', '"tip.z [mm]"')
+    assert "30 frames, 0.30 s at 100 Hz" in outcome("inspect", "log.csv", table.replace("null", '"tip.y [mm]"')).out
+
+
+def test_text_of_windows_is_read_with_a_warning_and_other_files_are_refused(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(f"t,Bär.x [mm],Bär.y [mm],Bär.z [mm]\n{rows(',', TIME, TIP)}".encode("cp1252"))
+    with pytest.warns(ResphysWarning, match="was read as Windows-1252: check names with accents"):
+        assert read_recording(path).labels == ("Bär",)
+    for content in (bytes(range(256)), b"PK\3\4\0\0" * 9, b"\xff\xfea", bytes(100)):
+        path.write_bytes(content)
+        with pytest.raises(DataFileError, match=r"a\.csv is not a text file: export it"):
+            read_recording(path)

@@ -1,0 +1,251 @@
+"""Recordings from the cells of a table whose layout is known: which column holds which coordinate.
+
+A cell that is empty or NaN is an occlusion.
+"""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ...io.errors import DataFileError
+from ...io.text import Rows, number
+from .recording import FloatArray, RawRecording
+
+log = logging.getLogger(__name__)
+
+AXES = ("x", "y", "z")
+_OCCLUDED = ("", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--")
+_UNEVEN = 0.25  # of a frame: largest error of a time stamp
+_LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
+_LEAST_FRAMES = 2  # of a recording
+_LEAST_RECORDED = 0.1  # of the frames between the first and the last
+
+Place = tuple[str, str, int]  # label, axis and column of a coordinate
+
+
+@dataclass(frozen=True)
+class Turn:
+    """How a table gives the rotations of rigid bodies.
+
+    Attributes:
+        axes: names of k columns of a rigid body.
+        quaternions: function of numbers (T, k) that returns quaternions (T, 4), w first.
+    """
+
+    axes: tuple[str, ...]
+    quaternions: Callable[[FloatArray], FloatArray]
+
+    @classmethod
+    def of(cls, axes: Sequence[str], rotations: Callable[[FloatArray], Rotation]) -> "Turn":
+        """Returns the form of numbers (T, k) for which a function returns T rotations."""
+        return cls(tuple(axes), lambda numbers: quaternions(numbers, rotations))
+
+
+def quaternions(numbers: FloatArray, rotations: Callable[[FloatArray], Rotation]) -> FloatArray:
+    """Returns quaternions (T, 4), w first, of numbers (T, k) by a function of (T', k); NaN where a number is."""
+    result = np.full((len(numbers), 4), np.nan)
+    seen = np.isfinite(numbers).all(axis=1)
+    if seen.any():
+        result[seen] = rotations(numbers[seen]).as_quat()[:, [3, 0, 1, 2]]
+    return result
+
+
+QUATERNION = Turn(("qw", "qx", "qy", "qz"), lambda columns: columns)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the numbers of a table are, and what they mean.
+
+    Attributes:
+        first: number of the first line of numbers.
+        width: number of cells of a line; empty cells after them are ignored.
+        places: label, axis (x, y, z or one of ``turn``) and column of every coordinate.
+        unit: of positions; None if the table does not state it.
+        clock: column of the frame number or time; None if every line is a frame.
+        seconds: unit of the time [s]; None for frame numbers.
+        rate: of the frames [Hz], where there is no time.
+        channels: factors to SI units of the columns of the actuation.
+        planar: whether a coordinate that no marker has a column for is zero.
+        turn: how rotations are given.
+    """
+
+    first: int
+    width: int
+    places: Sequence[Place]
+    unit: str | None = None
+    clock: int | None = None
+    seconds: float | None = None
+    rate: float | None = None
+    channels: Mapping[int, float] = field(default_factory=dict)
+    planar: bool = False
+    turn: Turn = QUATERNION
+
+    def read(self, rows: Rows, path: Path) -> RawRecording:
+        """Reads the recording from all lines of a file."""
+        markers, chosen, turned = self._markers(path)
+        others = [column for columns in turned.values() for column in columns]
+        others += [] if self.clock is None else [self.clock]
+        known = sorted({*chosen, *others, *self.channels} - {-1})
+        read, lines = self._numbers(rows, known, path)
+        values = np.zeros((len(read), max(known, default=0) + 2))  # The last column stays zero, for planar markers.
+        values[:, known] = read
+        stamps = np.arange(len(values), dtype=np.float64)
+        if self.clock is not None:
+            stamps = values[:, self.clock] * (self.seconds or 1.0)
+        frames, measured_rate = _frames(stamps, self.seconds is not None, lines, path)
+        actuation = None
+        if self.channels:
+            with np.errstate(over="ignore"):
+                driven = values[:, list(self.channels)] * list(self.channels.values())
+            driven = _switched_on(driven, lines, path)
+            values, frames = values[: len(driven)], frames[: len(driven)]
+            grid = np.arange(frames[-1] + 1)
+            actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
+        positions = np.full((frames[-1] + 1, len(markers), 3), np.nan)  # NaN in frames that were not recorded
+        positions[frames] = values[:, chosen].reshape(len(values), -1, 3)
+        turns = np.full((*positions.shape[:2], 4), np.nan)
+        for marker, columns in turned.items():
+            try:
+                turns[frames, marker] = self.turn.quaternions(values[:, columns])
+            except ValueError as error:
+                raise DataFileError(f"{path}: {markers[marker]} has a row that is no rotation ({error}).") from error
+        timed = self.seconds is not None
+        return RawRecording(
+            *(positions, markers, self.unit, measured_rate if timed else self.rate, actuation),
+            start=float(stamps[0]) if timed else 0.0,
+            turns=turns if turned else None,
+        )
+
+    def _markers(self, path: Path) -> tuple[list[str], list[int], dict[int, list[int]]]:
+        """Returns labels, the columns of their x, y and z, and those of rotations by the index of the rigid body.
+
+        The column of the axis that planar markers do not have is -1.
+        """
+        columns: dict[tuple[str, str], int] = {}
+        for label, axis, column in self.places:
+            if (label, axis) in columns:
+                raise DataFileError(f"{path} has two columns named '{label}.{axis}': rename one of these markers.")
+            columns[label, axis] = column
+        labels = list(dict.fromkeys(label for label, axis in columns if axis in AXES))
+        axes = {axis for _, axis in columns if axis in AXES}
+        optional = {*AXES} - axes if self.planar and len(axes) == 2 else set()
+        bodies = dict.fromkeys(label for label, axis in columns if axis in self.turn.axes)
+        wanted = [(label, axis) for label in labels for axis in AXES if axis not in optional]
+        wanted += [(label, axis) for label in bodies for axis in (*AXES, *self.turn.axes)]
+        for label, axis in wanted:
+            if (label, axis) not in columns:
+                what, lacks = ("marker", "")
+                if label in bodies:
+                    what, lacks = "rigid body", f" ({', '.join((*AXES, *self.turn.axes))})"
+                raise DataFileError(
+                    f"{path}: {what} {label} has no column '{label}.{axis}'; export it again with all{lacks}."
+                )
+        chosen = [columns.get((label, axis), -1) for label in labels for axis in AXES]
+        return labels, chosen, {labels.index(body): [columns[body, axis] for axis in self.turn.axes] for body in bodies}
+
+    def _numbers(self, rows: Rows, columns: Sequence[int], path: Path) -> tuple[FloatArray, list[int]]:
+        """Returns columns (T, C) of the rows of numbers, NaN for empty cells, and the line numbers of the rows."""
+        values, lines = [], []
+        for line, row in enumerate(rows[self.first :], start=self.first + 1):
+            if not any(row):
+                continue
+            if len(row) < self.width or any(row[self.width :]):
+                raise DataFileError(
+                    f"{path}, line {line}: {len(row)} cells where the other lines have {self.width}; the file is cut "
+                    "off or damaged there: export it again."
+                )
+            numbers = [np.nan if row[column].lower() in _OCCLUDED else number(row[column]) for column in columns]
+            if None in numbers:
+                column = columns[numbers.index(None)]
+                raise DataFileError(
+                    f"{path}, line {line}, column {column + 1}: {row[column]!r} is not a number; write numbers with a "
+                    "decimal point, and leave the cells of an occluded marker empty."
+                )
+            values.append(numbers)
+            lines.append(line)
+        if len(values) < _LEAST_FRAMES:
+            raise DataFileError(f"{path} holds {len(values)} frames: a recording needs two or more.")
+        return np.array(values, dtype=np.float64), lines
+
+
+def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatArray:
+    """Channels (T', C) from (T, C), cut off where one of them ends; missing first values equal the first known one.
+
+    A log may begin before the actuators are switched on, and end after they are switched off.
+    """
+    known = np.isfinite(driven)
+    if np.isinf(driven).any() or not known.any(axis=0).all():
+        row = int(np.argmax((np.isinf(driven) | ~known.any(axis=0)).any(axis=1)))
+        raise DataFileError(f"{path}, line {lines[row]}: an actuation is missing or infinite; every frame needs one.")
+    first = known.argmax(axis=0)
+    end = len(driven) - int(known[::-1].argmax(axis=0).max())
+    frames = np.arange(end)[:, None]
+    filled = np.where(frames < first, driven[first, np.arange(driven.shape[1])], driven[:end])
+    if (missing := np.isnan(filled).any(axis=1)).any():
+        raise DataFileError(
+            f"{path}, line {lines[int(missing.argmax())]}: an actuation is missing; every frame between the first and "
+            "the last one that has it needs one."
+        )
+    if first.any() or end < len(driven):
+        log.warning(
+            "%s has no actuation in its first %d frames, which get its first known value, nor in its last %d, which "
+            "are left out.",
+            *(path.name, int(first.max()), len(driven) - end),
+        )
+    if end < _LEAST_FRAMES:
+        raise DataFileError(f"{path} has an actuation in {end} frames: a recording needs two or more.")
+    return np.asarray(filled)
+
+
+def is_data(row: Sequence[str]) -> bool:
+    """Whether a line holds positions: it begins with a digit, and most cells are numbers or empty."""
+    filled = [cell for cell in row if cell.lower() not in _OCCLUDED]
+    begins = bool(filled) and filled[0].lstrip("+-.")[:1].isdecimal() and (row[0] != "" or 2 * len(filled) > len(row))
+    return len(row) >= 3 and begins and 2 * sum(number(cell) is not None for cell in filled) > len(filled)
+
+
+def _frames(
+    stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path
+) -> tuple[NDArray[np.int64], float | None]:
+    """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
+    known = np.abs(stamps) <= _LARGEST_STAMP
+    steps = np.diff(np.where(known, stamps, np.nan))
+    wrong = np.append(~known[0], ~(steps > 0.0))
+    if wrong.any():
+        raise DataFileError(
+            f"{path}, line {lines[int(np.argmax(wrong))]}: the time or frame does not rise, or is no number below "
+            "1e12; sort the lines and fill it in."
+        )
+    interval, span = float(np.median(steps)) if timed else 1.0, float(stamps[-1] - stamps[0])
+
+    def foreign(row: int) -> DataFileError:
+        return DataFileError(
+            f"{path}, line {lines[row]}: from the line before on, time or frame passes from {stamps[row - 1]:g} to "
+            f"{stamps[row]:g}, so that both do not belong to one recording; check that column."
+        )
+
+    if _LEAST_RECORDED * span > interval * len(stamps):
+        raise foreign(int(np.argmax(steps)) + 1)
+    if timed:  # The whole recording gives the interval more precisely than rounded times.
+        interval = span / round(span / interval)
+    exact = (stamps - stamps[0]) / interval
+    frames = np.round(exact).astype(np.int64)
+    uneven = np.abs(exact - frames) > _UNEVEN
+    if uneven.any():
+        raise DataFileError(
+            f"{path}, line {lines[int(np.argmax(uneven))]}: the frames are not evenly spaced; export the recording "
+            "at a constant frame rate."
+        )
+    if (np.diff(frames) < 1).any():
+        raise foreign(int(np.argmax(np.diff(frames) < 1)) + 1)
+    if not timed:
+        return frames, None
+    rate = 1.0 / interval
+    whole = rate < _LARGEST_STAMP and abs(rate - round(rate)) < 1e-3 * rate
+    return frames, float(round(rate)) if whole else rate

@@ -219,8 +219,9 @@ def learning_stages(
     targets = () if run.target is None else ("target",)
     if run.timing:
         add("time", time_models, (TIMES,), of(*NETWORKS, *targets, groups=groups), *learned)
-    if run.mesh_check is not None:
-        add("mesh_check", check_mesh, (MESH_CHECK,), of(*NETWORKS, "mesh_check", groups=groups))
+    same = run.is_laboratory and run.laboratory and (run.laboratory.mesh, run.laboratory.parts) == (run.mesh, run.parts)
+    if run.mesh_check is not None and not same:
+        add("mesh_check", check_mesh, (MESH_CHECK,), of(*NETWORKS, "mesh_check", groups={"1": groups["1"]}))
     if run.control is not None:
         stages += control_stages(run, run.control, of, workers)
     last = tuple(stage.name for stage in stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive"))

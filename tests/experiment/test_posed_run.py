@@ -10,11 +10,10 @@ from support.main_job import finish, run_without_report
 from support.played_run import check_robots
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.experiment.files import read_dataset
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_array, read_hdf5, read_json
 from warp_resphys.report.identification_section import own_table
 from warp_resphys.settings.body import MaterialSettings
-from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh
+from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh, ShippedArm
 from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
@@ -85,7 +84,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, folder):
     checked = metrics["mesh_check"]
     assert checked["cells"][1] == 1.5 * checked["cells"][0] == 30
     assert 0.1 < checked["moved_mm"] < 10.0
-    assert "cells, with the same constants, the markers of" in page
+    assert "With 30 instead of 20 cells and the same parameters, SysID moves the markers by" in page
     check_robots(run)
 
 
@@ -134,8 +133,9 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
     arm = GeneratedArm(kind="arm_generated", size=0.006)
     assert finer(arm, 2.0) == arm.changed(size=0.003)
     assert finer(arm.changed(layers=0.01), 2.0) == arm.changed(size=0.003, layers=0.005)
-    with pytest.raises(InputError, match="a mesh of the kind 'file' cannot be refined"):
-        finer(FileMesh(kind="file", path="a.vtk"), 2.0)
+    assert finer(file := FileMesh(kind="file", path="a.vtk"), 2.0) == file.changed(order=2)
+    shipped = [ShippedArm(kind="arm", name=f"arm_hexahedra_{size}") for size in (500, 1400, 2000)]
+    assert [finer(arm, 1.5) for arm in shipped] == [*shipped[1:], shipped[2]]
 
 
 @pytest.mark.slow

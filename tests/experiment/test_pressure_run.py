@@ -28,7 +28,7 @@ from warp_resphys.settings.stages import LEARNING, NETWORKS, StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED)
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
-STAGES |= {"report", "laboratory_scaled", "import_scaled"}
+STAGES |= {"mesh_check", "report", "laboratory_scaled", "import_scaled"}
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +79,11 @@ def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(
         assert results["horizons"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-9)
     growth = results["horizons"]["0.12"]["sysid"]["mean"] / results["horizons"]["0.06"]["sysid"]["mean"] - 1.0
     assert results["growth"]["sysid"] == pytest.approx(growth)
+    checked = results["mesh_check"]  # whole trials are shorter than its 50 steps
+    assert checked["errors_mm"][0] == pytest.approx(results["scales"]["1"]["sysid"]["mean"], rel=1e-6)
+    assert (checked["trials"], checked["model"]) == (["t003"], "sysid")
+    assert checked["cells"][0] < checked["cells"][1]
+    assert checked["moved_mm"] > abs(np.subtract(*checked["errors_mm"]))
 
 
 def test_recordings_are_seen_by_cameras_and_registered_back(finished):

@@ -53,7 +53,7 @@ FOLDS = [
     "in_the_loop.epochs=1",
     "parallel.processes=1",  # in this process, where no report is drawn
 ]
-STAGES = ["identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "report"]
+STAGES = ["identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "mesh_check", "report"]
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -116,8 +117,8 @@ def _read_or_generate(settings: MeshSettings) -> Mesh:
 def finer(settings: MeshSettings, times: float) -> MeshSettings:
     """Refines the group ``mesh`` by a factor: along the edges of a box, along a rod's axis, or everywhere.
 
-    Raises:
-        InputError: the mesh is read from a file.
+    Linear cells of a file become quadratic, and an arm of the package the next finer one. Cells that are given and
+    cannot be refined stay as they are.
     """
     match settings:
         case HexahedralBox() | TetrahedralBox():
@@ -129,9 +130,16 @@ def finer(settings: MeshSettings, times: float) -> MeshSettings:
         case GeneratedArm():
             layers = None if settings.layers is None else settings.layers / times
             return settings.changed(size=settings.size / times, layers=layers)
-    raise InputError(
-        f"mesh_check: a mesh of the kind {settings.kind!r} cannot be refined, as its cells are given: set it to null."
-    )
+        case FileMesh():
+            return settings.changed(order=2)
+        case ShippedArm():
+            by_size = sorted(_shipped_arms(), key=lambda name: int(name.rpartition("_")[2]))
+            return settings.changed(name=dict(pairwise(by_size)).get(settings.name, settings.name))
+
+
+def _shipped_arms() -> list[str]:
+    folder = resources.files("warp_resphys") / "meshes"
+    return sorted(file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh"))
 
 
 def shipped_arm(name: str) -> Mesh:
@@ -140,11 +148,9 @@ def shipped_arm(name: str) -> Mesh:
     Raises:
         InputError: the name is unknown.
     """
-    folder = resources.files("warp_resphys") / "meshes"
-    names = sorted(file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh"))
-    if name not in names:
+    if name not in (names := _shipped_arms()):
         raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}.")
-    with resources.as_file(folder / f"{name}.msh") as path:
+    with resources.as_file(resources.files("warp_resphys") / "meshes" / f"{name}.msh") as path:
         return read_mesh(path)
 
 

@@ -4,7 +4,7 @@ The values of settings and their relations are checked when settings are made, s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from itertools import product
 from typing import cast
@@ -27,13 +27,13 @@ from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.mesh import select_vertices, surface_vertices
-from ..settings.body import MaterialSettings
+from ..settings.body import BodySettings, MaterialSettings
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
 from ..settings.trials import RecordedData, ReleaseFromLoad
 from .actuators import Drive, check_drive, drive_of
-from .build import build_body, build_material, build_simulator, finer
+from .build import build_body, build_material, build_simulator
 from .experiment import LAW
 from .identify import ELASTIC
 from .recordings.checks import check_recorded
@@ -55,7 +55,7 @@ def check_run(run: RunSettings) -> None:
         MeshError: the mesh cannot be read or simulated, or no vertex lies at a place.
         DataFileError: the folder has no recordings.
     """
-    _check_memory(run)
+    check_memory(run.bodies)
     for prefix, settings in run.bodies.items():
         with naming(prefix):
             check_drive(settings)
@@ -78,8 +78,6 @@ def check_run(run: RunSettings) -> None:
         _check_simulated(run, simulator)
     if run.law is not None:
         _check_law(run, run.law)
-    if run.mesh_check is not None:
-        _check_memory(run.model_copy(update={"mesh": finer(run.mesh, run.mesh_check)}))
     if run.control is not None:
         _check_control(run, body)
     if run.identify is not None:
@@ -144,11 +142,11 @@ def _check_control(run: RunSettings, body: Body) -> None:
         raise InputError("control does not support payloads: remove them from laboratory.trials.")
 
 
-def _check_memory(run: RunSettings) -> None:
-    """Refuses meshes that do not fit into the free memory."""
+def check_memory(bodies: Mapping[str, BodySettings]) -> None:
+    """Refuses meshes of bodies, by the prefix of their keys, that do not fit into the free memory."""
     limit = _SHARE_OF_MEMORY * available_memory_gib()
-    meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in run.bodies.items()}
-    for key, body in run.bodies.items():
+    meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in bodies.items()}
+    for key, body in bodies.items():
         meshes |= {f"{key}parts.{name}.mesh": part.mesh for name, part in body.parts.items()}
     for key, mesh in meshes.items():
         cells = math.prod(mesh.divisions) if isinstance(mesh, HexahedralBox | TetrahedralBox) else 0

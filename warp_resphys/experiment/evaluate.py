@@ -13,16 +13,18 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
-from ..io.errors import ConvergenceError
+from ..io.errors import ConvergenceError, InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
+from ..learning.replay import Replay
 from ..settings.stages import StageSettings
 from .build import finer
+from .checks import check_memory
 from .experiment import LEARNED, Experiment
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, driving, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
@@ -32,6 +34,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FILM_FRAMES = 256  # maximum
+CHECKED_STEPS, _CHECKED_POSES = 50, 3  # that are simulated with a finer mesh
 _WARM_UP = 20  # steps before computing times are measured
 _FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over one second
 
@@ -318,35 +321,51 @@ def time_models(context: StageContext) -> None:
 
 
 def check_mesh(context: StageContext) -> None:
-    """Writes mesh_check.json: change of the uncorrected simulation of the test trials with a finer mesh.
+    """Writes mesh_check.json: change of the simulation of test trials with a finer mesh, see `finer`.
 
-    The finer mesh uses the parameters that were identified on the original mesh.
+    The trial with the largest motion is simulated for a few steps from where its inputs begin; of poses, a few are. The
+    finer mesh uses the parameters that were identified on the original mesh.
     """
     settings: StageSettings = context.settings
     times, parts = settings.mesh_check, settings.parts
     refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
     other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})
-    experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
     model = "simulation" if settings.identified is None else "sysid"
-    groups = experiments[0].batches(settings.groups["1"])
-    cells = [len(experiment.body.mesh.cells) for experiment in experiments]
-    content: dict[str, Any] = {"cells": cells, "model": model}
-    errors: list[list[FloatArray]] = [[], [], []]  # of both meshes, and of one from the other
-    with Progress(context.name, 2 * sum(map(len, groups)), "trials") as progress, torch.no_grad():
-        try:
-            for names in groups:
-                shown = []
-                for experiment in experiments:
-                    replay = experiment.replay(experiment.model_simulator(model), names, model)
-                    points = replay(experiment.start(replay, model), experiment.parameters(model))[0].cpu().numpy()
-                    shown.append(as_markers(points, experiment.dataset.labels))
-                    progress.advance(len(names))
+    content: dict[str, Any] = {"model": model}
+    try:
+        if other == settings:
+            raise InputError("The cells of a file are quadratic already: make a finer mesh to compare with.")
+        check_memory({"": other})
+        experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
+        meshes = [experiment.body.mesh for experiment in experiments]
+        content |= {"cells": [len(mesh.cells) for mesh in meshes], "vertices": [len(m.vertices) for m in meshes]}
+        amplitudes = _amplitudes(experiments[0], settings.groups["1"])
+        moving = experiments[0].moving([*amplitudes])
+        names = [max(moving, key=amplitudes.__getitem__)] if moving else [*amplitudes][:_CHECKED_POSES]
+        shown, observed = list[FloatArray](), np.empty(0)
+        with Progress(context.name, 2, "meshes") as progress, torch.no_grad():
+            for experiment in experiments:
+                replay = experiment.replay(experiment.model_simulator(model), names, model)
+                if moving:
+                    seconds = _first_change(experiment, names[0]) + CHECKED_STEPS * settings.time_step
+                    replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
+                points = replay(experiment.start(replay, model), experiment.parameters(model))[0].cpu().numpy()
+                shown.append(as_markers(points, experiment.dataset.labels))
                 observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.dataset.labels)
-                where = np.where(np.isfinite(observed), shown[1], np.nan)
-                for rows, x, y in zip(errors, (*shown, shown[0]), (observed, observed, where), strict=True):
-                    rows += _errors(x, y, [0] * len(names))
-        except ConvergenceError as error:
-            content["failed"] = str(error)
-        else:
-            *content["errors_mm"], content["moved_mm"] = (float(np.mean([row.mean() for row in own])) for own in errors)
+                progress.advance()
+        where = np.where(np.isfinite(observed), shown[1], np.nan)
+        pairs = ((shown[0], observed), (shown[1], observed), (shown[0], where))
+        means = [summarise(_errors(x, y, [0] * len(names)))["mean"] for x, y in pairs]
+        content |= {"trials": names, "errors_mm": means[:2], "moved_mm": means[2]}
+    except (ConvergenceError, InputError) as error:
+        content["failed"] = str(error)
     write_json(context.run_dir / MESH_CHECK, content)
+
+
+def _first_change(experiment: Experiment, name: str) -> float:
+    """Time at which the inputs of a trial begin to change [s]; zero if none does."""
+    times = experiment.dataset.times[experiment.dataset.rows([name])[0]]
+    acting = np.concatenate(
+        [times[:, None] * 0.0, *(own[0] for own in driving(experiment.dataset, [name]).values())], 1
+    )
+    return float(times[int((acting != acting[:1]).any(1).argmax())])

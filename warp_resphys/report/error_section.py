@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ..io.errors import number_of
+from ..io.errors import listed, number_of
 from ..learning.metrics import median_filter
 from .data import INSIDE, MODELS, OUTSIDE, FloatArray, RunReport, errors_by_load
-from .page import Canvas, Part, largest_text, mm_text, unbroken
+from .page import Canvas, Part, Text, largest_text, mm_text, unbroken
 from .sections import model_table, numbers
 
 if TYPE_CHECKING:
@@ -46,7 +46,28 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         bodies = next(iter(turned.values()))
         by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}
         blocks.append(model_table("Orientation of each rigid body [degrees]", numbers(by_body), metrics["errors_mm"]))
+    if check := metrics.get("mesh_check"):
+        blocks += [Text("Error of the mesh", heading=True), Text(mesh_text(check))]
     return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
+
+
+def mesh_text(check: Mapping[str, Any]) -> str:
+    """Return sentences on what a finer mesh changes.
+
+    Args:
+        check: Content of `mesh_check.json`.
+    """
+    if "failed" in check:
+        return f"The error of the mesh is not known: {check['failed']}"
+    cells, finer = check["cells"]
+    vertices = "{:,} instead of {:,} vertices".format(*check["vertices"][::-1])
+    mesh = f"quadratic cells ({vertices})" if cells == finer else f"{finer:,} instead of {cells:,} cells"
+    model, (before, after) = MODELS[check["model"]][0], map(mm_text, check["errors_mm"])
+    return unbroken(
+        f"With {mesh} and the same parameters, {model} moves the markers by {mm_text(check['moved_mm'])}, and its "
+        f"error is {after} instead of {before}, at the beginning of {listed(check['trials'])}. Parameters that are "
+        "identified on a finer mesh differ."
+    )
 
 
 def error_over_time(

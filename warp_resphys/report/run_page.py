@@ -153,7 +153,7 @@ def _what_is_measured(data: RunReport) -> str:
 
 
 def _contributions(metrics: Mapping[str, Any]) -> list[str]:
-    """Sentences on how bodies were held, and on the contributions of noise and mesh to the errors, if known."""
+    """Sentences on how bodies were held, and on the contribution of noise to the errors, if known."""
     notes = []
     if sideways := {trial: mm for fold in folds_in(metrics) for trial, mm in fold.get("sideways_mm", {}).items()}:
         distances = ", ".join(f"{mm_text(distance)} ({trial})" for trial, distance in sideways.items())
@@ -163,16 +163,6 @@ def _contributions(metrics: Mapping[str, Any]) -> list[str]:
         )
     if "noise_mm" in metrics:
         notes.append(f"The noise of the markers alone is {metrics['noise_mm']:.2f} mm.")
-    if check := metrics.get("mesh_check"):
-        cells, finer = check["cells"]
-        where = f"On a mesh of {finer:,} instead of {cells:,} cells, with the same constants,"
-        if "failed" in check:
-            return [*notes, f"The error of the mesh is not known. {where} {check['failed']}"]
-        before, after = map(mm_text, check["errors_mm"])
-        model = MODELS[check["model"]][0]
-        notes.append(
-            f"{where} the markers of {model} move by {mm_text(check['moved_mm'])}; its error is {after}, not {before}."
-        )
     return notes
 
 

@@ -124,7 +124,7 @@ class RunSettings(SimulatorSettings):
     )
     range_guard: bool = setting(True, "limit the inputs of networks to their training range")
     mesh_check: Annotated[float, Field(gt=1.0, le=4.0)] | None = setting(
-        None, "refinement of a second mesh, which shows the discretisation error"
+        None, "refinement of a second mesh, whose short simulation shows the discretisation error; null: none"
     )
     timing: bool = setting(True, "time the models, one trial at a time")
     parallel: ParallelSettings = ParallelSettings()

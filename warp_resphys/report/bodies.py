@@ -139,9 +139,10 @@ class ComparedMotion:
         shown = self.at(frames[self.times[frames] <= (longest if seconds is None else seconds) + 1e-9])
         *others, last = (MODELS[model][0] for model in shown.positions)
         first, second = _views(shown, FILM_VIEW, HEADROOM)
-        legend = [*((name, _RINGS[0]) for name in others), (last, _RINGS[1]), ("measured", MEASURED)]
+        first = replace(first, legend=[*((name, _RINGS[0]) for name in others), (last, _RINGS[1])])
+        second = replace(second, legend=[("measured markers", MEASURED)])
         texts = [f"{time:.2f} s" for time in shown.times]
-        return RenderScene([replace(first, legend=legend), second], FILM_VIEW, background="white", fps=fps, texts=texts)
+        return RenderScene([first, second], FILM_VIEW, background="white", fps=fps, texts=texts)
 
 
 def instants(target: FloatArray, bound: FloatArray, simulated: FloatArray) -> list[int]:

@@ -168,15 +168,15 @@ def _ring(radius: float, axes: FloatArray) -> tuple[FloatArray, Any]:
 
 def _add_texts(plotter: Any, scene: RenderScene) -> Any:
     """Adds time and legends at the top, where controls of players do not hide them, and returns the time."""
-    top = scene.size[1] - 32
+    top = scene.size[1] - 36
     for column, view in enumerate(scene.views):
         plotter.subplot(0, column)
-        left = 14 if column else 90
+        left = 14 if column else 100
         for name, colour in view.legend:
-            plotter.add_text(name, position=(left, top), font_size=9, color=colour)
-            left += 24 + 9 * len(name)
+            plotter.add_text(name, position=(left, top), font_size=12, color=colour)
+            left += 24 + 12 * len(name)
     plotter.subplot(0, 0)
-    return plotter.add_text(scene.texts[0], position=(14, top), font_size=10, color=INK)
+    return plotter.add_text(scene.texts[0], position=(14, top), font_size=12, color=INK)
 
 
 if __name__ == "__main__":

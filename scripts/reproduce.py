@@ -34,7 +34,7 @@ from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.metrics import PUBLISHED_MM
 from warp_resphys.report.data import MODELS, Errors, trial_errors
 from warp_resphys.report.page import MINUS, NONE, duration_text, error_parts, in_a_row, number_text, published_parts
-from warp_resphys.report.verdict import LEAST_TRIALS, ModelComparison, best_pair, known_errors, model_name
+from warp_resphys.report.verdict import LEAST_TRIALS, best_pair, compared, known_errors, less_error
 
 ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 RUNS: Final = Path("runs")
@@ -221,7 +221,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
         "tested": tested,
         "how": how,
         "errors_mm": {model: metrics["errors_mm"][model] for model in COMPARED if model in metrics["errors_mm"]},
-        "beside": best_of(errors),
+        "beside": beside(errors),
         "gains": {"sysid": _gain(errors, "simulation", "sysid"), "resphys": _gain(errors, "sysid", "resphys")},
         "intervals": intervals and {key: intervals[key] for key in ("coverage", "half_width_mm")},
         "seconds": sum(sum(part["seconds"].values()) for part in (metrics, *folds.values())),
@@ -229,7 +229,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def best_of(errors: Errors) -> dict[str, Any] | None:
+def beside(errors: Errors) -> dict[str, Any] | None:
     """The corrected model of least mean error beside the best of all others; None where one of them is missing."""
     corrected, other = best_pair(known_errors(errors))
     gain = _gain(errors, other, corrected)
@@ -238,10 +238,8 @@ def best_of(errors: Errors) -> dict[str, Any] | None:
 
 def _gain(errors: Errors, before: str, after: str) -> dict[str, Any] | None:
     """Share of the error of one model that another removes; None where one is missing or has diverged."""
-    if not {before, after} <= errors.keys():
-        return None
-    gain = ModelComparison(after, before, errors[after], errors[before]).gain
-    return gain and dict(gain._asdict())
+    known = known_errors(errors)
+    return dict(compared(known[before], known[after])._asdict()) if {before, after} <= known.keys() else None
 
 
 def robots_page(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str], pictures: Path) -> str:
@@ -313,9 +311,10 @@ def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[st
     robot, count = ROWS["robots"][name], len(row["tested"])
     text = f"Tested on {count} trial{'s' if count > 1 else ''}, {row['how']}: {', '.join(row['tested'])}."
     if pair := row["beside"]:
-        own, other = (number_text(row["errors_mm"][pair[key]]["mean"]) for key in ("corrected", "other"))
-        text += f" The best corrected model, {model_name(pair['corrected'])}, has an error of {own} mm; "
-        text += f"the best of all others, {model_name(pair['other'])}, {other} mm."
+        means = {model: row["errors_mm"][model]["mean"] for model in (pair["corrected"], pair["other"])}
+        best, second = sorted(means, key=lambda model: means[model])
+        said = less_error(best, second, 1.0 - means[best] / means[second])
+        text += f" {said[0].upper()}{said[1:]} ({number_text(means[best])} and {number_text(means[second])} mm)."
     if row["moved_mm"] is not None:
         text += f" A finer mesh moves the markers of the identified simulator by {number_text(row['moved_mm'])} mm."
     blocks = []

@@ -77,7 +77,7 @@ def test_every_row_is_an_experiment():
 
 def test_gains_and_the_best_models_are_those_of_the_trials():
     errors = {"rest": [9.0, 8.0], "simulation": [2.0, 2.0], "sysid": [1.0, 1.0], "resphys": [3.0, None]}
-    pair = reproduce.best_of(errors)
+    pair = reproduce.beside(errors)
     assert (pair["corrected"], pair["other"], pair["gain"]["share"]) == ("sysid", "simulation", 0.5)
     assert reproduce._gain(errors, "sysid", "resphys") is None
     kept = json.loads((DOCS / "robots.json").read_text())
@@ -113,7 +113,7 @@ def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_
     ours = " ".join(error_parts(metrics["errors_mm"]["resphys"])).strip()
     assert f"| **ResPhys** | 0.004 ± 0.010 | {ours} |" in page
     time = metrics["seconds_per_test_trajectory"]["simulation"]
-    assert f"| Uncorrected simulation | 0.711 ± 0.002 5.1 ms a step | {time['mean']:.3f} ± {time['std']:.3f}" in page
+    assert f"| Uncorrected simulator | 0.711 ± 0.002 5.1 ms a step | {time['mean']:.3f} ± {time['std']:.3f}" in page
     assert "seed is -1" in page
     assert Path("out/reproduction/beam_oscillation_error_over_time.png").is_file()
     overrides = ["ablation.counts=[1,4]", "ablation.draws=3", "ablation.processes=1"]

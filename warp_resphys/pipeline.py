@@ -66,8 +66,8 @@ from .io.stages import Stage, StageContext, package_versions, resources_used, ru
 from .io.tables import show
 from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
-from .report.sections import errors_table, horizon_table, scale_table, shapes_table
-from .report.verdict import verdict
+from .report.sections import shapes_table
+from .report.verdict import results_table, verdict
 from .settings.body import BodySettings
 from .settings.control import ControlSettings, FigureSettings
 from .settings.run import RunSettings
@@ -366,13 +366,9 @@ def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
-    """Prints the errors, by model and in the tables of the report, and the conclusions."""
+    """Prints what the report begins with: the mean errors, the verdict and the advice."""
     tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
-    tables = (
-        errors_table(metrics, run, brief=True),
-        horizon_table(metrics, {}),
-        scale_table(metrics.get("scales", {})),
-        tracking_table(tracking) if tracking else None,
-        shapes_table(shapes) if shapes else None,
-    )
-    show(*filter(None, tables), *verdict(metrics, run), f"Report: {folder / REPORT}")
+    tables = tracking_table(tracking) if tracking else None, shapes_table(shapes) if shapes else None
+    first, *advice = (*verdict(metrics, run), "")
+    said = "  ".join([*filter(None, advice), f"Report: {folder / REPORT}"])
+    show(results_table(metrics, run), *filter(None, (*tables, first, said)))

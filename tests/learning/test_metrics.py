@@ -46,14 +46,15 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
     json.dumps([summary, entries], allow_nan=False)
 
 
-def test_folds_have_equal_weight() -> None:
+def test_trials_have_equal_weight() -> None:
     folds = [
         {"resphys": summarise([np.array([1.0, 1.0, 1.0])]), "simfree": summarise([np.array([2.0])])},
         {"resphys": summarise([np.array([3.0]), np.array([5.0])]), "simfree": summarise([np.array([np.nan])])},
     ]
     result = summarise_folds(folds)
-    assert result["resphys"] == {"mean": 2.5, "std": 1.5, "trajectories": 3, "diverged": 0}
+    assert result["resphys"] == {"mean": 3.0, "std": 1.5, "trajectories": 3, "diverged": 0}
     assert result["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
+    assert summarise([np.array([1.0, 1.0, 1.0]), np.array([3.0])])["mean"] == 2.0
     assert summarise_folds(folds[:1])["resphys"] == {"mean": 1.0, "std": None, "trajectories": 1, "diverged": 0}
 
 

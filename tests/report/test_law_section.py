@@ -12,9 +12,9 @@ from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
 from warp_resphys.energies.materials import ConvexMaterial
 from warp_resphys.io.files import read_json, write_json
-from warp_resphys.report.data import errors_by_load
+from warp_resphys.report.data import grouped_errors
 from warp_resphys.report.law_section import drawn_stretches, law_text, not_needed_text, outside_text, wording
-from warp_resphys.report.page import percent_text
+from warp_resphys.report.page import number_text, percent_text
 from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.uniaxial import ACROSS, ALONG, small_strain, small_strain_of, uniaxial_stress
 from warp_resphys.settings.body import MaterialSettings
@@ -67,19 +67,19 @@ def run(folder, own, **more):
 def test_page_has_the_law_and_the_errors_by_load(tmp_path):
     page = run(tmp_path, law())
     means = {row["name"]: row["errors_mm"] for row in read_json(tmp_path / "errors.json")["per_trajectory"]}
-    inside, outside = (f"{means[name]['law']:.3f}" for name in ("0.07 kg", OTHER))
+    inside, outside = (number_text(means[name]["law"]) for name in ("0.07 kg", OTHER))
     assert inside != outside
     for said in (
-        "on 1 trial with other loads",
-        *(inside, outside),
+        "Beyond the training loads, ",
+        "mean error of the vertices [mm]loads as in trainingother loads",
+        f"+ law of its material{inside}{outside}",
         "is used: its root mean square error on the validation trials (80 g, 180 g) is 0.0049 % of",
-        "the learned force on the simulator with the identified law",
         "40.00 ± 0.40kPa",
         "Ogden's term of exponent 3",
-        "One test trial: 0.12 <kg>, outside of the training loads",
+        "One test trial: 0.12 <kg>, beyond the training loads",
         "did not need: second-order term in I₁, Mooney-Rivlin term, ",
         "the shear modulus of the law is 108 kPa",
-        "With elastic terms and relaxation40.30 %0.012 %",
+        "With elastic terms and relaxation40.30 %0.012 %chosen",
         "Shape and volume alone (neo-Hookean)22.0 %failed",
     ):
         assert said in page.text
@@ -116,10 +116,13 @@ def test_errors_by_load_and_multiples():
         "errors_mm": {"law": {}},
         "range": {"resphys": {"first_s": {"up": 0.0}}},
     }
-    inside, outside = errors_by_load(metrics, ["up", "twist"]).values()
-    assert [own["law"]["mean"] for own in (inside, outside)] == [2.0, 2.0]
-    assert [own["simfree"]["mean"] for own in (inside, outside)] == [0.02, 100.0]
-    assert errors_by_load(metrics, []) == {}
+    plain = vertex_settings()
+    data = plain.data.changed(others={name: {"weight_g": 1.0} for name in ("up", "twist")})
+    assert grouped_errors(metrics, plain.changed(data=data, test_titles=("weights", "others"))) == {
+        "weights": {"law": [1.0, 3.0], "simfree": [0.01, 0.03]},
+        "others": {"law": [2.0, 2.0], "simfree": [80.0, 120.0]},
+    }
+    assert [*grouped_errors(metrics, plain)] == ["4 test trials"]
     assert percent_text(49.0) == "50 times"
     (left,) = range_texts(metrics, ["50 g", "up"])
     assert left.endswith("from the start (up). There the learned force fades out, and the law remains.")

@@ -30,6 +30,7 @@ from warp_resphys.report.page import (
     duration_text,
     error_parts,
     number_text,
+    share_text,
 )
 from warp_resphys.report.render import axes_from_below, motion_axes
 from warp_resphys.report.run_page import range_texts
@@ -42,7 +43,6 @@ from warp_resphys.report.sections import (
     rest_table,
     scale_table,
     shapes_table,
-    share_text,
     trials_section,
 )
 from warp_resphys.settings.learning import RangeSettings
@@ -74,19 +74,19 @@ class TestErrors:
         table = horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
         assert table.columns == ["SysID", "ResPhys"]
         assert {row.head: row.cells for row in table.rows} == {
-            "First 5 s": [Cell("2.000 ± 0.100", "7.51 ± 3.63"), Cell("1.000 ± 0.100", "5.79 ± 3.09")],
-            "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.500 ± 0.100", "6.10 ± 3.22")],
+            "First 5 s": [Cell("2.00 ± 0.10", "7.51 ± 3.63"), Cell("1.00 ± 0.10", "5.79 ± 3.09")],
+            "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50 ± 0.10", "6.10 ± 3.22")],
             "Growth": [Cell(NONE, "+0.8 %"), Cell("+50.0 %", "+5.4 %")],
         }
         (row,) = horizon_table({"horizons": {"5": ERRORS}}, {}).rows
-        assert row.cells == [Cell("2.000 ± 0.100"), Cell("1.000 ± 0.100")]
+        assert row.cells == [Cell("2.00 ± 0.10"), Cell("1.00 ± 0.10")]
         assert horizon_table({}, {}) is None
 
     def test_by_scale_of_the_inputs(self):
         table = scale_table({"1.25": MORE, "1": ERRORS})
         assert {row.head: row.cells for row in table.rows} == {
-            "\N{MULTIPLICATION SIGN} 1": [Cell("2.000 ± 0.100"), Cell("1.000 ± 0.100", f"{MINUS}50 %")],
-            "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.500 ± 0.100")],
+            "\N{MULTIPLICATION SIGN} 1": [Cell("2.00 ± 0.10"), Cell("1.00 ± 0.10", f"{MINUS}50 %")],
+            "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.50 ± 0.10")],
         }
         assert scale_table({}) is None
 
@@ -133,9 +133,9 @@ def test_control_is_told_by_controller_and_speed():
     assert "the mean of A and B, follows 1 paths (eight) of 40 mm" in task.text
     plan, receding = table.rows
     assert plan.head == "SysID, open loop"
-    assert plan.cells == [Cell("1.000", beside="at most 2.000"), Cell(NONE)]
-    assert (receding.answer, plan.answer) == (True, False)
-    assert any("to 1.000 mm after corrections" in said and "to 4.000 mm before" in said for said in facts.items)
+    assert plan.cells == [Cell("1.00", beside="at most 2.00"), Cell(NONE)]
+    assert (receding.mark, plan.mark) == ("best", "")
+    assert any("to 1.00 mm after corrections" in said and "to 4.00 mm before" in said for said in facts.items)
     assert any("a command takes 2.0 ms" in said for said in facts.items)
     assert control_section(SimpleNamespace(metrics={}, settings=SimpleNamespace(control=None)), None) is None
 
@@ -323,8 +323,8 @@ def test_trials_out_of_range_are_counted_where_they_belong():
 
 def test_numbers_have_sensible_digits():
     shown = [number_text(value) for value in (4.48812, 0.000721, 0.0, None)]
-    assert shown == ["4.488", "0.00072", "0.000", "diverged"]
-    assert number_text(2.14e-9) == "2.1 \N{MULTIPLICATION SIGN} 10⁻⁹"
+    assert shown == ["4.49", "0.00072", "0", "diverged"]
+    assert [number_text(value) for value in (2.14e-9, 0.0999, 0.154, 1234.5)] == ["2.1e-09", "0.100", "0.154", "1,234"]
     deviating = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
     assert error_parts(deviating) == ("0.00072", "± 0.00031")
     assert error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
@@ -337,7 +337,7 @@ def test_published_growth_and_filtered_errors():
     assert 100.0 * published_growth(horizons, "5", "10")["resphys"] == pytest.approx(5.4, abs=0.05)
     assert largest_filtered({}) == ""
     filtered = largest_filtered({"median_filtered": {"resphys": 1.5, "sysid": None}})
-    assert "reaches 1.500 mm (ResPhys)" in filtered.replace(NO_BREAK_SPACE, " ")
+    assert "reaches 1.50 mm (ResPhys)" in filtered.replace(NO_BREAK_SPACE, " ")
 
 
 def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
@@ -346,11 +346,12 @@ def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
     ]
     covered = {"models": {"sysid": {"by_trial": {"a": 0.93}}}}
     metrics = {"per_trajectory": rows, "errors_mm": {"sysid": {"mean": 1.5}}, "intervals": covered}
-    data = SimpleNamespace(metrics=metrics, others=("b",), pages={}, driven=None)
+    run = SimpleNamespace(test_titles=("weights", "other loads"))
+    data = SimpleNamespace(metrics=metrics, settings=run, others=("b",), pages={}, driven=None)
     (table,) = trials_section(data, None).blocks
     assert [(row.head, row.cells[0].text, row.small) for row in table.rows] == [
-        ("a", "1.000", "amplitude 20 mm, coverage 93 %"),
-        ("b", "2.000", "amplitude 20 mm, other loads"),
+        ("a", "1.00", "amplitude 20 mm, coverage 93 %"),
+        ("b", "2.00", "amplitude 20 mm, other loads"),
     ]
     assert trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None) is None
 
@@ -364,9 +365,9 @@ def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
     (table,) = rest_table(fits, quantity)
     assert table.columns == ["As it is", "Refitted gain", "Refitted offset"]
     assert [[(cell.text, cell.small) for cell in row.cells] for row in table.rows] == [
-        [("2.000", ""), ("1.000", "+5.0 %"), ("0.500", "2 kPa")],
-        [("4.000", ""), ("1.000", "+5.0 %"), (NONE, "")],
-        [("3.000", ""), ("1.000", ""), ("2.250", "")],
+        [("2.00", ""), ("1.00", "+5.0 %"), ("0.500", "2 kPa")],
+        [("4.00", ""), ("1.00", "+5.0 %"), (NONE, "")],
+        [("3.00", ""), ("1.00", ""), ("2.25", "")],
     ]
     assert rest_table({}, None) == rest_table({"sysid": [fit("a", 2.0)]}, None) == []
 
@@ -377,26 +378,16 @@ def result(simulation, sysid=None, law=None, **more):
     return {"vertices": 225, "moved_mm": 12.5, "errors_mm": kept, **more}
 
 
-@pytest.mark.parametrize(
-    ("share", "text"),
-    [
-        (0.5, "50 %"),
-        (0.897, "90 %"),
-        (0.9958, "99.58 %"),
-        (0.99976, "99.976 %"),
-        (1.0, "100 %"),
-        (-0.2, "\N{MINUS SIGN}20 %"),
-    ],
-)
-def test_shares_have_digits_for_what_is_left(share, text):
-    assert share_text(share) == text
+def test_shares_have_digits_for_what_is_left():
+    shown = [share_text(share) for share in (0.5, 0.897, 0.9958, 0.99976, 1.0, -0.2)]
+    assert shown == ["50 %", "90 %", "99.6 %", "99.98 %", "100 %", f"{MINUS}20 %"]
 
 
 def test_a_model_that_diverges_on_a_body():
     lost = result(1.0, 0.2)
     lost["errors_mm"]["law"] = None
     rows = {row.head: [cell.text for cell in row.cells] for row in shapes_table({"rod": lost}).rows}
-    assert rows == {"rod": ["1.000", "0.200", "diverged"]}
+    assert rows == {"rod": ["1.00", "0.200", "diverged"]}
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -410,7 +401,7 @@ def test_page_has_the_bodies(tmp_path):
     for said in (
         "Other bodies of the same material",
         "thin <beam>",
-        "removes 99.0 %",
+        "removes 99 %",
         "225 vertices, moves by 12.5 mm",
     ):
         assert said in page.text

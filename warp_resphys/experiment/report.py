@@ -3,6 +3,7 @@
 Functions that read a file raise a DataFileError if the file is missing or damaged.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,7 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         "reconstruction": read_if_there(folder / RECONSTRUCTION),
         "control": read_if_there(folder / CONTROL) if run.control is not None else {},
         "shapes": read_if_there(folder / SHAPES) if run.shapes else {},
+        "placement": placement(read_if_there(common_folder(folder) / REGISTRATION), identified),
         "mesh_check": {} if run.mesh_check is None else read_if_there(folder / MESH_CHECK),
         "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if run.timing else {},
         **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
@@ -179,6 +181,13 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
     }
+
+
+def placement(registered: Mapping[str, Any], identified: Mapping[str, Any]) -> dict[str, float]:
+    """Largest residual of the registration of a trial [mm], and the identified rotation of the markers [degrees]."""
+    turns = [math.hypot(*model["placement"]["turn"]) for model in identified.values() if model.get("placement")]
+    rms = max((fit["rms_mm"] for fit in registered.values()), default=0.0)
+    return {"rms_mm": rms, "turned_deg": math.degrees(max(turns, default=0.0))} if registered else {}
 
 
 def true_contact(run: RunSettings) -> dict[str, float]:

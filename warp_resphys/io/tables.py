@@ -6,7 +6,7 @@ from typing import Final
 
 from rich.console import Console, RenderableType
 
-_LOG_WIDTH: Final = 140  # of tables that go to a file, in characters
+_LOG_WIDTH: Final = 110  # of tables that go to a file, in characters
 
 
 def show(*parts: RenderableType) -> None:

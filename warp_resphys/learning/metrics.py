@@ -155,9 +155,10 @@ def errors_per_marker(
 
 
 def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
-    """Returns the mean error over trajectories, steps and vertices (E_q of the paper), and the standard deviation.
+    """Returns the mean error over trajectories of that over steps and vertices (E_q of the paper), and its deviation.
 
-    The deviation is that of the mean over the vertices, over trajectories and steps.
+    Every trajectory counts alike, whatever its length. The deviation is that of the mean over the vertices, over
+    trajectories and steps.
 
     Args:
         errors: One array (T,) for each trajectory, from `marker_errors` [mm]; T may differ.
@@ -171,7 +172,7 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
     diverged = sum(not np.isfinite(row).all() for row in rows)
     pooled = np.concatenate(rows)  # (sum of T,) [mm]
     return {
-        "mean": None if diverged else float(pooled.mean()),
+        "mean": None if diverged else float(np.mean([row.mean() for row in rows])),
         "std": None if diverged else float(pooled.std()),
         "trajectories": len(rows),
         "diverged": diverged,
@@ -201,7 +202,7 @@ def summarise_trajectories(
 
 
 def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
-    """Returns the errors of a cross-validation for every model: mean and deviation of the folds' means."""
+    """Returns the errors of a cross-validation for every model: mean over the trials, deviation of the folds' means."""
     return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
 
 
@@ -237,11 +238,11 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
     means = [summary["mean"] for summary in summaries if summary["mean"] is not None]
-    complete = len(means) == len(summaries)
+    complete, counts = len(means) == len(summaries), [summary["trajectories"] for summary in summaries]
     return {
-        "mean": float(np.mean(means)) if complete else None,
+        "mean": float(np.average(means, weights=counts)) if complete else None,
         "std": float(np.std(means)) if complete and len(means) > 1 else None,
-        "trajectories": sum(summary["trajectories"] for summary in summaries),
+        "trajectories": sum(counts),
         "diverged": sum(summary["diverged"] for summary in summaries),
     }
 

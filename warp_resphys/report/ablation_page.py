@@ -99,7 +99,7 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure
     axes.boxplot([*errors.values()], widths=0.55, whis=(0, 100), **lines)
     axes.plot([0.5, count + 0.5], [uncorrected, uncorrected], color=grey, linewidth=1.1, linestyle="--")
     place: Any = {"textcoords": "offset points", "ha": "right", "color": grey}
-    axes.annotate("uncorrected simulation", (count + 0.5, uncorrected), (-2, 3), **place)
+    axes.annotate("uncorrected simulator", (count + 0.5, uncorrected), (-2, 3), **place)
     axes.set_xlim(0.5, count + 0.5)
     axes.set_xticks(range(1, count + 1), [str(markers) for markers in errors])
     axes.set_yscale("log")
@@ -132,7 +132,7 @@ def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
         "With none of these numbers of markers does the median error stay below 0.1 mm."
         if needed is None
         else f"With {needed} or more markers, the median error stays below 0.1 mm; the published reconstruction needs "
-        f"4. The error of the uncorrected simulation is {number_text(uncorrected)} mm."
+        f"4. The error of the uncorrected simulator is {number_text(uncorrected)} mm."
     )
     narrow = _markers_below(rows, "interquartile_range_mm", 0.05)
     if narrow is not None:

@@ -121,7 +121,7 @@ def tracking_table(tracking: Mapping[str, Any]) -> PageTable:
     for controller in first:
         name, meaning = _words(controller)
         cells = [cell(errors.get(controller)) for errors in tracking.values()]
-        rows.append(Row(name, cells, controller == best, meaning))
+        rows.append(Row(name, cells, "best" * (controller == best), meaning))
     return PageTable("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
 
 

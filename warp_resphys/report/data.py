@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
@@ -29,7 +28,7 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "regression": ("Regression", "without physics: kernel ridge regression over the training trials"),
     "linear": ("Linear model", "without physics: linear from frame to frame, with powers of the inputs (DMDc)"),
     "published": ("Published setting", "the simulator as the published code sets it up"),
-    "simulation": ("Uncorrected simulation", "the simulator as it is, with the values of the data sheet"),
+    "simulation": ("Uncorrected simulator", "with the values of the data sheet"),
     "reconstruction": ("Reconstruction", "the simulator with forces fitted to the test trial itself"),
     "sysid_elastic": ("SysID of E and ν", "the elastic parameters that fit best"),  # noqa: RUF001
     "sysid": ("SysID", "the simulator with the parameters that fit best"),
@@ -38,7 +37,6 @@ MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
     "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
 }
-INSIDE, OUTSIDE = "Loads as in training", "Other loads"  # Of test trials.
 
 Errors = Mapping[str, Sequence[float | None]]  # Of each model on the same held-out trials [mm]; None: it diverged.
 _TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
@@ -213,23 +211,20 @@ def trial_errors(metrics: Mapping[str, Any], others: Collection[str] = (), outsi
     return {model: [row["errors_mm"][model] for row in rows] for model in models}
 
 
-def errors_by_load(metrics: Mapping[str, Any], others: Collection[str]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns summaries of the errors by kind of load and model, without deviations; empty if there are no two kinds.
+def grouped_errors(metrics: Mapping[str, Any], settings: RunSettings) -> dict[str, Errors]:
+    """Returns the errors on the held-out trials by the title of their group: as in training, then with other loads.
 
     Args:
-        metrics: of a split.
-        others: names of the test trials outside of the training loads.
+        metrics: of a split or of folds.
+        settings: of the run.
     """
-    groups = {kind: trial_errors(metrics, others, kind == OUTSIDE) for kind in (INSIDE, OUTSIDE)}
-    if not all(groups.values()):
-        return {}
-    return {kind: {model: _summary(own) for model, own in errors.items()} for kind, errors in groups.items()}
-
-
-def _summary(values: Sequence[float | None]) -> dict[str, Any]:
-    finite = [value for value in values if value is not None]
-    lost = len(values) - len(finite)
-    return {"mean": None if lost else fmean(finite), "std": None, "trajectories": len(values), "diverged": lost}
+    others = other_trials(settings)
+    groups = {title: trial_errors(metrics, others, at > 0) for at, title in enumerate(settings.test_titles)}
+    if all(groups.values()):
+        return groups
+    errors = next(filter(None, groups.values()), {})
+    count = len(next(iter(errors.values()), ()))
+    return {f"{count} test trial{'s' * (count != 1)}": errors} if errors else {}
 
 
 def untrained(metrics: Mapping[str, Any]) -> set[str]:
@@ -239,6 +234,11 @@ def untrained(metrics: Mapping[str, Any]) -> set[str]:
         for model, kept in fold.get("networks", {}).items():
             epochs[model] += kept["epoch"]
     return {model for model, count in epochs.items() if not count}
+
+
+def missing_baselines(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Returns why predictions without physics are missing, by model."""
+    return {model: why for fold in folds_in(metrics) for model, why in fold.get("missing_baselines", {}).items()}
 
 
 def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:

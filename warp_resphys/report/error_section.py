@@ -7,7 +7,7 @@ import numpy as np
 
 from ..io.errors import listed, number_of
 from ..learning.metrics import median_filter
-from .data import INSIDE, MODELS, OUTSIDE, FloatArray, RunReport, errors_by_load
+from .data import MODELS, FloatArray, RunReport, grouped_errors
 from .page import Canvas, Part, Text, largest_text, mm_text, unbroken
 from .sections import model_table, numbers
 
@@ -32,10 +32,10 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         panels: dict[str, Any] = {"": slice(None)}
-        if errors_by_load(metrics, data.others):
+        if len(grouped_errors(metrics, data.settings)) > 1:
             inside = np.array([name not in data.others for name in trials.names])
-            by_load = {INSIDE: inside, OUTSIDE: ~inside}
-            panels = {f"{kind} ({number_of(rows.sum(), 'trial')})": rows for kind, rows in by_load.items()}
+            by_load = zip(data.settings.test_titles, (inside, ~inside), strict=True)
+            panels = {f"{kind} ({number_of(rows.sum(), 'trial')})": rows for kind, rows in by_load}
         figure = error_over_time(trials.errors_mm, times, of, window, panels)
         blocks.append(canvas.figure("error_over_time", figure, alt, _error_caption(data, window)))
     if by_model := metrics.get("per_marker"):
@@ -127,7 +127,7 @@ def _error_caption(data: RunReport, window: float | None) -> str:
         )
         text += largest_filtered(data.metrics)
     elif count > 1:
-        parted = bool(errors_by_load(data.metrics, data.others))
+        parted = len(grouped_errors(data.metrics, data.settings)) > 1
         text += f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
         text += " of a solid line" if data.sees_markers else ""
         text += " spans the smallest to the largest of them."

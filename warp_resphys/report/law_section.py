@@ -267,17 +267,15 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
         return []
     weak = any(own.get("residual") is not None for own in tried)
     columns = ["Coefficients", *(["Force residual"] if weak else []), "Validation error"]
-    rows, chosen = [], False
+    rows, chosen = [], next((own for own in tried if own["groups"] == law["groups"]), None)
     for own in tried:
-        answer = not chosen and own["groups"] == law["groups"]
-        chosen = chosen or answer
         words = in_a_row([_GROUPS.get(group, group) for group in own["groups"]])
         head = f"With {words}" if words else "Shape and volume alone (neo-Hookean)"
         cells = [
             Cell(str(sum(wording(name)[0][1] not in _NOT_FACTORS for name, value in own["constants"].items() if value)))
         ]
         cells += [Cell(_share(own.get("residual")))] if weak else []
-        rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], answer))
+        rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], "chosen" * (own is chosen)))
     note = (
         "Validation errors are root mean squares over the amplitude of the motion. The smallest class that was close "
         "enough to the best one was chosen"

@@ -88,7 +88,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
     colours = f"Grey: {MODELS[models[0]][0]}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]][0]}."
-    blocks: list[Block] = [] if data.sees_markers else _tip_figure(data, trials, canvas)
+    blocks: list[Block] = []
     if "video" in canvas.started:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
         pace = "four times slower than real time" if motion.is_fast else "in real time"
@@ -104,11 +104,11 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
 
         blocks += canvas.attempt("motion.mp4", film)
     blocks += _in_space(data, name)
+    blocks += [] if data.sees_markers else _tip_figure(data, trials, canvas)
     same = "The same trial" if blocks else f"The trial {name}"
     blocks += canvas.attempt("motion.png", lambda _: _instants_figure(data, motion, same, colours, canvas))
-    where = ", outside of the training loads" if name in data.others else ""
-    head = f"The motion in a test trial, {name}" if data.sees_markers else f"One test trial: {name}{where}"
-    return Part(head, blocks)
+    where = ", beyond the training loads" if name in data.others else ""
+    return Part(f"One test trial: {name}{where}", blocks)
 
 
 def _in_space(data: RunReport, name: str) -> list[Block]:

@@ -33,7 +33,7 @@ NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
 MOST_PERCENT = 10.0  # Relative change above which a multiple is written in place of a percentage.
-_MOST_DECIMALS = 6  # Numbers that need more are written with a power of ten.
+_LEAST_DECIMAL = 1e-4  # Smaller numbers are written with a power of ten.
 
 
 class Cell(NamedTuple):
@@ -55,7 +55,7 @@ class Row:
 
     head: str
     cells: Sequence[Cell]  # One a column.
-    answer: bool = False  # Whether the row is highlighted as the main result.
+    mark: str = ""  # Beside the row, such as "best"; the row is highlighted.
     small: str = ""  # In small print below the head.
     address: str = ""  # Link of the head; may be empty.
 
@@ -76,19 +76,30 @@ class PageTable:
         """Returns a table of texts, without small print."""
         return cls(heads[0], heads[1:], [Row(first, [*map(Cell, cells)]) for first, *cells in rows], summary=title)
 
+    @property
+    def marked(self) -> bool:
+        """Whether a row is marked."""
+        return any(row.mark for row in self.rows)
+
     def __rich__(self) -> "rich.table.Table":
-        """Returns the table for a terminal."""
+        """Returns the table for a terminal, without lines; what is too wide is wrapped."""
         import rich.table
         import rich.text
 
-        head, *heads = map(rich.text.Text, (self.head if self.summary else "", *self.columns))  # "[mm]" is no markup
-        table = rich.table.Table(title=rich.text.Text(self.summary or self.head))
-        table.add_column(head, no_wrap=True)
-        for column in heads:
-            table.add_column(column, justify="right")
+        title = rich.text.Text(self.summary) if self.summary else None
+        justified: Any = {
+            "title_justify": "left",
+            "caption_justify": "left",
+            "caption": rich.text.Text(self.note) if self.note else None,
+        }
+        table = rich.table.Table(title=title, box=None, padding=(0, 3, 0, 0), pad_edge=False, **justified)
+        table.add_column(rich.text.Text(self.head))  # "[mm]" is no markup.
+        for column in self.columns:
+            table.add_column(rich.text.Text(column), justify="right")
         for row in self.rows:
             cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
-            table.add_row(*map(rich.text.Text, (row.head, *cells)), style="bold" if row.answer else None)
+            marked = [row.mark] if self.marked else []
+            table.add_row(*map(rich.text.Text, (row.head, *cells, *marked)), style="bold" if row.mark else None)
         return table
 
 
@@ -258,8 +269,14 @@ def write_page(
 
 
 def number_text(value: float | None) -> str:
-    """Return a number with three decimals, or two digits if that takes more; None stands for divergence."""
-    return "diverged" if value is None else _alike([value], value)[0]
+    """Return a number with three digits, or two below 0.1, such as "1.07", "0.0038" or "4.3e-07"; None: diverged."""
+    if value is None:
+        return "diverged"
+    return f"{value:.1e}" if 0.0 < abs(value) < _LEAST_DECIMAL else f"{value:,.{_decimals(value)}f}"
+
+
+def _decimals(value: float) -> int:
+    return max(0, (2 if abs(value) >= 0.1 else 1) - math.floor(math.log10(abs(value)))) if value else 0
 
 
 def mm_text(value: float | None) -> str:
@@ -274,23 +291,14 @@ def largest_text(errors: NDArray[np.float64]) -> str:
 
 
 def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a mean and its "± deviation", if there is one, with two digits of the smaller of the two."""
+    """Return a mean and its "± deviation", if there is one, with the same decimals."""
     mean, std = summary["mean"], summary["std"]
     if mean is None:
         return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
     if std is None:
         return number_text(mean), ""
-    written = _alike([mean, std], min(mean, std) or mean)
-    return written[0], f"± {written[1]}"
-
-
-def _alike(values: Sequence[float], least: float) -> list[str]:
-    """Numbers with three decimals, or more for two digits of the least one, or with a common power of ten."""
-    decimals, exponent, power = max(3, 1 - math.floor(math.log10(abs(least)))) if least else 3, 0, ""
-    if decimals > _MOST_DECIMALS:
-        decimals, exponent = 1, math.floor(math.log10(values[0]))
-        power = " \N{MULTIPLICATION SIGN} 10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return [f"{value / 10.0**exponent:.{decimals}f}{power}" for value in values]
+    deviation = number_text(std) if mean < _LEAST_DECIMAL else f"{std:,.{_decimals(mean)}f}"
+    return number_text(mean), f"± {deviation}"
 
 
 def duration_text(seconds: float) -> str:
@@ -336,11 +344,11 @@ def percent_text(ratio: float, decimals: int = 0) -> str:
     return f"{text.replace('-', MINUS) if float(text) else '0'} %"
 
 
-def ratio_text(ratio: float) -> str:
-    """Return a ratio of errors as "0.23", "1.4", "320" or "1/320"."""
-    if ratio < 0.1:
-        return f"1/{float(f'{1.0 / ratio:.2g}'):,.0f}" if ratio else "0"
-    return f"{float(f'{ratio:.2g}'):,.0f}" if ratio >= 10.0 else f"{ratio:.2g}"
+def share_text(share: float) -> str:
+    """Return a share as a percentage, such as "63 %" or "99.8 %", with a digit of what is left of it."""
+    left = 100.0 * (1.0 - share)
+    digits = max(0, -math.floor(math.log10(left))) if left > 0.0 else 0
+    return f"{100.0 * share:.{digits}f} %".replace("-", MINUS)
 
 
 def unbroken(text: str) -> str:

@@ -190,8 +190,7 @@ def distance_table(results: Sequence[PictureResult]) -> PageTable:
     for result in results:
         cells = [Cell(number_text(result.distance(model))) for model in _MODELS]
         cells += [Cell(_text(getattr(result, key)["sysid"])) for key in others.values()]
-        small = f"{result.material}{', ' * bool(result.material)}{'kept back' if result.tested else 'training'}"
-        rows.append(Row(result.pose, cells, answer=result.tested, small=small))
+        rows.append(Row(result.pose, cells, "kept back" * result.tested, result.material))
     kinds = dict.fromkeys(result.compared for result in results)
     return PageTable(
         f"Pose; distance of {' or '.join(kinds)}", [*(f"{name} [mm]" for name in _MODELS.values()), *others], rows

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from ..io.errors import number_of
 from .body_section import body_section, paths_section
 from .control_section import control_section
-from .data import MODELS, OUTSIDE, RunReport, folds_in, trial_errors
+from .data import MODELS, RunReport, folds_in, trial_errors
 from .error_section import error_section
 from .identification_section import identification_section
 from .law_section import law_section
@@ -30,7 +30,7 @@ from .page import (
     write_page,
 )
 from .sections import (
-    errors_table,
+    details_table,
     horizons_section,
     quality_section,
     registration_section,
@@ -39,10 +39,10 @@ from .sections import (
     trials_section,
 )
 from .training_section import training_section
-from .verdict import LEAST_TRIALS, verdict
+from .verdict import LEAST_TRIALS, results_table, verdict
 
 _TIMED: Final = {
-    "simulation": "Uncorrected simulation",
+    "simulation": "Uncorrected simulator",
     "target": "Simulation with the true parameters",
     "resphys": "Simulation with the learned force",
     "inference": "of which the network",
@@ -92,14 +92,19 @@ def write_report(path: Path, data: RunReport) -> None:
 
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:
-    """Return the errors of the models and the published ones."""
+    """Return the mean errors of the models."""
+    return Part("", [results_table(data.metrics, data.settings)])
+
+
+def details_section(data: RunReport, canvas: Canvas) -> Part:
+    """Return the errors of all models beside the published ones, their definition, and the trials beyond training."""
     synthetic = "laboratory" in data.settings.targets
     blocks: list[Any] = [Text(_WITHOUT_RECORDINGS, "synthetic")] if synthetic else []
-    blocks += [errors_table(data.metrics, data.settings), Text(_what_is_measured(data), "what", note=True)]
+    blocks += [details_table(data.metrics, data.settings), Text(_what_is_measured(data), "what", note=True)]
     if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
         blocks.append(Text("Roll-outs outside the training range", heading=True))
         blocks.append(Items(ranges, "ranges"))
-    return Part("", blocks)
+    return Part("Errors in detail", blocks)
 
 
 def _what_is_measured(data: RunReport) -> str:
@@ -146,7 +151,7 @@ def _what_is_measured(data: RunReport) -> str:
     kind = "arm" if data.settings.chambers is not None else "beam" if data.sees_markers else "vertices"
     learned += [_PUBLISHED_FOR[kind]] if data.published else []
     if data.others:
-        learned.append(f"{OUTSIDE}: {', '.join(data.others)}. No training trial was held like that.")
+        learned.append(f"Beyond the training loads: {', '.join(data.others)}. No training trial was held like that.")
     many = len(next(iter(trial_errors(data.metrics).values()), ())) >= LEAST_TRIALS
     text += " Interval: of the mean, over draws of the trials." if many else ""
     return unbroken(" ".join([text, *_contributions(data.metrics), *learned]))
@@ -209,9 +214,10 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     results_section,
+    motion_section,
+    details_section,
     horizons_section,
     scales_section,
-    motion_section,
     error_section,
     trials_section,
     control_section,

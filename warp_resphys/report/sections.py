@@ -1,6 +1,5 @@
 """Sections of the page of a run: errors by trial, horizon and input, and its recordings."""
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -8,22 +7,19 @@ from typing import Any, Final
 
 from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, published_errors
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, mean_interval, published_errors
 from ..settings.run import RunSettings
 from ..stepping.quantity import Quantity
 from .data import (
     MODELS,
-    OUTSIDE,
     RunReport,
-    errors_by_load,
     folds_in,
+    missing_baselines,
     models_in_figures,
-    other_trials,
     trial_errors,
     untrained,
 )
 from .page import (
-    MINUS,
     NONE,
     Canvas,
     Cell,
@@ -38,10 +34,10 @@ from .page import (
     number_text,
     percent_text,
     published_parts,
-    ratio_text,
+    share_text,
     unbroken,
 )
-from .verdict import known_errors, recommended, standings
+from .verdict import LEAST_TRIALS, known_errors
 
 BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
@@ -50,50 +46,30 @@ _CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the 
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
 
 
-def errors_table(metrics: Mapping[str, Any], settings: RunSettings, brief: bool = False) -> PageTable:
-    """Return the errors of the models in the test trials.
+def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
+    """Return mean, deviation and interval of the errors of all models, beside those that were published.
 
     Args:
         metrics: Of a split or of folds.
         settings: Of the run.
-        brief: Whether to leave out deviations, published errors and those against the reconstruction, for a terminal.
     """
-    errors = metrics["errors_mm"]
-    idle, by_trial = untrained(metrics), trial_errors(metrics)
-    chosen, places = recommended(known_errors(by_trial, idle)), standings(known_errors(by_trial))
-    published = {} if brief else published_beside(published_errors(settings.name), list(errors))
-    by_load = errors_by_load(metrics, other_trials(settings))
-    with_intervals = any(interval for interval, _ in places.values())
-    columns = ["Mean error", *(["90 % interval"] if with_intervals else []), "Against the best other", *by_load]
-    reconstructed = {} if brief else metrics.get("errors_vs_reconstruction_mm", {})
-    columns += [*(["Against the reconstruction"] if reconstructed else []), *(["Published"] if published else [])]
-    missing = (
-        {} if brief else {m: why for own in folds_in(metrics) for m, why in own.get("missing_baselines", {}).items()}
-    )
-    rows: list[Row] = []
+    errors, known, idle = metrics["errors_mm"], known_errors(trial_errors(metrics)), untrained(metrics)
+    intervals = {model: mean_interval(own) for model, own in known.items() if len(own) >= LEAST_TRIALS}
+    reconstructed = metrics.get("errors_vs_reconstruction_mm", {})
+    published = published_beside(published_errors(settings.name), list(errors))
+    columns: dict[str, Mapping[str, Cell]] = {
+        "Mean error": {model: Cell.of(error_parts(own)) for model, own in errors.items()},
+        "90 % interval": {m: Cell(" to ".join(map(number_text, ends))) for m, ends in intervals.items()},
+        "Against the reconstruction": {model: Cell.of(error_parts(own)) for model, own in reconstructed.items()},
+        "Published": {model: Cell.of(own) for model, own in published.items()},
+    }
+    columns = {title: cells for title, cells in columns.items() if cells}
+    rows, missing = [], missing_baselines(metrics)
     for model, (name, meaning) in MODELS.items():
-        if model not in errors and model not in published and model not in missing:
-            continue
-        if model in missing:
-            meaning = f"without physics: {missing[model]}"
-        elif model in idle:
-            meaning = "no force: no epoch of its training was kept"
-        elif model == "resphys" and "law" in errors:
-            meaning = "the learned force on the simulator with the identified law"
-        elif model == "resphys" and "sysid" in errors:
-            meaning = "the learned force on the identified simulator"
-        interval, ratio = places.get(model, (None, None))
-        cells = [Cell.of(error_parts(errors[model])) if model in errors else Cell(NONE)]
-        cells = [Cell(cell.text) for cell in cells] if brief else cells
-        ends = NONE if interval is None else " to ".join(map(number_text, interval))
-        cells += [Cell(ends)] if with_intervals else []
-        cells.append(Cell(NONE if ratio is None else ratio_text(ratio)))
-        cells += [Cell.of(error_parts(own[model])) if model in own else Cell(NONE) for own in by_load.values()]
-        if reconstructed:
-            cells.append(Cell.of(error_parts(reconstructed[model])) if model in reconstructed else Cell(NONE))
-        cells += [Cell.of(published[model]) if model in published else Cell(NONE)] if published else []
-        rows.append(Row(name, cells, model == chosen, meaning))
-    return PageTable(f"Error of the {'vertices' if settings.markers is None else 'markers'} [mm]", columns, rows)
+        if model in errors or model in published or model in missing:
+            small = "no force: no epoch of its training was kept" if model in idle else missing.get(model, meaning)
+            rows.append(Row(name, [own.get(model, Cell(NONE)) for own in columns.values()], small=small))
+    return PageTable("All models [mm]", list(columns), rows)
 
 
 def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
@@ -157,7 +133,7 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     for name, row in trials.items():
         words = [f"amplitude {row['amplitude_mm']:.3g} mm"] if "amplitude_mm" in row else []
         words += [f"coverage {100.0 * by_trial[name]:.0f} %"] if name in by_trial else []
-        small[name] = ", ".join([*words, *([OUTSIDE.lower()] if name in data.others else [])])
+        small[name] = ", ".join([*words, *([data.settings.test_titles[1]] if name in data.others else [])])
     rows = numbers({name: row["errors_mm"] for name, row in trials.items()})
     note = "Amplitude: root mean square displacement of the observed points."
     note += " Coverage: share of the coordinates within the 90 % prediction intervals." if by_trial else ""
@@ -346,7 +322,7 @@ def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
         return None
     note = (
         "Mean distance of the vertices from a target of the same shape, whose motion begins in the same state; below "
-        "it, the share of the uncorrected simulation's error that is removed. A learned force belongs to its mesh, and "
+        "it, the share of the uncorrected simulator's error that is removed. A learned force belongs to its mesh, and "
         "cannot be put on another one."
     )
     beyond = [f"{n} ({100.0 * r['outside']:.0f} %)" for n, r in shapes.items() if r.get("outside", 0.0) > BEYOND]
@@ -356,7 +332,7 @@ def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
-    """Return the errors by body and model, and the shares of the uncorrected simulation's error that are removed."""
+    """Return the errors by body and model, and the shares of the uncorrected simulator's error that are removed."""
     models, rows = [model for model in MODELS if any(model in r["errors_mm"] for r in shapes.values())], []
     for name, result in shapes.items():
         errors, cells = result["errors_mm"], []
@@ -367,9 +343,3 @@ def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
             cells.append(Cell(number_text(error) if model in errors else NONE, below))
         rows.append(Row(name, cells, small=f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"))
     return PageTable("Error on other bodies [mm]", [MODELS[model][0] for model in models], rows, note)
-
-
-def share_text(share: float) -> str:
-    """Return a share as a percentage, with digits for what is left of it."""
-    digits = max(0, -math.floor(math.log10(1.0 - share)) - 1) if 0.9 < share < 1.0 else 0
-    return f"{100.0 * share:.{digits}f} %".replace("-", MINUS)

@@ -1,125 +1,69 @@
-"""The verdict on a run: which model is best, which corrections help, which do not, and what to do next.
+"""Results of a run in one form, for the terminal and the page: a table of mean errors, a verdict and advice.
 
-Everything is made from one list of comparisons, each of a model with another on the same held-out trials, by a paired
-bootstrap over these trials. With fewer than five trials there is no interval, and nothing is said to help.
+An error is the mean over the trials of the mean over the frames of a trial; every trial counts alike. Models are
+compared by a paired bootstrap over the trials, which gives an interval from five trials on.
 """
 
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from statistics import fmean
-from typing import Any, Final, Literal
+from typing import Any, Final, NamedTuple
 
 from ..learning.baselines import BASELINES
-from ..learning.metrics import Gain, mean_interval, paired_gain
+from ..learning.metrics import Gain, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
-from .data import MODELS, Errors, folds_in, other_trials, trial_errors, untrained
-from .page import MINUS, mm_text, number_text, unbroken
+from .data import MODELS, Errors, folds_in, grouped_errors, missing_baselines, untrained
+from .page import Cell, PageTable, Row, mm_text, number_text, share_text, unbroken
 
 LEAST_TRIALS: Final = 5  # with which an interval over trials is given
 CORRECTED: Final = ("sysid_elastic", "sysid", "law", "resphys_uncorrected", "resphys")
-# By model: the models that it may extend, of which the first available one is compared.
-_BASES: Final[Mapping[str, tuple[str, ...]]] = {
-    "sysid_elastic": ("simulation",),
-    "sysid": ("simulation",),
-    "law": ("sysid", "simulation"),
-    "simfree": ("law", "sysid", "simulation"),
-    "resphys_uncorrected": ("simulation",),
-    "resphys": ("law", "sysid", "simulation"),
+_RANKED: Final = (  # from the simplest one on
+    *BASELINES,
+    "simulation",
+    "sysid_elastic",
+    "sysid",
+    "law",
+    "simfree",
+    *CORRECTED[-2:],
+)
+_ROWS: Final[Mapping[str, str]] = {  # Below that of the best model without physics.
+    "simfree": "network in place of the simulator (SimFree)",
+    "simulation": "uncorrected simulator",
+    "sysid_elastic": "+ identified E and \N{GREEK SMALL LETTER NU}",
+    "sysid": "+ identified parameters (SysID)",
+    "law": "+ law of its material",
+    "resphys": "+ learned force (ResPhys)",
+    "resphys_uncorrected": "learned force on the uncorrected simulator",
 }
-_RANKED: Final = (*BASELINES, "simulation", "sysid_elastic", "sysid", "law", "simfree", *CORRECTED[-2:])
-_BETWEEN: Final = ("interpolation", "regression")  # good only at trials between those of the training
 _NAMES: Final = {
     "rest": "a body that does not move",
-    "interpolation": "interpolation without physics",
-    "regression": "kernel regression without physics",
-    "linear": "a linear model without physics",
-    "simulation": "the uncorrected simulation",
-    "sysid_elastic": "identification of E and nu",
-    "law": "the law",
-    "resphys_uncorrected": "the learned force on the uncorrected simulation",
+    "interpolation": "interpolation",
+    "regression": "kernel regression",
+    "linear": "a linear model",
+    "simulation": "the uncorrected simulator",
+    "sysid_elastic": "identification of E and \N{GREEK SMALL LETTER NU}",
+    "law": "the law of the material",
+    "resphys_uncorrected": "the learned force on the uncorrected simulator",
 }
 _NUMBERS: Final = ("no", "one", "two", "three", "four")
-_TIMES: Final = 10.0  # ratio of errors from which on it is written in place of a percentage
+_EQUAL: Final = 0.005  # share of an error below which there is no difference
 _CLOSE: Final = 1e-4  # distance from a bound or the first guess that counts as none, over a parameter's range
+_SIMPLER: Final = 0.1  # share of an error that a simpler model may add, where the difference is not significant
+_COVERED: Final = 0.75  # share of the measurements within 90 % intervals, below which these are too narrow
+_TURNED: Final = 3.0  # degrees by which identification rotates the markers, from which on their registration is wrong
+_MOST_DOUBTS: Final = 3  # in the verdict
 _GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # keys of the ranges in the group `identify`
 
 Known = Mapping[str, Sequence[float]]  # errors of the models whose roll-outs are all defined [mm]
 
 
-@dataclass(frozen=True)
-class ModelComparison:
-    """A model beside another one, on the same held-out trials."""
+class Doubt(NamedTuple):
+    """A reason not to rely on a result yet."""
 
-    model: str
-    other: str  # With which it is compared.
-    errors: Sequence[float | None]  # Of the model on each trial [mm]; None where its roll-out diverged.
-    others: Sequence[float | None]  # Of the other model.
-    where: str = ""  # Which trials these are, such as "with other loads".
-    idle: bool = False  # Whether no epoch of its training was kept, so that its learned force is zero.
-
-    @cached_property
-    def gain(self) -> Gain | None:
-        """Share of the other model's error that the model removes; None where a roll-out diverged."""
-        pairs = [(b, a) for b, a in zip(self.others, self.errors, strict=True) if a is not None and b]
-        return paired_gain(*zip(*pairs, strict=True)) if pairs and len(pairs) == len(self.errors) else None
-
-    @property
-    def outcome(self) -> Literal["helps", "harms", "same", "few", "unknown"]:
-        """Outcome by the 90 % interval of the gain; ``few`` with fewer than five trials."""
-        if self.idle or self.gain is None:
-            return "unknown"
-        if self.gain.trials < LEAST_TRIALS:
-            return "few"
-        return "helps" if self.gain.lower > 0.0 else "harms" if self.gain.upper < 0.0 else "same"
-
-    @property
-    def improves(self) -> bool:
-        """Whether the model has less error, significantly so where there are enough trials for an interval."""
-        return self.outcome == "helps" or (self.outcome == "few" and self.gain is not None and self.gain.share > 0.0)
-
-    @property
-    def text(self) -> str:
-        """The comparison as what follows the model's name: "has 48 % less error than SysID (90 % interval ...)"."""
-        base, at = model_name(self.other), f" {self.where}" if self.where else ""
-        if self.idle:
-            return f"adds nothing to {base}{at}, as no epoch of its training improved the validation trials"
-        if lost := sum(error is None for error in self.errors):
-            return f"diverged in {lost} of {len(self.errors)} trials{at}"
-        if self.gain is None:
-            return f"cannot be compared with {base}{at}, which diverged or has no error"
-        if self.outcome == "few":
-            known = [(a, b) for a, b in zip(self.errors, self.others, strict=True) if a is not None and b is not None]
-            sign = 1 if self.improves else -1
-            word, count = "lower" if self.improves else "higher", len(known)
-            shown = sum(sign * a < sign * b for a, b in known)
-            before, after = (number_text(fmean(own)) for own in list(zip(*known, strict=True))[::-1])
-            return f"has a {word} error than {base} on {shown} of {count} trials{at} ({before} to {after} mm)"
-        if self.outcome == "same":
-            return f"shows no significant difference from {base} on {self.gain.trials} trials{at}"
-        return f"{accuracy(self.gain, base)}{at}"
-
-
-def accuracy(gain: Gain, base: str) -> str:
-    """Returns the size of a gain over a model or of a loss, with its interval where there are enough trials for one."""
-    better = gain.share >= 0.0
-    ends = (gain.lower, gain.upper) if better else (-gain.upper, -gain.lower)
-    ratios = [(1.0 - min(own, 1.0 - 1e-12)) ** (-1 if better else 1) for own in (gain.share, gain.lower, gain.upper)]
-    if ratios[0] >= _TIMES:
-        text, unit = f"is {_times(ratios[0])} times more accurate than {base}", ""
-        text = text if better else f"has {_times(ratios[0])} times the error of {base}"
-        shown = [_times(ratio) for ratio in sorted(ratios[1:])]
-    else:
-        text = f"has {100.0 * abs(gain.share):.0f} % {'less' if better else 'more'} error than {base}"
-        shown, unit = [f"{100.0 * end:.0f}".replace("-", MINUS) for end in ends], " %"
-    return text if gain.trials < LEAST_TRIALS else f"{text} (90 % interval {' to '.join(shown)}{unit})"
-
-
-def _times(ratio: float) -> str:
-    return f"{float(f'{ratio:.2g}'):,.0f}" if ratio >= _TIMES else f"{ratio:.1f}"
+    fact: str
+    remedy: str  # A sentence.
 
 
 def model_name(model: str) -> str:
@@ -133,133 +77,181 @@ def known_errors(errors: Errors, without: Collection[str] = ()) -> Known:
     return {model: own for model, own in finite.items() if own and len(own) == len(errors[model])}
 
 
-def best_pair(known: Known) -> tuple[str, str]:
-    """Returns the corrected model of least mean error, and the best of all others; empty where there is none."""
-    return _least(known, CORRECTED), _least(known, [model for model in _RANKED if model not in CORRECTED])
-
-
-def recommended(known: Known) -> str:
-    """Returns the simplest model that is not significantly worse than the one of least mean error; empty without any.
-
-    With fewer than five trials it is the one of least mean error. Where that one knows only what lies between the
-    training trials, the split cannot judge a simulator, and none is recommended.
-    """
-    best = _least(known, _RANKED)
-    if best in _BETWEEN:
-        return ""
-    others = {m: ModelComparison(best, m, known[best], own) for m, own in known.items() if m != best}
-    worse = {model for model, own in others.items() if own.outcome in ("helps", "few")}
-    return next((model for model in _RANKED if model in known and model not in worse), "")
-
-
-def _least(known: Known, models: Collection[str]) -> str:
-    """The model of least mean error, the simplest of equal ones; empty without one."""
+def best_of(known: Known, models: Collection[str]) -> str:
+    """Returns the model of least mean error among some, the simplest of equal ones; empty without one."""
     return min((m for m in _RANKED if m in known and m in models), key=lambda m: fmean(known[m]), default="")
 
 
-def standings(known: Known) -> dict[str, tuple[tuple[float, float] | None, float | None]]:
-    """Returns by model the 90 % interval of its mean error over the trials [mm], and the ratio to the best other model.
-
-    With fewer than five trials there is no interval.
-    """
-    means = {model: fmean(own) for model, own in known.items()}
-    best = {m: min((mean for other, mean in means.items() if other != m), default=0.0) for m in means}
-    return {
-        m: (mean_interval(own) if len(own) >= LEAST_TRIALS else None, means[m] / best[m] if best[m] else None)
-        for m, own in known.items()
-    }
+def best_pair(known: Known) -> tuple[str, str]:
+    """Returns the corrected model of least mean error, and the best of all others; empty where there is none."""
+    return best_of(known, CORRECTED), best_of(known, [model for model in _RANKED if model not in CORRECTED])
 
 
-def comparisons(errors: Errors, without: Collection[str] = (), where: str = "") -> list[ModelComparison]:
-    """Returns each correction beside the model that it corrects.
+def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
+    """Returns the mean errors, with a column for each group of test trials and each factor of the inputs.
 
-    Args:
-        errors: on held-out trials.
-        without: models of which no epoch of training was kept.
-        where: which trials these are; may be empty.
-    """
-    pairs = {m: next((base for base in bases if base in errors), "") for m, bases in _BASES.items() if m in errors}
-    return [ModelComparison(m, b, errors[m], errors[b], where, m in without) for m, b in pairs.items() if b]
-
-
-def verdict(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
-    """Returns at most four sentences on a run: what is best, what helps, what does not, and what to do next.
+    Of the models without physics, the best one of each column is shown.
 
     Args:
         metrics: metrics.json of a split or of folds.
         settings: of the run.
     """
-    others, idle = other_trials(settings), untrained(metrics)
-    inside, outside = (trial_errors(metrics, others, out) for out in (False, True))
-    steps = comparisons(inside or outside, idle, "with loads as in training" if inside and outside else "")
-    if inside and outside:
-        steps += [step for step in comparisons(outside, idle, "with other loads") if not step.idle]
-    known = known_errors(outside or inside, idle)
-    helping = [step for step in steps if step.improves]
-    sentences = (
-        _best_text(known, "with other loads" if outside else ""),
-        _listed(helping),
-        _listed([step for step in steps if step not in helping], _unused_law(metrics)),
-        _to_do(metrics, settings.identify, known),
-    )
-    return [unbroken(f"{text[0].upper()}{text[1:]}.") for text in sentences if text]
+    groups, idle = grouped_errors(metrics, settings), untrained(metrics)
+    columns = {title: {model: _cell(own) for model, own in errors.items()} for title, errors in groups.items()}
+    plain = {title: best_of(known_errors(errors), BASELINES) for title, errors in groups.items()}
+    for scale, errors in sorted(metrics.get("scales", {}).items(), key=lambda item: float(item[0])):
+        if float(scale) != 1.0:
+            title = f"inputs \N{MULTIPLICATION SIGN} {float(scale):g}"
+            columns[title] = {model: Cell(number_text(summary["mean"])) for model, summary in errors.items()}
+            means = {m: errors[m]["mean"] for m in BASELINES if m in errors and errors[m]["mean"] is not None}
+            plain[title] = min(means, key=means.__getitem__, default="")
+    last = next(reversed(groups.values()), {})
+    best, mark = best_of(known_errors(last, idle), _RANKED), "best beyond the training" if len(groups) > 1 else "best"
+    rows = []
+    if named := [model_name(model) for model in dict.fromkeys(plain.values()) if model]:
+        cells = [columns[title].get(model, Cell("")) for title, model in plain.items()]
+        rows.append(Row(f"without physics ({', '.join(named)})", cells, mark * (best in BASELINES)))
+    rows += [
+        Row(text, [own.get(model, Cell("")) for own in columns.values()], mark * (model == best))
+        for model, text in _ROWS.items()
+        if any(model in own for own in columns.values())
+    ]
+    of = "vertices" if settings.markers is None else "markers"
+    lacking = [f"{model_name(model)}: {why}" for model, why in missing_baselines(metrics).items()]
+    note = f"Missing: {'; '.join(lacking)}." if lacking else ""
+    return PageTable(f"{settings.title}: mean error of the {of} [mm]", list(columns), rows, note)
 
 
-def _listed(steps: Sequence[ModelComparison], *more: str) -> str:
-    return "; ".join([*(f"{model_name(step.model)} {step.text}" for step in steps), *filter(None, more)])
+def _cell(errors: Sequence[float | None]) -> Cell:
+    lost = sum(error is None for error in errors)
+    known = [error for error in errors if error is not None]
+    return Cell(f"{lost} of {len(errors)} diverged" if lost else number_text(fmean(known)))
 
 
-def _best_text(known: Known, where: str) -> str:
-    """Returns the sentence on the best model: its error, and its gain over the best model of the other kind."""
+def less_error(best: str, second: str, share: float) -> str:
+    """Returns the first half of a sentence on the best model, such as "ResPhys has 63 % less error than SimFree".
+
+    Args:
+        best: model of less error.
+        second: best model of the other kind; the kinds are the corrected simulators, and all other models.
+        share: of the error of the second one that the best one removes.
+    """
+    other = "anything without physics" if second in BASELINES else model_name(second)
+    other = "any corrected simulator" if best not in CORRECTED else other
+    name = f"{model_name(best)}, without physics," if best in BASELINES else model_name(best)
+    return f"{name} has {share_text(share)} less error than {other}"
+
+
+def verdict(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
+    """Returns a sentence on what is best, by how much and on how many trials, and at most two sentences of advice.
+
+    Args:
+        metrics: metrics.json of a split or of folds.
+        settings: of the run.
+    """
+    groups, idle = [*grouped_errors(metrics, settings).values()], untrained(metrics)
+    if not groups or not {*_RANKED} & groups[-1].keys():
+        return []
+    known = known_errors(groups[-1], idle)
+    beyond = "beyond the training loads, " if len(groups) > 1 else ""
+    texts = [f"{beyond}{_best_text(known)}"] if known else ["all models diverged"]
+    inside = best_of(known_errors(groups[0], idle), _RANKED) if len(groups) > 1 else ""
+    advice = [f"within them, {model_name(inside)} is {'enough' if inside in BASELINES else 'best'}"] if inside else []
+    if doubts := [*_failed(groups[-1], known, idle), *_doubts(metrics, settings, known, len(groups))]:
+        advice += [f"check before use: {'; '.join(doubt.fact for doubt in doubts[:_MOST_DOUBTS])}", doubts[0].remedy]
+    elif not inside:
+        advice += _use(known)
+    return [unbroken(f"{text[0].upper()}{text[1:]}.") for text in [*texts, *advice[:2]] if text]
+
+
+def _best_text(known: Known) -> str:
     corrected, other = best_pair(known)
-    best = _least(known, (corrected, other))
-    if not best:
-        return ""
+    best = best_of(known, (corrected, other))
     count = len(known[best])
-    at = f" on {count} trial{'s' if count > 1 else ''}{' ' if where else ''}{where}"
-    means = {model: f"with a mean error of {mm_text(fmean(known[model]))}{at}" for model in known}
+    on = f"on {count} trial{'s' * (count > 1)}"
     if not corrected or not other:
-        return f"{model_name(best)} is best, {means[best]}"
+        return f"{model_name(best)} has the lowest error, {mm_text(fmean(known[best]))} {on}"
     second = other if best == corrected else corrected
-    beside = ModelComparison(best, second, known[best], known[second])
-    if best in _BETWEEN:
-        return (
-            f"{model_name(corrected)} is the best simulator, {means[corrected]}, but {model_name(best)} {beside.text}: "
-            "the test trials lie between those of the training, so this split cannot judge a simulator"
-        )
-    if beside.outcome == "few":
-        return f"{model_name(best)} is best, {means[best]}; {model_name(second)} has {mm_text(fmean(known[second]))}"
-    place = "is best" if beside.improves else "has the lowest error"
-    return f"{model_name(best)} {place}, {means[best]}: it {beside.text}"
+    gain = compared(known[second], known[best])
+    if gain.share < _EQUAL or not is_clear(gain):
+        word = "no" if gain.share < _EQUAL else "no significant"
+        return f"{model_name(best)} and {model_name(second)} show {word} difference {on}, {mm_text(fmean(known[best]))}"
+    lower = sum(a < b for a, b in zip(known[best], known[second], strict=True))
+    return f"{less_error(best, second, gain.share)} (on {lower} of {count} trials)"
 
 
-def _unused_law(metrics: Mapping[str, Any]) -> str:
-    laws = [fold["law"] for fold in folds_in(metrics) if fold.get("law")]
-    unused = sum(not law["accepted"] for law in laws)
-    where = f" in {unused} of {len(laws)} folds" if len(laws) > 1 else ""
-    return f"the identified law is not used{where}, as it did not help on the validation trials" if unused else ""
+def compared(before: Sequence[float], after: Sequence[float]) -> Gain:
+    """Returns the share of the error of one model that another one removes, on the same trials."""
+    return paired_gain([max(error, 1e-300) for error in before], after)
 
 
-def _to_do(metrics: Mapping[str, Any], settings: IdentifySettings | None, known: Known) -> str:
-    """Returns the advice: use a model, choose another split, or correct the identification."""
-    best, chosen, parts = _least(known, _RANKED), recommended(known), list[str]()
-    count = len(known[best]) if best else 0
-    if best in _BETWEEN:
-        parts.append("to judge the simulator, test it on trials unlike those of the training")
-    elif 0 < count < LEAST_TRIALS:
-        few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
-        parts.append(f"{few} too few for an interval; use at least five")
+def is_clear(gain: Gain) -> bool:
+    """Returns whether the 90 % interval of a gain excludes zero, or there are too few trials for an interval."""
+    return gain.trials < LEAST_TRIALS or gain.lower > 0.0
+
+
+def _use(known: Known) -> Iterator[str]:
+    """Yields which model to use: of those that are not clearly worse than the best one, the simplest simulator."""
+    best = best_of(known, _RANKED)
+    if best in BASELINES:
+        yield f"{model_name(best)} is enough for trials like these; to judge the simulator, test it on others"
     elif best:
-        parts.append(f"use {model_name(chosen)}")
-        parts[0] += f", which is simpler than {model_name(best)} and not significantly worse" * (chosen != best)
-    folds = folds_in(metrics)
-    counted = Counter(text for fold in folds for text in _bounds(fold, settings))
-    parts += [f"in {n} of {len(folds)} folds, {text}" if len(folds) > 1 else text for text, n in counted.items()]
-    return "; ".join(parts)
+        chosen = next(m for m in _RANKED if m in known and m not in BASELINES and _as_good(known[m], known[best]))
+        simpler = f", which is simpler than {model_name(best)} and not significantly worse"
+        yield f"use {model_name(chosen)}{simpler * (chosen != best)}"
 
 
-def _bounds(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> Iterator[str]:
-    """Yields advice on identified parameters at a bound or at their first guess."""
+def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:
+    gain = compared(errors, best)
+    return gain.share < _EQUAL or (gain.share < _SIMPLER and not is_clear(gain))
+
+
+def _failed(errors: Errors, known: Known, idle: Collection[str]) -> Iterator[Doubt]:
+    """Yields corrections that diverged, or that no epoch of a training improved."""
+    best = best_of(known, ("simulation", *CORRECTED))
+    use = f"use {model_name(best)}" if best else ""
+    for model in (model for model in CORRECTED if model in errors):
+        if lost := sum(error is None for error in errors[model]):
+            yield Doubt(f"{model_name(model)} diverged in {lost} of {len(errors[model])} trials", use)
+        elif model in idle:
+            yield Doubt(f"no epoch of the training of {model_name(model)} lowered the validation error", use)
+
+
+def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, groups: int) -> Iterator[Doubt]:
+    """Yields reasons not to rely on the best corrected simulator yet, the worst one first."""
+    model, _ = best_pair(known)
+    folds, count = folds_in(metrics), len(next(iter(known.values()), ()))
+    error = fmean(known[model]) if model else math.inf
+    placed = [fold["placement"] for fold in folds if "placement" in fold]
+    if (turned := max((own["turned_deg"] for own in placed), default=0.0)) > _TURNED:
+        text = f"the markers are rotated by {turned:.1f}° from their registration"
+        yield Doubt(text, "check the positions and axes of the markers")
+    if (rms := max((own["rms_mm"] for own in placed), default=0.0)) > error:
+        yield Doubt(f"the markers at rest fit their positions to {mm_text(rms)} only", "measure the positions again")
+    checks = [fold["mesh_check"] for fold in folds if "moved_mm" in fold.get("mesh_check", {})]
+    if checks and model in known and (base := checks[0]["model"]) in known and base != model:
+        moved, gained = fmean(check["moved_mm"] for check in checks), fmean(known[base]) - error
+        if moved > gained:
+            text = f"a finer mesh moves the markers by {mm_text(moved)}, {model_name(model)} gains {mm_text(gained)}"
+            yield Doubt(text, "refine the mesh first")
+    if 0 < count < LEAST_TRIALS:
+        few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
+        yield Doubt(f"{few} too few for an interval", "test on five trials or more")
+    left = sum(len(fold.get("range", {}).get(model, {}).get("first_s", ())) for fold in folds)
+    if groups == 1 and 2 * left > count:
+        yield Doubt(f"{left} of {count} trials leave the training range", "train on trials that reach as far")
+    covered = metrics.get("intervals", {}).get("models", {}).get(model, {}).get("coverage", 1.0)
+    if covered < _COVERED:
+        text = f"90 % of the measurements should lie within the 90 % intervals, {100.0 * covered:.0f} % do"
+        yield Doubt(text, "validate on trials like those of the test")
+    counted = Counter(doubt for fold in folds for doubt in _bounds(fold, settings.identify))
+    for doubt, found in counted.items():
+        where = f"in {found} of {len(folds)} folds, " if len(folds) > 1 else ""
+        yield Doubt(f"{where}{doubt.fact}", doubt.remedy)
+
+
+def _bounds(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> Iterator[Doubt]:
+    """Yields identified parameters at a bound or at their first guess."""
     for model, group in _GROUPS.items():
         ranges = (None if settings is None else getattr(settings, group)) or {}
         start, values = (metrics.get(key, {}).get(model, {}) for key in ("first_guesses", "parameters"))
@@ -268,6 +260,6 @@ def _bounds(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> It
             ends = {end: getattr(own, end) for end in ("lower", "upper")}
             if end := next((end for end, bound in ends.items() if abs(values[name] - bound) <= close), ""):
                 mend = f"widen {key}.{end}" if ends[end] else f"remove it from the fit (~{key})"
-                yield f"{name} is at its {end} bound, {ends[end]:g}: {mend}"
+                yield Doubt(f"{name} is at its {end} bound, {ends[end]:g}", mend)
             elif own.prior is None and abs(values[name] - start.get(name, math.nan)) <= close:
-                yield f"{name} stayed at its first guess, {values[name]:g}: raise identify.starts"
+                yield Doubt(f"{name} stayed at its first guess, {values[name]:g}", "raise identify.starts")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import BeforeValidator, Field, model_validator
 
 from ..io.errors import InputError, listed
-from ..io.settings import Natural, Settings, Word, parse, setting
+from ..io.settings import Natural, Pair, Settings, Word, parse, setting
 from .body import Integrator, MaterialSettings, PhysicsSettings, SimulatorSettings, SteppedSettings, TargetSettings
 from .control import ControlSettings, Model
 from .learning import (
@@ -83,6 +83,9 @@ class RunSettings(SimulatorSettings):
 
     name: Name = setting(description="name of the experiment and of the folder of its runs")
     title: Word = setting(description="title of the report")
+    test_titles: Pair[Word] = setting(
+        ("loads as in training", "other loads"), "titles of the test trials, and of those of data.others"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})] = setting(
         0, "seed of all random numbers"
     )

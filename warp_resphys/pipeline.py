@@ -368,7 +368,8 @@ def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     """Prints what the report begins with: the mean errors, the verdict and the advice."""
     tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
-    tables = tracking_table(tracking) if tracking else None, shapes_table(shapes) if shapes else None
-    first, *advice = (*verdict(metrics, run), "")
-    said = "  ".join([*filter(None, advice), f"Report: {folder / REPORT}"])
-    show(results_table(metrics, run), *filter(None, (*tables, first, said)))
+    tables = [results_table(metrics, run)]
+    tables += [tracking_table(tracking)] if tracking else []
+    tables += [shapes_table(shapes)] if shapes else []
+    said, *advice = (*verdict(metrics, run), "")
+    show(*tables, *filter(None, (said, "  ".join([*filter(None, advice), f"Report: {folder / REPORT}"]))))

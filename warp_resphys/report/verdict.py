@@ -117,7 +117,7 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
         if any(model in own for own in columns.values())
     ]
     of = "vertices" if settings.markers is None else "markers"
-    lacking = [f"{model_name(model)}: {why}" for model, why in missing_baselines(metrics).items()]
+    lacking = [f"{model_name(model)} ({why})" for model, why in missing_baselines(metrics).items()]
     note = f"Missing: {'; '.join(lacking)}." if lacking else ""
     return PageTable(f"{settings.title}: mean error of the {of} [mm]", list(columns), rows, note)
 

@@ -71,7 +71,7 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
     assert inside != outside
     for said in (
         "Beyond the training loads, ",
-        "mean error of the vertices [mm]loads as in trainingother loads",
+        "mean error of the vertices [mm]weights of the paperother loads",
         f"+ law of its material{inside}{outside}",
         "is used: its root mean square error on the validation trials (80 g, 180 g) is 0.0049 % of",
         "40.00 ± 0.40kPa",

@@ -1,11 +1,10 @@
 """Hessian blocks of the cells, and their assembly into the value array of a linear solver."""
 
-import functools
 from typing import Any
 
 import warp as wp
 
-from .modules import named_module
+from .modules import generated, named_module
 from .points import MatrixPoints, VectorPoints
 
 wp.set_module_options({"enable_backward": False})
@@ -113,7 +112,7 @@ def line_pair_blocks(
     blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
 
 
-@functools.cache
+@generated
 def scatter_kernel(scalar: Any) -> Any:
     """Returns `scatter_blocks` for values of type ``wp.float64`` or ``wp.float32``."""
     module = named_module(f"assembly.{scalar.__name__}")
@@ -155,7 +154,7 @@ def scatter_kernel(scalar: Any) -> Any:
     return scatter_blocks
 
 
-@functools.cache
+@generated
 def projection_kernel(scalar: Any) -> Any:
     """Returns `project_blocks` for values of type ``wp.float64`` or ``wp.float32``."""
     module = named_module(f"assembly.projection.{scalar.__name__}")

@@ -9,12 +9,11 @@ so that the stress is w t u and the tangent w (slope u u^T + t / l (1 - u u^T)),
 for a negative tension. The origin o is zero, or for a string the first three values.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
-from .modules import named_module
+from .modules import generated, named_module
 from .points import PartValues, VectorPoints, value_reader, vector_at
 
 ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
@@ -91,7 +90,7 @@ def muscle_tension(length: wp.float64, toe: wp.float64, v: muscle_values):
 LAWS = {"thread": thread_tension, "string": string_tension, "muscle": muscle_tension}  # e, t, dt/dl and dt/dv
 
 
-@functools.cache
+@generated
 def axial_kernels(law: str) -> SimpleNamespace:
     """Returns the kernels of one of `LAWS`."""
     module = named_module(f"axial.{law}")

@@ -17,14 +17,13 @@ and F - R = F (I - U^-1). All terms are small with the strain, so that they add 
 same theorem, the matrix of `kernels.materials.corotated.turning` is (F F^T + (3 + y) I) / g.
 """
 
-import functools
 from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
 from .materials.corotated import rotation_blocks
 from .matrices import HALLEY_ITERATIONS, HALLEY_TOLERANCE, LARGEST_TRACE
-from .modules import named_module
+from .modules import generated, named_module
 from .points import MatrixPoints, matrix_at
 from .solid import add_viscous_tangent, solid_kernels, viscous_response
 
@@ -153,7 +152,7 @@ class LaneCells:
     shape_points: int  # S, the number of points without a volume term, which come first
 
 
-@functools.cache
+@generated
 def cell_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of a material whose shape term is that of ``kernels.materials.corotated``."""
     module = named_module(f"lanes.{law.NAME}")

@@ -3,20 +3,19 @@
 Without pairs, a direction is that of the matrix alone.
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from .minimisation import FACTOR, FAILED, NEED_DIRECTION, LineSearch, SolverProgress, begin_search
-from .modules import named_module
+from .modules import generated, named_module
 from .reductions import ZERO, block_sum
 
 MIN_CURVATURE = wp.constant(wp.float64(1e-10))
 
 
-@functools.cache
+@generated
 def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
     """Returns kernels for pairs, right-hand sides and solutions of type ``wp.float64`` or ``wp.float32``."""
     module = named_module(f"lbfgs.{scalar.__name__}")

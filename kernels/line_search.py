@@ -3,7 +3,6 @@
 Below the rounding errors of residual and state a minimisation makes no progress.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
@@ -23,7 +22,7 @@ from .minimisation import (
     accept_trial,
     record_solution,
 )
-from .modules import named_module
+from .modules import generated, named_module
 from .reductions import ZERO, block_max, block_sum
 
 wp.set_module_options({"enable_backward": False})
@@ -133,7 +132,7 @@ def decreases_enough(
     return energy <= before + rounding and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
 
 
-@functools.cache
+@generated
 def accept_kernel(scalar: Any) -> Any:
     """Returns the kernel that tests a trial, for pairs of type ``wp.float64`` or ``wp.float32``."""
     lbfgs = lbfgs_kernels(scalar)

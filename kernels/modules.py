@@ -1,15 +1,34 @@
-"""Named Warp modules, which are compiled only if used, and the streams of kernel launches."""
+"""Named Warp modules, which are compiled only if used, the streams of launches, and Warp in several threads.
+
+Warp's settings, modules and captures are global to the process: while a thread makes kernels, records a launch or
+captures a graph, no other one may launch.
+"""
 
 import functools
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from threading import Lock
-from typing import Any
+from threading import Condition, RLock
+from typing import Any, TypeVar
 
 import torch
 import warp as wp
 
-_SETTINGS = Lock()  # Warp's settings are global to the process.
+T = TypeVar("T")
+
+_WARP = RLock()
+
+
+def generated(make: Callable[..., T]) -> Callable[..., T]:
+    """Decorates a function that makes kernels: every result is made once, by one thread."""
+    cached = functools.cache(make)
+
+    @functools.wraps(make)
+    def locked(*arguments: Any) -> T:
+        with _WARP:
+            return cached(*arguments)
+
+    return locked
 
 
 def named_module(part: str) -> wp.Module:
@@ -21,18 +40,60 @@ def named_module(part: str) -> wp.Module:
 
 @contextmanager
 def shareable() -> Iterator[None]:
-    """Loads Warp modules so that several CPU threads may launch their kernels concurrently.
+    """Lets one thread at a time load Warp modules, such that several CPU threads may launch their kernels concurrently.
 
     By default every launch registers its tile memory, which these kernels do not use, in a variable shared by all
     threads.
     """
-    with _SETTINGS:
+    with _WARP:
         before = wp.config.enable_tiles_in_stack_memory
         wp.config.enable_tiles_in_stack_memory = False
         try:
             yield
         finally:
             wp.config.enable_tiles_in_stack_memory = before
+
+
+class RecordedLaunch:
+    """A recorded launch of Warp, which waits while another thread captures."""
+
+    _ended = Condition(_WARP)
+    _running = 0  # of all threads
+
+    def __init__(self, command: Any) -> None:
+        self._command = command
+
+    def launch(self, stream: Any = None) -> None:
+        """Launches the kernel."""
+        own = RecordedLaunch
+        with _WARP:
+            own._running += 1
+        try:
+            self._command.launch(stream)
+        finally:
+            with _WARP:
+                own._running -= 1
+                if not own._running:
+                    own._ended.notify_all()
+
+    @classmethod
+    def forked(cls) -> None:
+        """Lets a forked process begin, which has one thread."""
+        cls._running = 0
+        _WARP.release()
+
+    @classmethod
+    @contextmanager
+    def captured(cls, device: torch.device) -> Iterator[Any]:
+        """Captures the launches of this thread, when those of others have ended."""
+        with cls._ended:
+            cls._ended.wait_for(lambda: not cls._running)
+            with wp.ScopedCapture(device=str(device)) as capture:
+                yield capture
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_WARP.acquire, after_in_parent=_WARP.release, after_in_child=RecordedLaunch.forked)
 
 
 def launch_stream(device: torch.device) -> Any:

@@ -5,13 +5,12 @@ F = sum_a x_a g_a^T, such as a deformation gradient; or g_a is a number, and the
 sum_a g_a x_a, such as a fibre or a position. The stress has the shape of the argument of the energy.
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from .modules import named_module
+from .modules import generated, named_module
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,7 +74,7 @@ class PartValues:
     places: wp.array2d[int]  # (n, P) column of each value at each point
 
 
-@functools.cache
+@generated
 def value_reader(vector: Any) -> Any:
     """Returns the function that reads the values at point p of environment b into a vector type."""
 
@@ -91,7 +90,7 @@ def value_reader(vector: Any) -> Any:
     return read_values
 
 
-@functools.cache
+@generated
 def gather_kernels(width: int) -> SimpleNamespace:
     """Returns kernels from stresses to forces, for operators with three components or one."""
     module = named_module(f"points.{width}")

@@ -13,13 +13,12 @@ values. From it follow
 A clamped tangent is the nearest one without negative eigenvalues.
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from .modules import named_module
+from .modules import generated, named_module
 from .points import MatrixPoints, PartValues, VectorPoints, matrix_at, value_reader, vector_at
 
 STEP = wp.constant(wp.float64(3e-4))  # of differences, over the size of f
@@ -87,7 +86,7 @@ def write_blocks(hessian: mat99, columns: int, clamp: bool, out: wp.array[wp.mat
             out[(m * (m + 1)) / 2 + n] = block
 
 
-@functools.cache
+@generated
 def pointwise_kernels(density: Any) -> SimpleNamespace:
     """Returns the kernels of an energy function, and the vector type of its values."""
     shape, vector = density.input_types.values()

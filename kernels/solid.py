@@ -1,11 +1,10 @@
 """Elastic and viscous energy of a solid: local step, tangent and derivatives by the constants, for any material."""
 
-import functools
 from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
-from .modules import named_module
+from .modules import generated, named_module
 from .points import MatrixPoints, green_strain, matrix_at
 
 wp.set_module_options({"enable_backward": False})
@@ -101,7 +100,7 @@ def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
             out[(k * (k + 1)) / 2 + n] += factor * wp.outer(columns[k], columns[n])
 
 
-@functools.cache
+@generated
 def solid_kernels(law: ModuleType) -> SimpleNamespace:
     """Returns the kernels of one of ``kernels.materials``."""
     module = named_module(f"solid.{law.NAME}")

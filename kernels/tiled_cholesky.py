@@ -12,13 +12,12 @@ Threads of a block share tiles and synchronise. Warp's own tiles do so through l
 compile for every type; these few lines of C++ also compile for a CPU, where a block is one thread.
 """
 
-import functools
 from types import SimpleNamespace
 from typing import Any, Final
 
 import warp as wp
 
-from .modules import named_module
+from .modules import generated, named_module
 from .reductions import block_max
 
 TILE: Final = 16  # rows and columns of a tile
@@ -198,7 +197,7 @@ _SOLVE: Final = (
 )
 
 
-@functools.cache
+@generated
 def tiled_kernels(scalar: Any) -> SimpleNamespace:
     """Returns kernels for a scalar type, in blocks of ``BLOCK`` threads."""
     module = named_module(f"tiles.{scalar.__name__}")

@@ -23,13 +23,11 @@ The moduli named unit_shear and unit_bulk, of value one, carry the volumes of vi
 viscosities and moduli of branches, not ratios to the elastic ones.
 """
 
-import functools
-
 import warp as wp
 
 from ..axial import muscle_pull
 from ..matrices import SMALLEST_STRETCH_SUM, cofactor, polar_rotation, signed_svd, spectral_blocks
-from ..modules import named_module
+from ..modules import generated, named_module
 from . import corotated, mooney_rivlin
 from .density import Law
 
@@ -100,7 +98,7 @@ def unsigned_polar(f: wp.mat33d):
     return u * signs * right, v * wp.diag(wp.vec3d(s[0], s[1], -s[2])) * right
 
 
-@functools.cache
+@generated
 def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
     """Returns the law with Ogden's terms of some exponents, and a number of families of fibres.
 

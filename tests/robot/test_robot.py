@@ -1,9 +1,12 @@
 """A finished run as a robot: it does what the evaluation did, by names, with gradients, and from one file."""
 
+import copy
 import dataclasses
 import json
+import pickle
 import re
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +101,17 @@ class TestRollouts:
         assert float((motion.q[-1] - motion.q[0]).abs().max()) > 1e-3
         assert torch.equal(further.q[0], motion.q[-1])
         np.testing.assert_allclose(motion.times, robot.time_step * np.arange(6))
+
+    def test_in_threads_and_as_a_copy_it_moves_as_alone(self, robot):
+        alone = [played(robot, steps).q for steps in (3, 4, 5)]
+        with ThreadPoolExecutor(3) as pool:
+            threads = list(pool.map(lambda steps: played(robot, steps).q, (3, 4, 5)))
+        copies = [pickle.loads(pickle.dumps(robot)), copy.deepcopy(robot), copy.copy(robot)]
+        for number, expected in enumerate(alone):
+            assert torch.equal(threads[number], expected)
+            assert torch.equal(played(copies[number], 3 + number).q, expected)
+        motion = copy.deepcopy(played(robot, 3))
+        assert torch.equal(robot.step(motion.final).q, copies[0].step(pickle.loads(pickle.dumps(motion.final))).q)
 
     def test_a_settled_robot_stays_at_rest(self, robot):
         with torch.no_grad():

@@ -17,6 +17,7 @@ from ..io.errors import ConvergenceError
 from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
 from ..linalg.threads import in_threads, threads_for
+from ..stepping.adjoints import AdjointFunction, first_derivatives
 from .assembly import BlockPattern
 from .hessian import ExactHessian
 from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings
@@ -143,7 +144,7 @@ def equilibrium(
     values = (terms.values[name] for name in solve.names)
     tensors = (start, fixed_positions, terms.target, terms.inertia, terms.force, *values)
     needs_grad = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors[1:])
-    # Forward-mode differentiation also calls the function, which raises torch's error for it.
+    # Forward-mode differentiation also calls the function, which raises an error for it.
     if needs_grad or forward_ad._current_level >= 0:
         x: torch.Tensor = _Equilibrium.apply(solve, *tensors)
         assert solve.report is not None
@@ -165,7 +166,6 @@ class _Solve:
     def __call__(self, inputs: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, SolveReport]:
         """Returns the minimiser and the report for a start, fixed positions and terms."""
         tensors = [None if tensor is None else tensor.detach() for tensor in inputs]
-        # Solvers are made here and not in the threads, because Warp captures the launches of all threads.
         parts = [(rows, own, own.solver(self.purpose, self.settings)) for rows, own in self.workspace.parts]
 
         def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
@@ -174,14 +174,14 @@ class _Solve:
             return _solve(own, solver, own_follows, self.names, *(_rows(tensor, rows) for tensor in tensors))
 
         assert tensors[0] is not None
-        with threads_for(tensors[0][0].numel(), len(parts)):
+        with self.workspace.potential.lock, threads_for(tensors[0][0].numel(), len(parts)):
             results = in_threads(solve, parts)
         x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
         self.report = SolveReport.of([report for _, report in results])
         return x, self.report
 
 
-class _Equilibrium(torch.autograd.Function):
+class _Equilibrium(AdjointFunction):
     """x* = argmin of the incremental potential, with x = d at the fixed vertices.
 
     With the residual g(x, theta) = 0 and the Hessian H = dg/dx, the implicit function theorem gives dx = -H^-1
@@ -203,7 +203,7 @@ class _Equilibrium(torch.autograd.Function):
 
     @override
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_derivatives
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
         x, saved = x.detach(), [None if tensor is None else tensor.detach() for tensor in saved]
@@ -222,7 +222,7 @@ class _Equilibrium(torch.autograd.Function):
             return _adjoint(own, hessians, solve.names, needed, *(_rows(t, rows) for t in (gradient, x, *saved)))
 
         try:
-            with threads_for(gradient[0].numel(), len(parts)):
+            with solve.workspace.potential.lock, threads_for(gradient[0].numel(), len(parts)):
                 gradients = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None

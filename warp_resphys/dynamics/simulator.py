@@ -1,8 +1,9 @@
 """Batched, differentiable simulation of a body."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
 from ..io.machine import find_device
 from ..linalg.threads import shards_of
+from ..stepping.adjoints import refuse_transforms
 from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
@@ -51,6 +53,9 @@ def _check_count(name: str, value: object) -> None:
 @dataclass
 class Simulator:
     """Simulates a body over time.
+
+    Several threads may use a simulator: each has its own buffers. On a GPU they take turns, after a first step in one
+    thread. It can be copied and pickled.
 
     Args:
         body: a body, or a `fem.scene.Scene` of several bodies.
@@ -94,6 +99,19 @@ class Simulator:
 
     def __post_init__(self) -> None:
         """Checks the arguments and builds the energies."""
+        self._build()
+        warn_of_implausible(self.body, self.materials, self.gravity, self.rest_positions.device.type == "cpu")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the arguments, of which a copy is built: buffers, factors and Warp's arrays belong to a process."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Builds a copy from its arguments."""
+        vars(self).update(state)
+        self._build()
+
+    def _build(self) -> None:
         if not (np.isfinite(self.time_step) and self.time_step > 0.0):
             raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
         if self.dtype not in (torch.float64, torch.float32):
@@ -138,9 +156,8 @@ class Simulator:
         self.constants: dict[str, Any] = {**energies.constants, "gravity": [list(self.gravity)]}
         self.counts = {**energies.counts, "gravity": 3}
         self.inputs, self.parts = energies.inputs, energies.parts
-        self._workspaces: dict[int, Workspace] = {}
+        self._workspaces: dict[tuple[int, int], Workspace] = {}
         self._attached_mass = self.tensor(body.attached_mass)
-        warn_of_implausible(body, self.materials, self.gravity, on_cpu=self.rest_positions.device.type == "cpu")
         self._built = True
 
     def __repr__(self) -> str:
@@ -164,6 +181,7 @@ class Simulator:
 
     def tensor(self, values: object) -> torch.Tensor:
         """Returns values with the simulator's device and dtype."""
+        refuse_transforms(values)
         return torch.as_tensor(values, device=self.device, dtype=self.dtype)
 
     def prepare(self, parameters: Parameters | Constants | None = None) -> Constants:
@@ -189,14 +207,18 @@ class Simulator:
         return Constants(inertia, weight, tensors["gravity"], mass.damping, values)
 
     def workspace(self, batch: int) -> Workspace:
-        """Returns the buffers for a batch size, made at their first use, also for use outside of inference mode."""
-        if batch not in self._workspaces:
+        """Returns the calling thread's buffers for a batch size, made at their first use, also in inference mode.
+
+        Threads that have ended leave theirs to new ones, whose identifiers are the same.
+        """
+        key = get_ident(), batch
+        if key not in self._workspaces:
             with lasting():
                 workspace = self._make_workspace(batch=batch)
                 shards = shards_of(batch, workspace.potential.device)
                 workspace.shards += [(rows, self._make_workspace(batch=rows.stop - rows.start)) for rows in shards]
-            self._workspaces[batch] = workspace
-        return self._workspaces[batch]
+            self._workspaces[key] = workspace
+        return self._workspaces[key]
 
     def rest_state(self, batch: int = 1) -> State:
         """Returns the undeformed body at rest, for a batch of one or more environments."""
@@ -333,7 +355,8 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
         """
         inputs, constants = self._checked(state, inputs, parameters)
-        return self._energies.contacts(self._step(state, inputs, constants), after.q)
+        with self.workspace(state.batch).potential.lock:
+            return self._energies.contacts(self._step(state, inputs, constants), after.q)
 
     def is_held(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -550,6 +573,7 @@ class Simulator:
 
     def _fitted(self, inputs: Inputs | None, batch: int | None = None) -> Inputs:
         """Returns inputs with the simulator's device and dtype where they are numbers (`Inputs.fitted`)."""
+        refuse_transforms()
         if inputs is None:
             return _NO_INPUTS
         if not isinstance(inputs, Inputs):

@@ -3,8 +3,9 @@
 from typing import Any
 
 import torch
-from torch.autograd.function import once_differentiable
 from typing_extensions import override
+
+from ..stepping.adjoints import AdjointFunction, first_derivatives
 
 
 def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
@@ -13,22 +14,22 @@ def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
     return pressure
 
 
-class _Pressure(torch.autograd.Function):
-    """The pressure of the barrier, whose derivative is computed with it; it has no second derivatives."""
+class _Pressure(AdjointFunction):
+    """The pressure of the barrier, whose derivative is computed with it."""
 
     @override
     @staticmethod
     def forward(ctx: Any, d: torch.Tensor, reach: float) -> torch.Tensor:
         s = (d / reach).clamp_max(1.0)
         log, below = s.log(), (s - 1.0) / s
-        ctx.save_for_backward((2.0 * log + below * (4.0 - below)) / reach)
+        ctx.save_for_backward(d, (2.0 * log + below * (4.0 - below)) / reach)
         return (s - 1.0) * (2.0 * log + below)
 
     @override
     @staticmethod
-    @once_differentiable
+    @first_derivatives
     def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor, None]:
-        (derivative,) = ctx.saved_tensors
+        _, derivative = ctx.saved_tensors
         return slope * derivative, None
 
 

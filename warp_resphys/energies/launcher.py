@@ -3,7 +3,8 @@
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from threading import Lock
+from functools import cache
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -13,18 +14,24 @@ from numpy.typing import NDArray
 
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels import points
-from ..kernels.modules import launch_stream, shareable
+from ..kernels.modules import RecordedLaunch, launch_stream, shareable
 
-_CAPTURES = Lock()  # A capture records launches of all threads: only one thread may use Warp during the first step.
+_GPU = RLock()  # Threads take turns on a GPU, whose stream they share.
 _MANY_POINTS = 10_000  # of a set, whose stresses a CPU's caches do not hold
 BLOCK = 128  # threads per block on a GPU; the same for all kernels, as Warp compiles a module once per block size
 
 ensure_kernel_cache()  # before Warp is first used
 
 
+@cache
+def _initialise() -> None:
+    with shareable():
+        wp.init()
+
+
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     """Returns a Warp array on a tensor's memory, without gradient."""
-    wp.init()  # `from_torch` does not
+    _initialise()  # `from_torch` does not
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 
@@ -65,6 +72,7 @@ class Launcher:
 
     Attributes:
         active: (B,) zero for environments that kernels skip, such as converged ones during a solve.
+        lock: held while the buffers are in use, as a backward pass may run in another thread.
     """
 
     by_cells = False  # whether there is one thread per node or pair of nodes of a cell, as on a GPU
@@ -72,6 +80,7 @@ class Launcher:
     def __init__(self, batch: int, device: torch.device) -> None:
         self.batch, self.device = batch, device
         self.by_cells = self.by_cells or device.type == "cuda"
+        self.lock = RLock() if device.type == "cpu" else _GPU
         self.active = torch.ones(batch, device=device, dtype=torch.int32)
 
     def zeros(self, *shape: int) -> torch.Tensor:
@@ -81,19 +90,20 @@ class Launcher:
 
     def upload(self, values: NDArray[Any], dtype: Any) -> Any:
         """Returns a Warp array with a copy of the values."""
-        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
+        with shareable():
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=str(self.device))
 
     def record(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> Any:
         """Returns a recorded launch, for `launch`."""
         options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
-            return wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options)
+            return RecordedLaunch(wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options))
 
     def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
         """Returns a recorded launch with cooperating blocks of threads (one thread per block on a CPU)."""
         options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
-            return wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options)
+            return RecordedLaunch(wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **options))
 
     def gather(self, s: Any, stress: Any, out: torch.Tensor) -> Any:
         """Returns a launch that adds the transposed operators applied to a set's stress to ``out`` (B, N, 3).
@@ -136,7 +146,7 @@ class Launcher:
             calls: makes the launches, by `issue`, ``wp.capture_while`` and ``wp.capture_if``.
             commands: all launches that it may make.
         """
-        with _CAPTURES, wp.ScopedCapture(device=str(self.device)) as capture:
+        with self.lock, RecordedLaunch.captured(self.device) as capture:
             calls()
         return CapturedGraph(capture.graph, tuple(commands))
 

@@ -16,10 +16,12 @@ from typing_extensions import override
 
 from ..io.errors import InputError, MeshError
 from ..kernels import obstacles as kernels
+from ..kernels.modules import shareable
 from ..kernels.triangles import from_surface
 from ..mesh.motion_files import MovingSurface
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
+from ..stepping.adjoints import AdjointFunction, first_derivatives
 from .launcher import Launcher, struct_of, warp_view
 
 Vector = tuple[float, float, float]
@@ -276,12 +278,13 @@ def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLik
         places: (P, 3) [m].
     """
     arrays = [np.asarray(vertices), np.asarray(places)]
-    corners: Any = wp.array(arrays[0], dtype=wp.vec3, device="cpu")
-    points: Any = wp.array(arrays[1], dtype=wp.vec3, device="cpu")
-    indices: Any = wp.array(np.asarray(triangles).ravel(), dtype=int, device="cpu")
-    surface = wp.Mesh(corners, indices, support_winding_number=True)
-    out = wp.zeros(len(arrays[1]), dtype=float, device="cpu")
-    wp.launch(from_surface, out.size, [surface.id, points], [out], device="cpu")
+    with shareable():
+        corners: Any = wp.array(arrays[0], dtype=wp.vec3, device="cpu")
+        points: Any = wp.array(arrays[1], dtype=wp.vec3, device="cpu")
+        indices: Any = wp.array(np.asarray(triangles).ravel(), dtype=int, device="cpu")
+        surface = wp.Mesh(corners, indices, support_winding_number=True)
+        out = wp.zeros(len(arrays[1]), dtype=float, device="cpu")
+        wp.launch(from_surface, out.size, [surface.id, points], [out], device="cpu")
     return np.asarray(out.numpy(), dtype=np.float64)
 
 
@@ -379,32 +382,34 @@ class _Measurement(Launcher):
         )
 
 
-class _Distances(torch.autograd.Function):
+class _Distances(AdjointFunction):
     """Signed distances and normals."""
 
     @override
     @staticmethod
     def forward(ctx: Any, own: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        for buffer, value in zip(own.inputs, given, strict=True):
-            buffer.copy_(value.detach())
-        own.launch(own.measure)
+        with own.lock:
+            for buffer, value in zip(own.inputs, given, strict=True):
+                buffer.copy_(value.detach())
+            own.launch(own.measure)
+            d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
         ctx.own = own
         ctx.save_for_backward(*given)
-        d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
         return d, n
 
     @override
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_derivatives
     def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         own = ctx.own
-        buffers, position, turn, command = own.adjoint
-        for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
-            buffer.copy_(value)
-        own.launch(command)
-        sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
-        needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
-        return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
+        with own.lock:
+            buffers, position, turn, command = own.adjoint
+            for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
+                buffer.copy_(value)
+            own.launch(command)
+            sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
+            needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
+            return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..io.errors import InputError
 from ..kernels import broad_phase
 from ..kernels import surfaces as kernels
-from ..kernels.modules import launch_stream
+from ..kernels.modules import launch_stream, shareable
 from ..mesh.mesh import Mesh, boundary_triangles
 from .launcher import Launcher, struct_of, warp_view
 from .obstacles import signed_distances
@@ -234,10 +234,11 @@ class PairList:
         own, device = self._launcher, str(self._launcher.device)
         size, used = own.batch * nodes.shape[0], self._hierarchies.get(nodes.ptr)
         if used is None:
-            arrays = [wp.empty(size, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, int)]
+            with shareable():
+                arrays = [wp.empty(size, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, int)]
             used = self._hierarchies[nodes.ptr] = _Hierarchy(arrays)
         own.launch(own.record(broad_phase.boxes, (own.batch, nodes.shape[0]), [motion, nodes], used.arrays))
-        with wp.ScopedStream(launch_stream(own.device)):
+        with shareable(), wp.ScopedStream(launch_stream(own.device)):
             return used.fitted()
 
     def _set(self, keys: torch.Tensor, size: int, total: int) -> None:

@@ -33,9 +33,10 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..kernels import tendons as kernels
+from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
-from .launcher import launch, warp_view
+from .launcher import Launcher, launch, warp_view
 from .pointwise import PartPoints
 from .strings import thread_pull
 
@@ -107,7 +108,7 @@ class BoundTendons(BoundEnergy):
         self._one_hot = site.tensor(np.eye(tendons.count)[part])  # (P, T)
         self._beyond = site.tensor(beyond(part))
         first = np.searchsorted(part, np.arange(tendons.count + 1))
-        self._runs: Any = wp.array(first.astype(np.int32), dtype=int, device=str(device))
+        self._runs = Launcher(1, device).upload(first.astype(np.int32), int)
         self._first = torch.as_tensor(first[:-1], device=device)
         entry = np.zeros(len(part))
         entry[first[:-1]] = np.broadcast_to(np.asarray(entry_angle, dtype=np.float64), tendons.count)
@@ -186,31 +187,37 @@ class BoundTendons(BoundEnergy):
         return {SEGMENT_TENSION: segments.clamp_min(0.0)}
 
 
-class _Stick(torch.autograd.Function):
+class _Stick(AdjointFunction):
     """Tensions (B, P) of the segments where guides stick or slide (`kernels.tendons.stick`)."""
 
     @override
     @staticmethod
     def forward(ctx: Any, runs: Any, begin: torch.Tensor, held: torch.Tensor, growth: torch.Tensor) -> torch.Tensor:
-        given = [x.detach().double().expand(len(held), -1).contiguous() for x in (begin, held, growth)]
+        given = _environments(begin, held, growth)
         segments = torch.zeros_like(given[1])
         views = [warp_view(value, wp.float64) for value in (*given, segments)]
         launch(kernels.stick, given[0].shape, [runs, *views], [], segments.device)
-        ctx.runs, ctx.shared = runs, [len(x) < len(held) for x in (begin, held, growth)]
-        ctx.save_for_backward(*given, segments)
+        ctx.runs = runs
+        ctx.save_for_backward(begin, held, growth, segments)
         return segments.to(held.dtype)
 
     @override
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_derivatives
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        *given, segments = ctx.saved_tensors
+        *values, segments = ctx.saved_tensors
+        given = _environments(*values)
         slopes = [torch.zeros_like(x) for x in given]
         tensors = (*given, segments, gradient.double().contiguous(), *slopes)
         inputs = [ctx.runs, *(warp_view(value, wp.float64) for value in tensors)]
         launch(kernels.stick_adjoint, given[0].shape, inputs, [], segments.device)
-        pairs = zip(slopes, ctx.shared, strict=True)
-        return None, *((x.sum(0, keepdim=True) if shared else x).to(gradient.dtype) for x, shared in pairs)
+        pairs = zip(slopes, values, strict=True)
+        return None, *(slope.sum_to_size(value.shape).to(gradient.dtype) for slope, value in pairs)
+
+
+def _environments(begin: torch.Tensor, held: torch.Tensor, growth: torch.Tensor) -> list[torch.Tensor]:
+    """Returns values of all environments, of which ``held`` has some for each."""
+    return [x.detach().double().expand(len(held), -1).contiguous() for x in (begin, held, growth)]
 
 
 def beyond(part: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -31,6 +31,7 @@ import warp as wp
 from typing_extensions import override
 
 from ..kernels import solid as kernels
+from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.state import ImplicitStage
 from .base import Term
 from .launcher import warp_view
@@ -177,7 +178,7 @@ class StrainTerm(Term):
         return product
 
 
-class GreenStrain(torch.autograd.Function):
+class GreenStrain(AdjointFunction):
     """Green strain E = (F^T F - I) / 2 at every point, from (B, N, 3) to (B, P, 3, 3)."""
 
     @override
@@ -185,11 +186,13 @@ class GreenStrain(torch.autograd.Function):
     def forward(ctx: Any, term: StrainTerm, positions: torch.Tensor) -> torch.Tensor:
         ctx.term = term
         ctx.save_for_backward(positions)
-        return term.strain(positions)
+        with term.launcher.lock:
+            return term.strain(positions)
 
     @override
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @first_derivatives
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, torch.Tensor]:
-        (positions,) = ctx.saved_tensors
-        return None, ctx.term.strain_adjoint(positions.to(gradient.dtype), gradient)
+        (positions,), term = ctx.saved_tensors, ctx.term
+        with term.launcher.lock:
+            return None, term.strain_adjoint(positions.to(gradient.dtype), gradient)

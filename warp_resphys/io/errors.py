@@ -37,6 +37,10 @@ class DataFileError(ResphysError):
     """A data file that is missing, damaged, of another program, or cannot be written."""
 
 
+class DerivativeError(ResphysError, RuntimeError):
+    """A derivative that a simulation does not have: of second order, in forward mode, or by ``torch.func``."""
+
+
 class ConvergenceError(ResphysError, RuntimeError):
     """A solve that did not reach its tolerance.
 

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
+from threading import Lock
 from typing import TypeVar
 
 import torch
@@ -29,10 +30,7 @@ def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
     """
     before = torch.get_num_threads()
     limit_torch = before > 1 and not (unknowns >= _WORTH_SHARING and shards == 1)
-    # Direct calls to the libraries: threadpoolctl's own queries take too long for a time step.
-    limited = [(library, count) for library in _blas() if (count := library.get_num_threads()) != 1]
-    for library, _ in limited:
-        library.set_num_threads(1)
+    _LIMIT.begin()
     if limit_torch:
         torch.set_num_threads(1)
     try:
@@ -40,8 +38,33 @@ def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
     finally:
         if limit_torch:
             torch.set_num_threads(before)
-        for library, count in limited:
-            library.set_num_threads(count)
+        _LIMIT.end()
+
+
+class _BlasLimit:
+    """Limit of BLAS to one thread, which all threads of the process share: the last user takes it away."""
+
+    def __init__(self) -> None:
+        self._lock, self._users, self._limited = Lock(), 0, list[tuple[LibController, int]]()
+
+    def begin(self) -> None:
+        with self._lock:
+            if not self._users:
+                # Direct calls to the libraries: threadpoolctl's own queries take too long for a time step.
+                counts = [(library, library.get_num_threads()) for library in _blas()]
+                self._limited = [(library, count) for library, count in counts if count != 1]
+                for library, _ in self._limited:
+                    library.set_num_threads(1)
+            self._users += 1
+
+    def end(self) -> None:
+        with self._lock:
+            self._users -= 1
+            for library, count in () if self._users else self._limited:
+                library.set_num_threads(count)
+
+
+_LIMIT = _BlasLimit()
 
 
 @cache
@@ -72,6 +95,16 @@ def shards_of(batch: int, device: torch.device) -> list[slice]:
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "warp-resphys", lambda: torch.set_num_threads(1))
+
+
+def _forked() -> None:
+    """Lets a forked process, which has none of these threads and none of OpenMP's, do without."""
+    _pool.cache_clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
 
 
 def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:

@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..kernels.modules import launch_stream, shareable
+from ..kernels.modules import RecordedLaunch, launch_stream, shareable
 from ..kernels.tiled_cholesky import BLOCK, TILE, tiled_kernels
 from .linear_solver import Factor, Indices, LinearSolver, Mask, bandwidth_reducing_order
 
@@ -62,7 +62,7 @@ class TiledSolver(LinearSolver):
         views = [wp.from_torch(array, requires_grad=False) for array in arrays]
         options = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
         with shareable():
-            return wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options)
+            return RecordedLaunch(wp.launch_tiled(kernel, dim=list(blocks), inputs=views, **options))
 
     def record_factor(self, values: torch.Tensor, active: torch.Tensor, clamped: torch.Tensor) -> SimpleNamespace:
         """Returns recorded launches of ``clear``, ``factor`` and ``check`` (``kernels.tiled_cholesky``).

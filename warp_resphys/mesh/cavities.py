@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..io.kernel_cache import ensure_kernel_cache
+from ..kernels.modules import shareable
 from ..kernels.triangles import blocked
 from .chambers import find_chambers
 from .mesh import FloatArray, Mesh, boundary_triangles, connected_parts
@@ -42,13 +43,14 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity]:
     normals /= sizes[:, None]
     starts = centres + _LIFT * np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * normals
     directions = _half_sphere(normals).reshape(-1, 3)
-    rays: list[Any] = [
-        wp.array(own, dtype=wp.vec3, device="cpu") for own in (np.repeat(starts, _DIRECTIONS, axis=0), directions)
-    ]
-    points: Any = wp.array(mesh.vertices, dtype=wp.vec3, device="cpu")
-    surface = wp.Mesh(points, wp.array(outer.ravel(), dtype=int, device="cpu"))
-    hits: Any = wp.zeros(len(directions), dtype=float, device="cpu")
-    wp.launch(blocked, len(directions), [surface.id, *rays], [hits], device="cpu")
+    with shareable():
+        rays: list[Any] = [
+            wp.array(own, dtype=wp.vec3, device="cpu") for own in (np.repeat(starts, _DIRECTIONS, axis=0), directions)
+        ]
+        points: Any = wp.array(mesh.vertices, dtype=wp.vec3, device="cpu")
+        surface = wp.Mesh(points, wp.array(outer.ravel(), dtype=int, device="cpu"))
+        hits: Any = wp.zeros(len(directions), dtype=float, device="cpu")
+        wp.launch(blocked, len(directions), [surface.id, *rays], [hits], device="cpu")
     hidden = np.flatnonzero(1.0 - hits.numpy().reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN)
     parts, cavities = connected_parts(outer[hidden]), []
     for own in (hidden[parts == part] for part in np.unique(parts)):

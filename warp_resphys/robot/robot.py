@@ -21,6 +21,7 @@ from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
 from ..learning.rollout import DIVERGENCE_DISTANCE, LearnedPredictor, Rollout, equilibrium_under_feedback
 from ..mesh.mesh import Mesh
+from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .description import Description
@@ -419,6 +420,7 @@ class Robot:
         return hessian, linearised.inertia_matrix(state.q), linearised.free.cpu().numpy()
 
     def _read(self, inputs: Mapping[str, Given], batch: int) -> dict[str, torch.Tensor]:
+        refuse_transforms()
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
 
     def _predictor(self, conditions: torch.Tensor | None, base: torch.Tensor | None) -> LearnedPredictor:

@@ -1,0 +1,151 @@
+"""A simulator in threads and processes: every call returns what it returns alone; copies give the same motion."""
+
+import copy
+import io
+import multiprocessing
+import pickle
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, box_hexahedra, select_vertices
+from warp_resphys.studies.check import MOTIONS, positions
+
+MESH = box_hexahedra((0.1, 0.02, 0.02), (6, 2, 2))
+TIP = select_vertices(MESH, x=0.1)
+FLOOR = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.002))}, distance=0.001, friction=0.3)
+
+
+def simulator(*energies):
+    material = Corotated(100e3, 0.45, stiffness_damping=2e-3)
+    return Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0), energies=energies), material)
+
+
+def loss(sim, number, modulus):
+    """The height of the tip after some steps and in an equilibrium, under a load of its own."""
+    load = torch.zeros(1, len(MESH.vertices), 3, dtype=torch.float64)
+    load[0, TIP, 2] = -1e-4 * number
+    values = {"youngs_modulus": modulus}
+    state = sim.static_equilibrium(Inputs(0.1 * load), values)
+    return sim.rollout(state, 4, Inputs(load), values).q[-1, 0, TIP, 2].mean()
+
+
+def results(sim, number):
+    modulus = torch.tensor([100e3], dtype=torch.float64, requires_grad=True)
+    height = loss(sim, number, modulus)
+    height.backward()
+    return height.item(), modulus.grad.item()
+
+
+@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("energies", [(), (FLOOR,)])
+def test_threads_have_the_results_of_one(count, energies):
+    """To the last bit, forward and backward, as each has its own buffers, starts and factors."""
+    sim = simulator(*energies)
+    alone = [results(sim, number) for number in range(12)]
+    assert len(set(alone)) == 12
+    with ThreadPoolExecutor(count) as pool:
+        assert list(pool.map(lambda number: results(sim, number), range(12))) == alone
+    assert 1 < len({thread for thread, _ in sim._workspaces}) <= count + 1
+
+
+def test_a_gradient_in_another_thread_does_not_disturb_a_step():
+    """A backward pass needs the buffers of the forward pass, whose thread goes on."""
+    sim = simulator()
+    moduli = [torch.tensor([100e3], dtype=torch.float64, requires_grad=True) for _ in range(16)]
+    alone = [results(sim, number) for number in range(16)]
+    with ThreadPoolExecutor(1) as pool:
+        heights, waiting = [], []
+        for number, modulus in enumerate(moduli):
+            heights.append(loss(sim, number, modulus))
+            waiting.append(pool.submit(heights[-1].backward))
+        for future in waiting:
+            future.result()
+    for height, modulus, expected in zip(heights, moduli, alone, strict=True):
+        assert (height.item(), modulus.grad.item()) == expected
+
+
+FIRST_USE = """
+import sys, torch
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+sys.path.insert(0, {tests!r})
+from dynamics.test_threads import FLOOR, results, simulator
+together = Barrier(4)
+def first(number):
+    together.wait()
+    return results(shared if number % 2 else simulator(FLOOR), 3)
+shared = simulator(FLOOR)
+with ThreadPoolExecutor(4) as pool:
+    print(len(set(pool.map(first, range(4)))))
+"""
+
+
+def test_the_first_use_may_be_in_several_threads(pytestconfig):
+    """Warp loads modules and captures graphs for the whole process: of one simulator and of several."""
+    script = FIRST_USE.format(tests=str(pytestconfig.rootpath / "tests"))
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.returncode) == ("1\n", 0), done.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")
+@pytest.mark.parametrize("divisions", [(6, 2, 2), (24, 12, 12)])
+def test_a_forked_process_uses_the_simulator(divisions, monkeypatch):
+    """With threads for the shards of a batch, and those of torch for a large body, neither of which it inherits."""
+    monkeypatch.setenv("WARP_RESPHYS_THREADS", "2")
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    mesh = box_hexahedra((0.1, 0.02, 0.02), divisions)
+    sim = Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Corotated(100e3, 0.45))
+    batch = 4 if len(mesh.vertices) < 1000 else 1
+
+    def motion():
+        return sim.step(sim.rest_state(batch))[0].q
+
+    here = motion()
+    (end, other), context = multiprocessing.Pipe(duplex=False), multiprocessing.get_context("fork")
+    child = context.Process(target=lambda: other.send(motion().numpy()))
+    try:
+        child.start()
+        assert end.poll(60)
+        torch.testing.assert_close(torch.as_tensor(end.recv()), here, rtol=0.0, atol=1e-12)
+    finally:
+        child.kill()
+        torch.set_num_threads(before)
+
+
+def saved(thing):
+    file = io.BytesIO()
+    torch.save(thing, file)
+    file.seek(0)
+    return torch.load(file, weights_only=False)
+
+
+WAYS = {"pickle": lambda x: pickle.loads(pickle.dumps(x)), "deepcopy": copy.deepcopy, "copy": copy.copy, "save": saved}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_copies_of_a_used_simulator_move_as_it_does(name, recwarn):
+    """Of every kind of energy: buffers, factors and Warp's arrays stay behind, and nothing is warned of again."""
+    sim = MOTIONS[name][0]()
+    expected = positions(sim)
+    copies = {way: make(sim) for way, make in WAYS.items()}
+    assert not recwarn
+    for way, other in copies.items():
+        assert torch.equal(positions(other), expected), way
+    assert copies["copy"].body is sim.body
+    assert copies["deepcopy"].body is not sim.body
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_copies_of_bodies_states_and_motions(way):
+    sim = simulator(FLOOR)
+    motion = sim.rollout(sim.static_equilibrium(), 3)
+    body, final, copied = (WAYS[way](thing) for thing in (sim.body, motion.final, motion))
+    assert torch.equal(copied.q, motion.q)
+    assert list(final.memory) == list(motion.final.memory)
+    again = Simulator(body, sim.material)
+    assert torch.equal(again.step(final)[0].q, sim.step(motion.final)[0].q)

@@ -224,13 +224,19 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     stage = StageSettings.reading(settings("experiment=sopra"), *LEARNING, *NETWORKS, *keys, **own)
     experiment = Experiment(stage, tmp_path)
     about = (np.tile(0.01 * np.arange(5), (2, 1)), observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
-    experiment.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, bound=np.zeros((1, 3)))
+    pressed = {"pressure": np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 0.0]])[..., None]}
+    more = {"bound": np.zeros((1, 3)), "inputs": pressed}
+    experiment.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, **more)
     markers = {"sysid": good, "resphys": lost}
     results = summary(StageContext("evaluate", tmp_path, "", stage), experiment, {"1": ("a", "b")}, markers, left)
     assert results["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert results["errors_mm"]["resphys"]["diverged"] == 1
     assert results["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}
     assert results["growth"]["sysid"] == pytest.approx(0.0)
+    rise, release = (results["phases"][phase] for phase in ("rise", "release"))
+    assert rise["sysid"]["mean"] == release["sysid"]["mean"] == pytest.approx(5.0)
+    assert (rise["resphys"]["mean"], rise["resphys"]["trajectories"]) == (0.0, 2)
+    assert (release["resphys"]["diverged"], release["resphys"]["trajectories"]) == (1, 1)
 
 
 def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(finished):

@@ -5,9 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from warp_resphys.learning.intervals import time_since_change
 from warp_resphys.learning.metrics import (
+    errors_per_marker,
     marker_errors,
     paired_gain,
+    phases,
     summarise,
     summarise_folds,
     summarise_trajectories,
@@ -75,3 +78,24 @@ def test_intervals_of_gains_have_their_stated_coverage(count):
         result = paired_gain(before, before * (0.8 + 0.2 * draw.normal(size=count)))
         inside += result.lower <= 0.2 <= result.upper
     assert 0.85 < inside / 300 < 0.95
+
+
+def test_a_driven_trial_rises_holds_and_is_released():
+    times = 0.25 * np.arange(12)
+    inputs = np.array([0.0, 1.0, 1.005, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 0.5, 0.5, 0.5])  # noise is no change
+
+    def found(inputs, before=0.0):
+        since = time_since_change(times[:, None], [inputs[:, None, None]])[:, 0]
+        return " ".join(word[:3] or "-" for word in phases(since, np.abs(inputs), before))
+
+    assert found(inputs) == "- ris ris ris hol ris ris ris hol rel rel rel"
+    assert found(-np.ones(12)) == "ris ris ris" + 9 * " hol"
+    assert found(np.ones(12), before=1.0) == " ".join(12 * "-")
+    assert found(0.2 * np.ones(12), before=1.0) == " ".join(12 * ["rel"])
+
+
+def test_trials_of_other_lengths_count_alike_for_a_marker():
+    off, seen = np.zeros((2, 6, 1, 3)), np.zeros((2, 6, 1, 3))
+    off[0, :, 0, 0], off[1, :, 0, 0] = 1e-3, 4e-3
+    seen[1, 2:] = np.nan
+    assert errors_per_marker(off, seen, ["tip"]) == {"tip": pytest.approx(2.5)}

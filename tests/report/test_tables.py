@@ -17,7 +17,15 @@ from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, me
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
 from warp_resphys.report.control_section import control_section
-from warp_resphys.report.data import along_body, at_times, drawn_markers, mean_distance, shown_models, tip_markers
+from warp_resphys.report.data import (
+    Driven,
+    along_body,
+    at_times,
+    drawn_markers,
+    mean_distance,
+    shown_models,
+    tip_markers,
+)
 from warp_resphys.report.error_section import largest_filtered
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import (
@@ -36,6 +44,7 @@ from warp_resphys.report.render import axes_from_below, motion_axes
 from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.sections import (
     against,
+    gain_text,
     horizon_table,
     published_beside,
     published_growth,
@@ -362,7 +371,8 @@ def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
 
     quantity = SimpleNamespace(shown=lambda value: f"{value:g} kPa")
     fits = {"sysid": [fit("a", 2.0, scale=1.0, zero=0.5), fit("b", 4.0, scale=1.0)], "simulation": [fit("a", 9.0)]}
-    (table,) = rest_table(fits, quantity)
+    driven = Driven(quantity, ("c",), {})
+    (table,) = rest_table(fits, driven)
     assert table.columns == ["As it is", "Refitted gain", "Refitted offset"]
     assert [[(cell.text, cell.small) for cell in row.cells] for row in table.rows] == [
         [("2.00", ""), ("1.00", "+5.0 %"), ("0.500", "2 kPa")],
@@ -370,6 +380,17 @@ def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
         [("3.00", ""), ("1.00", ""), ("2.25", "")],
     ]
     assert rest_table({}, None) == rest_table({"sysid": [fit("a", 2.0)]}, None) == []
+
+    def text(gains, left=1.0, pressures=(3.0, 1.0, 2.0)):
+        rows = [fit(n, 2.0, scale=left) | {"values": {"scale": gain}} for n, gain in zip("abc", gains, strict=True)]
+        values = {n: np.array([[0.0], [-p]]) for n, p in zip("abc", pressures, strict=True)}
+        return gain_text(rows, Driven(quantity, ("c",), values))
+
+    assert "from +2.1 % at 1 kPa to +11.0 % at 3 kPa" in text([0.11, 0.021, 0.066])
+    assert "may lack physics" in text([-0.11, -0.021, -0.066])
+    assert "much the same in all trials (+5.1 %)" in text([0.051, 0.05, 0.052])
+    assert text([0.11, 0.021, 0.066], left=1.9) == text([0.066, 0.021, 0.11]) == ""
+    assert text([0.11, 0.021, 0.066], pressures=(1.0, 1.0, 2.0)) == ""
 
 
 def result(simulation, sysid=None, law=None, **more):

@@ -18,13 +18,20 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.metrics import errors_per_marker, marker_errors, median_filter, summarise, summarise_trajectories
+from ..learning.metrics import (
+    PHASES,
+    errors_per_marker,
+    marker_errors,
+    median_filter,
+    summarise,
+    summarise_trajectories,
+)
 from ..learning.replay import Replay
 from ..settings.stages import StageSettings
 from .build import finer
 from .checks import check_memory
 from .experiment import LEARNED, Experiment
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, driving, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, Dataset, driving, phases_of, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
@@ -201,7 +208,7 @@ def summary(
             model: {name: _mean_angle(x[:count, :, own], points[:count, :, own]) for name, own in bodies.items()}
             for model, x in simulated.items()
         }
-    content |= _over_time(settings, test, observed, errors)
+    content |= _over_time(settings, test, observed, errors) | _by_phase(dataset, names, test, observed)
     if left:
         content["range"] = {model: _range(rows[:count], names, step) for model, rows in left.items()}
     if len(groups) > 1:
@@ -219,15 +226,16 @@ def summary(
 
 
 def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
-    """Mean error of the orientation of a rigid body where it was seen [degrees]; None if a roll-out diverged.
+    """Mean over trials of the error of a rigid body's orientation, where seen [degrees]; None if a roll-out diverged.
 
     Args:
         simulated: (R, T, 4, 3) its points [m].
         observed: (R, T, 4, 3) [m], NaN where it was not seen.
     """
     seen = np.isfinite(observed).all(axis=(-2, -1))
-    mean = float(np.degrees(angles(observed, simulated)[seen].mean())) if seen.any() else math.nan
-    return mean if math.isfinite(mean) else None
+    off = np.degrees(angles(observed, simulated))
+    means = [own[at].mean() for own, at in zip(off, seen, strict=True) if at.any()]
+    return float(np.mean(means)) if means and np.isfinite(means).all() else None
 
 
 def _errors(simulated: FloatArray, observed: FloatArray, first: Sequence[int]) -> list[FloatArray]:
@@ -265,6 +273,24 @@ def _over_time(
     if horizons and horizons[-1] >= _FILTERED_SECONDS:
         content["median_filtered"] = {model: _largest_filtered(rows, step) for model, rows in errors.items()}
     return content
+
+
+def _by_phase(
+    dataset: Dataset, names: Sequence[str], test: Mapping[str, FloatArray], observed: FloatArray
+) -> dict[str, Any]:
+    """Entry ``phases``: errors by phase of the inputs and model; empty without inputs."""
+    at = phases_of(dataset, names)
+    seen = np.isfinite(observed[: len(names)]).all(-1).any(-1)
+    frames = {phase: (at == phase) & seen for phase in PHASES}
+    found = {
+        phase: {
+            model: summarise(marker_errors(x[k, own], observed[k, own]) for k, own in enumerate(rows) if own.any())
+            for model, x in test.items()
+        }
+        for phase, rows in frames.items()
+        if rows.any()
+    }
+    return {"phases": found} if found else {}
 
 
 def _largest_filtered(errors: Sequence[FloatArray], step: float) -> float | None:

@@ -17,6 +17,7 @@ from ..fem.body import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..learning.intervals import time_since_change
+from ..learning.metrics import phases
 from ..mesh.mesh import select_vertices
 from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
@@ -354,3 +355,21 @@ def since_change(dataset: Dataset, names: Sequence[str]) -> FloatArray:
     since = time_since_change(dataset.times[rows].T, acting).T
     since[[dataset.begins[row] == STATIC for row in rows]] = np.inf
     return since
+
+
+def phases_of(dataset: Dataset, names: Sequence[str]) -> NDArray[np.str_]:
+    """Returns the phases (R, T) of driven trials, see `learning.metrics.phases`; empty words for others and for poses.
+
+    The size of the inputs is their norm, each kind over its largest value.
+    """
+    rows, acting = dataset.rows(names), driving(dataset, names)
+    largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in dataset.inputs.items()}
+    kinds = {name: acting[name] / size for name, size in largest.items() if size}
+    since = time_since_change(dataset.times[rows].T, [own.swapaxes(0, 1) for own in kinds.values()]).T
+    found = np.full(since.shape, "", dtype="<U7")
+    for k, row in enumerate(rows):
+        if kinds and dataset.begins[row] != STATIC:
+            before = [dataset.resting[name][row] / largest[name] for name in kinds if name in dataset.resting]
+            sizes = np.linalg.norm(np.concatenate([own[k] for own in kinds.values()], 1), axis=1)
+            found[k] = phases(since[k], sizes, float(np.linalg.norm(np.concatenate([[0.0], *before]))))
+    return found

@@ -22,6 +22,7 @@ from ..data.rigid_bodies import as_markers, owners
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
+from ..learning.metrics import marker_errors
 from ..learning.parameters import HUNG, configured_parameters, own_name, split_name
 from ..learning.placement import DisplacedMarkers, Placement, by_placement, placement_of
 from ..learning.replay import Replay, exact
@@ -233,8 +234,9 @@ def free_fits(
     errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
 
     def mean(error: FloatArray) -> float:
-        """Mean length of errors (T, M, 3) of markers and rigid bodies that were seen [mm]."""
-        return float(1e3 * np.nanmean(np.linalg.norm(as_markers(error, labels), axis=-1)))
+        """Mean error of a trial [mm], of its errors (T, M, 3), as the table of errors has it."""
+        own = as_markers(error, labels)
+        return float(marker_errors(own, np.where(np.isfinite(own), 0.0, np.nan)).mean())
 
     left: dict[str, dict[str, float]] = {name: {} for name in errors}
     values: dict[str, dict[str, float]] = {name: {} for name in errors}

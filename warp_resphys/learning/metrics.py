@@ -11,6 +11,8 @@ from scipy.special import ndtr, stdtrit
 
 from ..io.errors import InputError
 
+PHASES: Final = ("rise", "hold", "release")  # of driven trials, see `phases`
+_RISE, _NOISE = 0.5, 0.02  # duration of a rise [s]; differences of inputs that are none, over the largest size
 _DRAWS, _TAIL = 10_000, 0.05  # of the bootstrap: samples, and probability outside of its interval at either end
 
 
@@ -139,7 +141,7 @@ def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64])
 def errors_per_marker(
     simulated: NDArray[np.float64], observed: NDArray[np.float64], labels: Sequence[str]
 ) -> dict[str, float | None]:
-    """Returns the mean error of every marker that was seen [mm]; None where a roll-out diverged.
+    """Returns the mean over trials of the error of every marker that was seen [mm]; None where a roll-out diverged.
 
     Args:
         simulated: (R, T, M, 3) [m], NaN where a roll-out diverged.
@@ -149,8 +151,8 @@ def errors_per_marker(
     means: dict[str, float | None] = {}
     for m, label in enumerate(labels):
         errors = [marker_errors(x[:, m : m + 1], y[:, m : m + 1]) for x, y in zip(simulated, observed, strict=True)]
-        if any(map(len, errors)):
-            means[label] = _finite_mean(np.concatenate(errors))
+        if of_trials := [own.mean() for own in errors if len(own)]:
+            means[label] = _finite_mean(np.array(of_trials))
     return means
 
 
@@ -234,6 +236,25 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # Windows of NaN alone.
         return np.asarray(np.nanmedian(windows, axis=-1))
+
+
+def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float = 0.0) -> NDArray[np.str_]:
+    """Returns the phase of each frame of a driven trial: ``rise``, ``hold`` or ``release``; empty before any.
+
+    After its inputs grew, a trial rises for half a second and then holds; after they fell, it is released until they
+    grow again. Differences of up to 2 % of the largest size are noise.
+
+    Args:
+        since: (T,) since the last change of the inputs [s], see `intervals.time_since_change`.
+        sizes: (T,) norm of the inputs.
+        before: the norm before the first frame.
+    """
+    changes = np.flatnonzero(since == 0.0)
+    grew = np.diff(sizes[changes], prepend=before)
+    grew[np.abs(grew) <= _NOISE * sizes.max()] = 0.0
+    last = np.searchsorted(changes, np.arange(len(since)), side="right") - 1
+    rests = (last == 0) & (grew[0] == 0.0)
+    return np.select([rests, grew[last] < 0.0, since <= _RISE], ["", "release", "rise"], "hold")
 
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:

@@ -42,6 +42,10 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
+    if by_phase := metrics.get("phases"):
+        rows = {phase.capitalize(): {m: own["mean"] for m, own in models.items()} for phase, models in by_phase.items()}
+        note = "Rise: the first half second after the inputs grew. Hold: after that. Release: after they fell."
+        blocks.append(model_table("Phase; mean error [mm]", numbers(rows), metrics["errors_mm"], note))
     if turned := metrics.get("orientations_deg"):
         bodies = next(iter(turned.values()))
         by_body = {name: {m: angles[name] for m, angles in turned.items()} for name in bodies}

@@ -5,13 +5,15 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
 
+import numpy as np
+
 from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, mean_interval, published_errors
 from ..settings.run import RunSettings
-from ..stepping.quantity import Quantity
 from .data import (
     MODELS,
+    Driven,
     RunReport,
     folds_in,
     missing_baselines,
@@ -43,6 +45,8 @@ BEYOND: Final = 0.01  # Share of cells and times above which a law is said to ex
 _PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
 _MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
 _CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the one before.
+_LEVELS, _HELPS = 3, 0.9  # least number of different inputs; largest share of the error that a helpful gain leaves
+_ALIKE, _STEADY = 0.3, 0.9  # range of gains that are alike, over their mean; least rank correlation with the inputs
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
 
 
@@ -141,16 +145,16 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     tables = [model_table("Test trial [mm]", rows, data.metrics["errors_mm"], note, data.pages, small)] if rows else []
     fits = [fold["free_fits"] for fold in folds if "free_fits" in fold]
     merged = {model: [row for own in fits for row in own.get(model, ())] for model in _CHAIN}
-    tables += rest_table(merged, None if data.driven is None else data.driven.quantity)
+    tables += rest_table(merged, data.driven)
     return Part("Trial by trial", tables) if tables else None
 
 
-def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], quantity: Quantity | None) -> list[PageTable]:
+def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven | None) -> list[PageTable]:
     """Return a table of what could explain the errors that remain; empty without fits.
 
     Args:
         fits: Of metrics.json, by model; the model with the smallest error is shown.
-        quantity: Of the inputs that drive the trials.
+        driven: Inputs that drive the trials.
     """
     means = {model: fmean(row["as_is_mm"] for row in rows) for model, rows in fits.items() if rows}
     model = min(means, key=lambda name: means[name], default="")
@@ -163,7 +167,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], quantity: Quanti
             return Cell(NONE)
         value = row["values"].get(key)
         words = "" if value is None else f"{100.0 * value:+.1f} %" if key == "scale" else ""
-        words = quantity.shown(value) if key == "zero" and value is not None and quantity is not None else words
+        words = driven.quantity.shown(value) if key == "zero" and value is not None and driven is not None else words
         return Cell(number_text(row["left_mm"][key]), words)
 
     body = [Row(r["name"], [Cell(number_text(r["as_is_mm"])), *(left(r, key) for key in shown)]) for r in fits[model]]
@@ -172,13 +176,39 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], quantity: Quanti
     note = (
         f"Mean error of {MODELS[model][0]} [mm], and what it would be with the inputs or the marker positions refitted "
         "to the test trials, linearised about the identified simulator; below it, the refitted value. An improvement "
-        "by gain or offset suggests an error of the actuator or its log, one by marker positions a placement error."
+        "by gain or offset may come from the calibration of the actuator, from physics that the simulator lacks, or "
+        "from the mesh; one by marker positions suggests a placement error."
     )
-    return [
-        PageTable(
-            "What could explain the remaining error", ["As it is", *(_REFITTED[key] for key in shown)], body, note
+    note += gain_text(fits[model], driven) if driven is not None else ""
+    columns = ["As it is", *(_REFITTED[key] for key in shown)]
+    return [PageTable("What could explain the remaining error", columns, body, note)]
+
+
+def gain_text(fits: Sequence[Mapping[str, Any]], driven: Driven) -> str:
+    """Return what the refitted gains suggest; empty with fewer than three inputs, or where they remove little error.
+
+    Args:
+        fits: Of a model, by trial.
+        driven: Inputs of the trials.
+    """
+    known = [row for row in fits if "scale" in row["values"] and row["name"] in driven.values]
+    sizes = np.array([float(np.abs(driven.values[row["name"]]).max()) for row in known])
+    gains = np.array([100.0 * row["values"]["scale"] for row in known])
+    left = sum(row["left_mm"]["scale"] for row in known)
+    if len({*sizes.tolist()}) < _LEVELS or left > _HELPS * sum(row["as_is_mm"] for row in known):
+        return ""
+    if np.ptp(gains) <= _ALIKE * abs(gains.mean()):
+        return (
+            f" The refitted gain is much the same in all trials ({gains.mean():+.1f} %), as after a wrong calibration."
         )
-    ]
+    if abs(np.corrcoef(sizes.argsort().argsort(), gains.argsort().argsort())[0, 1]) < _STEADY:
+        return ""
+    low, high = int(sizes.argmin()), int(sizes.argmax())
+    return (
+        f" The refitted gain changes steadily with the inputs, from {gains[low]:+.1f} % at "
+        f"{driven.quantity.shown(sizes[low])} to {gains[high]:+.1f} % at {driven.quantity.shown(sizes[high])}, which "
+        "a wrong calibration would not do: the simulator may lack physics, or its mesh may be too coarse."
+    )
 
 
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:

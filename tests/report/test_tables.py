@@ -180,7 +180,7 @@ class TestIdentification:
             ("prony_time_2", 0.3125, "Prony time 2 [s]", "0.3125"),
             ("tendon_offset_1_left", 0.002, "Tendon offset 1 left [mm]", "2"),
             ("pressure_delay", 0.03, "Pressure delay [ms]", "30"),
-            ("pressure_slew", 2e-6, "Pressure slew [µs per unit]", "2"),
+            ("pressure_slew", 2e-6, "Pressure slew [µs/Pa]", "2"),
             ("tendon_contraction_dead_band", 0.003, "Tendon contraction dead band [mm]", "3"),
             ("muscle_contraction_dead_band", 0.03, "Muscle contraction dead band [%]", "3"),
             ("pressure_slope_3", 2.0, "Pressure slope 3", "2"),
@@ -195,11 +195,11 @@ class TestIdentification:
 
     def test_what_the_data_cannot_tell(self, identified):
         said = uncertainty_text("sysid", identified, {}).replace(NO_BREAK_SPACE, " ")
-        assert said == "SysID: the data determine stiffness damping least, to 3.4 % of the range."
+        assert said == "SysID: stiffness damping is least certain (3.4 % of the range)."
         assert uncertainty_text("sysid", {**identified, "uncertainty": None}, {}) == ""
         identified["uncertainty"] |= {"poorest_deviation": 1.9, "correlation": [[1.0, -0.95], [-0.95, 1.0]]}
         said = uncertainty_text("sysid", identified, {})
-        assert "over the whole range: set a prior" in said
+        assert "the data do not constrain stiffness damping: set a prior." in said
         assert f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)" in said
 
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])

@@ -232,7 +232,7 @@ def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
         simulated: (R, T, 4, 3) its points [m].
         observed: (R, T, 4, 3) [m], NaN where it was not seen.
     """
-    seen = np.isfinite(observed).all(axis=(-2, -1))
+    seen = np.asarray(np.isfinite(observed).all(axis=(-2, -1)))
     off = np.degrees(angles(observed, simulated))
     means = [own[at].mean() for own, at in zip(off, seen, strict=True) if at.any()]
     return float(np.mean(means)) if means and np.isfinite(means).all() else None

@@ -30,6 +30,8 @@ _UNITS: Final = (  # By patterns of names, of which the first one that fits coun
     (r"release_force_.", "N", 1.0),
     (r"principal_point_.", "px", 1.0),
     (r"prony_time_.+", "s", 1.0),
+    (r"(.+_)?(pressure|stress)_slew", "µs/Pa", 1e6),
+    (r"(.+_)?tension_slew", "µs/N", 1e6),
     (r".+_slew", "µs per unit", 1e6),
     (rf"muscle_contraction{_BAND}", "%", 100.0),
     (rf"(.+_)?(pressure|stress){_BAND}", "kPa", 1e-3),
@@ -197,10 +199,10 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     words = {parameter: parameter_wording(parameter)[0] for parameter in names}
     words = {p: w if w.startswith(("Young", "Poisson", "Prony")) else w[0].lower() + w[1:] for p, w in words.items()}
     largest = max(abs(weight) for weight in uncertainty["poorest"].values())
-    along = [words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest]
+    along = " with ".join(words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest)
     share = 100.0 * uncertainty["poorest_deviation"]
-    text = f"{MODELS[name][0]}: the data determine {' together with '.join(along)} least, "
-    text += f"to {share:.2g} % of the range" if share < _WHOLE else "leaving it open over the whole range: set a prior"
+    known = f"{along} is least certain ({share:.2g} % of the range)."
+    text = f"{MODELS[name][0]}: {known if share < _WHOLE else f'the data do not constrain {along}: set a prior.'}"
     correlation = np.array(uncertainty["correlation"], dtype=np.float64)
     tied = [
         f"{words[names[i]]} and {words[names[j]]} (correlation {correlation[i, j]:+.2f})".replace("-", MINUS)
@@ -208,11 +210,11 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
         for i in range(j)
         if abs(correlation[i, j]) > _TIED
     ]
-    text += f"; they do not separate {', '.join(tied)}." if tied else "."
+    text += f" The data do not separate {', '.join(tied)}." if tied else ""
     for parameter, deviation in uncertainty["deviation"].items():
         prior = ranges[parameter].prior if parameter in ranges else None
         if prior is not None and ranges[parameter].per == "all" and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)
             where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
-            text += f" They add almost nothing about {words[parameter]}: it stays at its prior, {where}."
+            text += f" The data do not constrain {words[parameter]}: it stays at its prior, {where}."
     return text.replace(" %", f"{NO_BREAK_SPACE}%")

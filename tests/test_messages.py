@@ -37,7 +37,7 @@ MESSAGES = {
         lambda: beam().step(beam().rest_state(), wr.Inputs(presure=torch.zeros(1, 2)))
     ),
     "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "
-    "them": collapsed,
+    "them (gmsh: Coherence, Abaqus: one part)": collapsed,
     "1 of 1 bodies have no equilibrium under these loads: they grow to more than 100 times their size; lower the "
     "loads, or take a stiffer material.": lambda: beam().static_equilibrium(pushed(1e3)),
     "no equilibrium was found: under growing loads it is lost beyond 30 % of them; lower the loads, or take a stiffer "

@@ -86,6 +86,7 @@ HERE = {
 ELSEWHERE = {
     "a.c3d": (write_c3d, read_recording),
     "a.h5": (write_hdf5, read_recording),
+    "a.inp": (write_box, read_mesh),
     "a.msh": (write_box, read_surfaces),
     "a.vtk": (write_box, read_mesh),
     "a.vtu": (write_box, read_mesh),

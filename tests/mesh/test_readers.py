@@ -24,13 +24,22 @@ def test_gmsh_files_keep_regions_beside_surfaces(tmp_path, mesh):
     assert list(read_surfaces(tmp_path / "two.msh")) == ["end"]
 
 
-def test_regions_that_cannot_be_are_refused(tmp_path):
+def test_regions_that_cannot_be_are_refused():
     mesh = box_hexahedra(divisions=(2, 1, 1))
     for cells in ([], [2], [True, False], [-1]):
         with pytest.raises(MeshError, match="'tip'"):
             Mesh(mesh.vertices, mesh.cells, {"tip": np.array(cells)})
     with pytest.raises(MeshError, match="no region 'top'; it has base, tip"):
         in_two(mesh).region("top")
-    twice = Mesh(mesh.vertices, mesh.cells, {"a": np.array([0]), "b": np.array([0, 1])})
-    with pytest.raises(MeshError, match="several regions"):
-        write_mesh(tmp_path / "twice.msh", twice)
+
+
+def test_cells_in_several_regions_are_kept(tmp_path):
+    mesh = box_hexahedra(divisions=(3, 1, 1))
+    regions = {"a": np.array([1]), "b": np.array([0, 1]), "c": np.array([1])}
+    write_mesh(tmp_path / "twice.msh", Mesh(mesh.vertices, mesh.cells, regions))
+    again = read_mesh(tmp_path / "twice.msh")
+    np.testing.assert_array_equal(again.cells, mesh.cells)
+    assert {name: cells.tolist() for name, cells in again.regions.items()} == {
+        "body": [2],
+        **{name: cells.tolist() for name, cells in regions.items()},
+    }

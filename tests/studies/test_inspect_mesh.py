@@ -7,7 +7,7 @@ import trimesh
 from matplotlib.image import imread
 
 from support.command_line import refusal, settings_of
-from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.io.errors import InputError, MeshError, ResphysWarning
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm, name_surfaces
 from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
@@ -81,12 +81,16 @@ class TestNamedSurfaces:
         np.testing.assert_array_equal(surfaces["clamp"], left)
         assert len(read_vertices(tmp_path / "box.inp")) == len(box.vertices) + 1
 
-    def test_a_surface_within_the_body_is_refused(self, tmp_path, arm):
+    def test_a_surface_within_the_body_is_left_out_or_refused(self, tmp_path, arm):
         mesh, surfaces = arm
         inside = mesh.cells[:1, [0, 1, 2, 3]]
         assert not np.any(np.all(np.sort(boundary_faces(mesh), axis=1) == np.sort(inside), axis=1))
         write_mesh(tmp_path / "arm.msh", mesh, {**surfaces, "middle": inside})
-        with pytest.raises(MeshError, match=r"arm\.msh: 1 of 1 faces of the surface 'middle' are not on the body's"):
+        with pytest.warns(ResphysWarning, match=r"arm\.msh: the surface 'middle' is left out, as no face of it is on"):
+            assert set(read_surfaces(tmp_path / "arm.msh")) == set(surfaces)
+        partly = np.concatenate([inside, boundary_faces(mesh)[:1]])
+        write_mesh(tmp_path / "arm.msh", mesh, {"middle": partly})
+        with pytest.raises(MeshError, match=r"arm\.msh: 1 of 2 faces of the surface 'middle' are not on the body's"):
             read_surfaces(tmp_path / "arm.msh")
 
     @pytest.mark.parametrize("kind", ["tetrahedron10", "tetrahedron"])

@@ -1,8 +1,8 @@
 """Decodes files of other programs in a subprocess with limits on memory and time.
 
 On a damaged file, ezc3d and HDF5 (C++ and C) can crash, loop or allocate gigabytes, and meshio can loop. This module
-is therefore also a program, which decodes one file and returns plain arrays. It imports nothing from the package,
-because that would take longer than decoding most files.
+is therefore also a program, which decodes one file and returns plain arrays. What it imports from the package takes no
+time.
 """
 
 import contextlib
@@ -12,12 +12,17 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .abaqus_file import read_abaqus
+from .errors import DecodingError
+from .gmsh_file import read_gmsh
+from .mesh_blocks import Block, mesh_arrays_of
 
 if TYPE_CHECKING:
     import h5py
@@ -28,19 +33,13 @@ MEMORY = (2 << 30, 64)  # limit of the address space: bytes, plus bytes per byte
 SECONDS = (10.0, 2e-6)  # limit of processor time: seconds, plus seconds per byte of the file
 _OUT_OF_TIME = -getattr(signal, "SIGXCPU", 0)
 _WAITING = 6  # limit of wall-clock time over that of processor time, for a busy machine
-_SURFACE_CELLS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # number of corners
-_PHYSICAL = "gmsh:physical"  # meshio's key of gmsh's group numbers
-
-
-class DecodingError(Exception):
-    """A file that cannot be decoded; the message is the reason, without the file's name."""
 
 
 def decode(library: str, path: Path, *names: str) -> Arrays:
     """Runs `c3d_arrays`, `mesh_arrays` or `hdf5_arrays` in a subprocess, and returns the arrays.
 
     Args:
-        library: "ezc3d", "meshio" or "h5py".
+        library: "ezc3d", "meshio" (and our own readers of meshes) or "h5py".
         path: An existing file.
         names: Further arguments of `hdf5_arrays`.
 
@@ -50,7 +49,7 @@ def decode(library: str, path: Path, *names: str) -> Arrays:
     size = path.stat().st_size
     memory, seconds = MEMORY[0] + MEMORY[1] * size, SECONDS[0] + SECONDS[1] * size
     limits = str(memory), str(np.ceil(seconds).astype(int))
-    command = [sys.executable, "-P", __file__, *limits, library, str(path), *names]
+    command = [sys.executable, "-P", "-m", __spec__.name, *limits, library, str(path), *names]
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}  # each claims address space
     endless = f"decoding takes more than {seconds:.0f} s"
     try:
@@ -146,58 +145,62 @@ def refuse_data_elsewhere(file: "h5py.File") -> None:
 
 
 def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
-    """Reads points, volume cells, named surfaces and named regions with meshio, whose own errors are not caught.
+    """Reads points, volume cells, named surfaces and named regions (`mesh_blocks.mesh_arrays_of`).
 
-    Returns:
-        `points` (N, 3); `types`, names of all cell types; `solid/TYPE` (M, k), the volume cells of a type;
-        `surface/NAME` (F, 3 | 4), the corners of the faces of a named surface; and `region/NAME` (m,), the numbers of
-        the volume cells of a named region.
+    Args:
+        path: a file of gmsh, of Abaqus, or of another program, which meshio reads; its own errors are not caught.
+        file_format: meshio's name of the format; None for that of the file name extension.
 
     Raises:
-        DecodingError: meshio cannot read the format.
+        DecodingError: the file cannot be read.
     """
+    readers = {"gmsh": read_gmsh, ".msh": read_gmsh, "abaqus": read_abaqus, ".inp": read_abaqus}
+    own = readers.get(file_format or Path(path).suffix.lower())
+    if own is None:
+        return mesh_arrays_of(*_read_by_meshio(path, file_format))
+    try:
+        return mesh_arrays_of(*own(path))
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        raise DecodingError(f"the file is damaged or not whole ({error}); save the mesh again") from error
+
+
+def _read_by_meshio(path: str, file_format: str | None) -> tuple[NDArray[np.float64], list[Block]]:
+    """Returns points and blocks of a file; cell sets are groups."""
     import meshio
 
+    _know_voxels()
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             content = meshio.read(path, file_format)
     except SystemExit as error:
         raise DecodingError(printed.getvalue()) from error
-    arrays = {"points": np.asarray(content.points, dtype=np.float64)}
-    arrays["types"] = np.array([block.type for block in content.cells if len(block)], dtype=np.str_)
-    parts: dict[str, list[NDArray[np.int64]]] = {}
-    for block in content.cells:
-        if block.dim == 3 and len(block):
-            polyhedra = not isinstance(block.data, np.ndarray)
-            data = np.empty((len(block), 0)) if polyhedra else block.data
-            parts.setdefault(f"solid/{block.type}", []).append(np.asarray(data, dtype=np.int64))
-    for name, number, cells in _groups(content, 2):
-        block = content.cells[number]
-        if block.type in _SURFACE_CELLS:
-            corners = np.asarray(block.data, dtype=np.int64)[:, : _SURFACE_CELLS[block.type]]
-            parts.setdefault(f"surface/{name}", []).append(corners[cells])
-    first = np.cumsum([0, *(len(block) if block.dim == 3 else 0 for block in content.cells)])
-    for name, number, cells in _groups(content, 3):
-        parts.setdefault(f"region/{name}", []).append(first[number] + cells)
-    return arrays | {name: np.concatenate(own) for name, own in parts.items()}
-
-
-def _groups(content: Any, dimension: int) -> Iterator[tuple[str, int, NDArray[np.int64]]]:
-    """Yields the members of gmsh's physical groups, or of cell sets: group name, block number, cells in the block."""
-    groups = {tuple(int(n) for n in tag): name for name, tag in content.field_data.items() if len(tag) == 2}
+    if "cannot handle" in printed.getvalue():  # cells that meshio leaves out
+        raise DecodingError(printed.getvalue())
+    blocks = []
     for number, block in enumerate(content.cells):
-        if block.dim != dimension:
-            continue
-        if _PHYSICAL in content.cell_data:
-            tags = np.asarray(content.cell_data[_PHYSICAL][number])
-            for tag in np.unique(tags).tolist():
-                if (tag, dimension) in groups:
-                    yield groups[tag, dimension], number, np.flatnonzero(tags == tag)
-            continue
-        for name, sets in content.cell_sets.items():
-            if sets[number] is not None and len(sets[number]):
-                yield name, number, np.asarray(sets[number], dtype=np.int64)
+        sets = {name: own[number] for name, own in content.cell_sets.items() if own[number] is not None}
+        groups = {name: np.asarray(cells, dtype=np.int64) for name, cells in sets.items()}
+        nodes = block.data if isinstance(block.data, np.ndarray) else np.empty((len(block), 0))
+        blocks.append(Block(block.type, block.dim, nodes.astype(np.int64), groups))
+    return np.asarray(content.points, dtype=np.float64), blocks
+
+
+def _know_voxels() -> None:
+    """Adds VTK's pixels and voxels to meshio: quadrilaterals and hexahedra with another order of corners."""
+    from meshio import _vtk_common
+    from meshio.vtk import _vtk_42
+
+    orders = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}
+    known = _vtk_common.vtk_to_meshio_order
+
+    def order(kind: int, dtype: Any = int) -> NDArray[Any] | None:
+        return np.array(orders[kind], dtype=dtype) if kind in orders else known(kind, dtype)
+
+    if 11 not in _vtk_common.vtk_to_meshio_type:
+        _vtk_common.vtk_to_meshio_type.update({8: "quad", 11: "hexahedron"})
+        _vtk_42.vtk_type_to_numnodes[[8, 11]] = 4, 8
+        _vtk_common.vtk_to_meshio_order = _vtk_42.vtk_to_meshio_order = order
 
 
 def _limit(memory: int, seconds: int) -> None:
@@ -233,7 +236,7 @@ def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> in
         message = str(error)
     except Exception as error:
         message = too_much if "bad_alloc" in str(error) else f"{type(error).__name__}: {error}"
-    reason.write((" ".join(message.split())[:200] or "no reason given").encode(errors="replace"))
+    reason.write((" ".join(message.split())[:300] or "no reason given").encode(errors="replace"))
     reason.close()
     return 1
 

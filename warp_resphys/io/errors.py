@@ -41,6 +41,10 @@ class DerivativeError(ResphysError, RuntimeError):
     """A derivative that a simulation does not have: of second order, in forward mode, or by ``torch.func``."""
 
 
+class DecodingError(Exception):
+    """A file that cannot be decoded; the message is the reason, without the file's name."""
+
+
 class ConvergenceError(ResphysError, RuntimeError):
     """A solve that did not reach its tolerance.
 

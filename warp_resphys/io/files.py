@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .atomic import atomic_path, read_error
-from .decoding import DecodingError, refuse_data_elsewhere
-from .errors import DataFileError
+from .decoding import refuse_data_elsewhere
+from .errors import DataFileError, DecodingError
 
 if TYPE_CHECKING:
     import torch

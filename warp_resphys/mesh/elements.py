@@ -132,6 +132,12 @@ class Element:
         return FACES[self.faces.shape[1]]
 
     @cached_property
+    def mirrored(self) -> IntArray:
+        """(K,) order of the nodes of a mirrored cell, whose volume is negative otherwise."""
+        swapped = self.shape.nodes[:, [1, 0, 2]]
+        return np.abs(swapped[:, None] - self.shape.nodes).sum(axis=2).argmin(axis=1)
+
+    @cached_property
     def edges(self) -> IntArray:
         """(E, 2) corners of the edges, ascending."""
         corners = self.faces[:, : self.face.corners]

@@ -171,7 +171,8 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
 
     Raises:
         MeshError: The mesh is empty; a coordinate is not finite; an index is out of range; a vertex belongs
-            to no cell; two vertices coincide; a cell is flat, inverted or folded.
+            to no cell; two vertices coincide; a cell has a vertex twice, or the vertices of another cell, or is flat,
+            turned or folded.
     """
     vertices, cells, count = mesh.vertices, mesh.cells, len(mesh.vertices)
     if count == 0 or len(cells) == 0:
@@ -187,11 +188,26 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
         _refuse(
             np.asarray(nearest.min(axis=1) < np.arange(count)),
             "vertices",
-            "lie on another one, a crack between cells; merge or glue them",
+            "lie on another one, a crack between cells; merge or glue them (gmsh: Coherence, Abaqus: one part)",
         )
-    volumes, determinants = _normalised_volumes(mesh)
+    keys = np.sort(cells, axis=1)
+    twice = (keys[:, 1:] == keys[:, :-1]).any(axis=1)
+    _refuse(twice, "cells", "have a vertex twice, such as wedges written as hexahedra; mesh the body with tetrahedra")
+    ranks = np.lexsort(keys.T)
+    repeated = np.zeros(len(cells), dtype=bool)
+    repeated[ranks[1:]] = (keys[ranks[1:]] == keys[ranks[:-1]]).all(axis=1)
+    _refuse(repeated, "cells", "have the vertices of an earlier one and would count twice; keep one of each")
+    volumes, smallest, largest = _normalised_volumes(mesh)
     _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat; remove them or mesh the body anew")
-    _refuse(determinants < DEGENERATE_VOLUME, "cells", "are inverted or folded; reorder or move their nodes")
+    order = mesh.element.mirrored.tolist()
+    _refuse(largest < 0.0, "cells", f"are inverted: their nodes wind the other way; take them as cells[:, {order}]")
+    _refuse(smallest < DEGENERATE_VOLUME, "cells", "are folded; move their nodes or mesh the body anew")
+
+
+def is_mirrored(mesh: Mesh) -> bool:
+    """Whether all cells have a negative volume, as in files that wind their nodes the other way; indices must exist."""
+    volumes = _normalised_volumes(mesh)[0]
+    return bool((volumes < DEGENERATE_VOLUME).all() and (volumes < -DEGENERATE_VOLUME).any())
 
 
 def boundary_faces(mesh: Mesh) -> IntArray:
@@ -354,8 +370,8 @@ def select_cells(
     return np.flatnonzero(chosen)
 
 
-def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
-    """Returns volumes and smallest Jacobian determinants of the cells, (M,) each, over the cube of the longest edge.
+def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Returns volumes, smallest and largest determinants of the cells, (M,) each, over the cube of the longest edge.
 
     Determinants are multiplied by the volume of the reference cell, so that both are equal for affine cells.
     """
@@ -368,14 +384,14 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
     longest = np.sqrt((sides**2).sum(axis=1).max(axis=0))
     nodes /= np.where(longest > 0, longest, 1.0)
     volumes = np.zeros(len(mesh.cells))
-    smallest = np.full(len(mesh.cells), np.inf)
+    smallest, largest = np.full(len(mesh.cells), np.inf), np.full(len(mesh.cells), -np.inf)
     for number, gradient in enumerate(gradients):
         jacobian = np.tensordot(gradient.T, nodes, axes=1)  # (3, 3, M), transposed
         determinants = (np.cross(jacobian[0], jacobian[1], axis=0) * jacobian[2]).sum(axis=0)
         if number < len(points):
             volumes += weights[number] * determinants
-        smallest = np.minimum(smallest, determinants)
-    return volumes, smallest * weights.sum()
+        smallest, largest = np.minimum(smallest, determinants), np.maximum(largest, determinants)
+    return volumes, smallest * weights.sum(), largest * weights.sum()
 
 
 def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:

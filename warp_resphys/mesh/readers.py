@@ -1,4 +1,4 @@
-"""Reading and writing of volume meshes and their named surfaces by meshio, with conversion to metres."""
+"""Reading and writing of volume meshes and their named surfaces, with conversion to metres."""
 
 import functools
 import os
@@ -11,29 +11,33 @@ from pathlib import Path
 import numpy as np
 
 from ..io.atomic import atomic_path
-from ..io.decoding import Arrays, DecodingError, decode, mesh_arrays
-from ..io.errors import MeshError
+from ..io.decoding import Arrays, decode, mesh_arrays
+from ..io.errors import DecodingError, MeshError, warn
 from .elements import ELEMENTS
-from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, quadratic
+from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
 SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # plausible diagonals of a body [m]
 
+# Formats whose nodes have numbers. Files regularly have some without a volume cell: ends of curves, reference points.
+_NUMBERED = (".msh", ".inp")
 _CELL_TYPES = tuple(element.file_type for element in ELEMENTS.values())  # meshio's names
 _PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's group numbers
 
 
 def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
-    """Reads and checks a tetrahedral or hexahedral mesh in any format of meshio.
+    """Reads and checks a tetrahedral or hexahedral mesh of gmsh, Abaqus or any other format of meshio.
 
-    Points, lines, surface cells and data fields of the file are ignored. Named volumes, that is gmsh's physical groups
-    or the cell sets of other formats, become the regions of the mesh.
+    Points, lines, surface cells and data fields of the file are ignored. Named volumes, that is gmsh's physical groups,
+    the element sets of Abaqus or the cell sets of other formats, become the regions of the mesh. If all cells have a
+    negative volume, the order of their nodes is reversed, with a warning.
 
     Args:
         path: The file; its extension determines the format.
         units: Unit of the coordinates in the file: "m", "cm" or "mm".
         order: 2 adds the edge midpoints to 4-node tetrahedra; 1 keeps the cells of the file.
-        drop_unreferenced: Whether to drop vertices that belong to no volume cell, which are an error otherwise.
+        drop_unreferenced: Whether to drop vertices that belong to no volume cell, which are an error otherwise; in
+            files of gmsh and Abaqus, they are always dropped.
 
     Returns:
         The mesh in metres. Vertices keep the file's order.
@@ -61,20 +65,23 @@ def read_surfaces(
 
     Returns:
         (F, 3 | 4 | 6) faces by name, as from `mesh.boundary_faces` of the mesh that `read_mesh` returns for the same
-        arguments; empty without named surfaces.
+        arguments; empty without named surfaces. Those between two parts of the body are left out, with a warning.
 
     Raises:
-        MeshError: As in `read_mesh`, or a named surface has a face that is not on the boundary of the body.
+        MeshError: As in `read_mesh`, or some faces of a named surface are not on the boundary of the body.
     """
     mesh, content, places = _read(Path(path), units, order, drop_unreferenced)
     faces = boundary_faces(mesh)
     corners = mesh.element.face.corners
-    face_of = {tuple(sorted(face)): number for number, face in enumerate(faces[:, :corners].tolist())}
+    face_of = {frozenset(face): number for number, face in enumerate(faces[:, :corners].tolist())}
     surfaces = {}
     for name in (key.removeprefix("surface/") for key in content if key.startswith("surface/")):
         nodes = content[f"surface/{name}"]
-        numbers = [face_of.get(tuple(sorted(places[face].tolist()))) for face in nodes]
+        numbers = [face_of.get(frozenset(places[face].tolist())) for face in nodes]
         missing = numbers.count(None)
+        if missing == len(numbers):
+            warn(f"{path}: the surface {name!r} is left out, as no face of it is on the body's boundary")
+            continue
         if missing:
             raise MeshError(
                 f"{path}: {missing} of {len(numbers)} faces of the surface {name!r} are not on the body's boundary; "
@@ -88,8 +95,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
     """Writes a mesh in metres; only gmsh's format .msh keeps regions and named surfaces (F, 3 | 4 | 6 | 8 | 9).
 
     Raises:
-        MeshError: The extension is unknown to meshio, the format does not support such cells, or a cell belongs to
-            several regions, which gmsh's format does not support.
+        MeshError: The extension is unknown to meshio, or the format does not support such cells.
         DataFileError: The file cannot be written.
     """
     import meshio
@@ -97,22 +103,23 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, surfaces: Mapping[str, 
     path = Path(path)
     kind = mesh.element.file_type
     blocks, groups, fields = [(kind, mesh.cells)], [np.zeros(len(mesh.cells), dtype=np.int64)], {}
-    as_gmsh = path.suffix == ".msh"
+    as_gmsh = path.suffix.lower() == ".msh"
     if as_gmsh:
-        owners = np.bincount(np.concatenate([*mesh.regions.values(), groups[0][:0]]), minlength=len(mesh.cells))
-        if (owners > 1).any():
-            raise MeshError(f"{path}: {int((owners > 1).sum())} cells belong to several regions; gmsh's keep to one")
-        if (owners == 0).any():
-            fields["body"] = np.array([1, 3])
         groups[0] += 1
         for number, (name, cells) in enumerate(mesh.regions.items(), start=2):
             fields[name] = np.array([number, 3])
-            groups[0][cells] = number
+            again = cells[groups[0][cells] > 1]  # gmsh repeats a cell for each of its groups
+            if len(again):
+                blocks.append((kind, mesh.cells[again]))
+                groups.append(np.full(len(again), number))
+            groups[0][np.setdiff1d(cells, again)] = number
+        if (groups[0] == 1).any():
+            fields["body"] = np.array([1, 3])
         for number, (name, faces) in enumerate((surfaces or {}).items(), start=2 + len(mesh.regions)):
             fields[name] = np.array([number, 2])
             blocks.append(({3: "triangle", 4: "quad", 6: "triangle6", 8: "quad8", 9: "quad9"}[faces.shape[1]], faces))
             groups.append(np.full(len(faces), number))
-    formats = ["gmsh"] if as_gmsh else meshio.extension_to_filetypes.get(path.suffix, [])
+    formats = ["gmsh"] if as_gmsh else meshio.extension_to_filetypes.get(path.suffix.lower(), [])
     if not formats:
         raise MeshError(f"{path}: meshio does not know the extension {path.suffix!r}; use .msh, .vtu or .vtk")
     data = {_PHYSICAL: groups, _GEOMETRICAL: groups} if as_gmsh else {}
@@ -142,7 +149,8 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
         mesh = Mesh(content["points"], _volume_cells(content).copy(), regions)
         places = np.arange(len(mesh.vertices))
         used = np.unique(mesh.cells)
-        if drop_unreferenced and used[0] >= 0 and used[-1] < len(places):  # others are refused below
+        drops = drop_unreferenced or path.suffix.lower() in _NUMBERED
+        if drops and used[0] >= 0 and used[-1] < len(places):  # others are refused below
             places[:] = -1
             places[used] = np.arange(len(used))
             mesh = Mesh(mesh.vertices[used], places[mesh.cells], regions)
@@ -162,6 +170,8 @@ def _read_file(path: Path) -> Arrays:
         stat = path.stat()
         return _decoded(path.absolute(), stat.st_ino, stat.st_size, stat.st_mtime_ns)
     except DecodingError as error:
+        if path.suffix.lower() in _NUMBERED:
+            raise MeshError(f"{path}: {error}") from error
         raise MeshError(
             f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"
         ) from error
@@ -170,20 +180,32 @@ def _read_file(path: Path) -> Arrays:
 @functools.lru_cache(maxsize=2)
 def _decoded(path: Path, *_: int) -> Arrays:
     """Returns the arrays of a file, cached by its state: an experiment reads its mesh a dozen times, 0.3 s each."""
-    return decode("meshio", path)
+    arrays = decode("meshio", path)
+    for name in (f"solid/{kind}" for kind in _CELL_TYPES if f"solid/{kind}" in arrays):
+        cells = arrays[name]
+        mesh = Mesh(arrays["points"], cells)
+        if cells.min() >= 0 and cells.max() < len(mesh.vertices) and is_mirrored(mesh):
+            warn(f"{path}: all {len(cells)} cells have a negative volume, so the order of their nodes is reversed")
+            arrays[name] = cells[:, mesh.element.mirrored]
+    return arrays
 
 
 def _volume_cells(arrays: Arrays) -> IntArray:
     """Returns the volume cells of a file (M, K); raises MeshError unless there is exactly one supported kind."""
     solids = {name.removeprefix("solid/"): cells for name, cells in arrays.items() if name.startswith("solid/")}
     if not solids:
-        others = ", ".join(sorted({*arrays["types"].tolist()})) or "no cells"
+        if not len(arrays["types"]):
+            raise MeshError("the file has no cells; save a mesh of the volume")
+        others = ", ".join(sorted({*arrays["types"].tolist()}))
         raise MeshError(
             f"the file has no tetrahedra or hexahedra (only: {others}): mesh its inside by mesh=surface mesh.path=FILE"
         )
     if len(solids) > 1 or not solids.keys() <= {*_CELL_TYPES}:
         supported = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
-        raise MeshError(f"the file has {' and '.join(sorted(solids))} cells; all must be {supported}, and of one kind")
+        raise MeshError(
+            f"the file has {' and '.join(sorted(solids))} cells; all must be {supported}, and of one kind: mesh the "
+            "body with tetrahedra alone"
+        )
     (cells,) = solids.values()
     return cells
 

@@ -97,7 +97,7 @@ class BoxesMesh(Settings):
 
 
 class FileMesh(Settings):
-    """A tetrahedral or hexahedral mesh from a file that meshio reads."""
+    """A tetrahedral or hexahedral mesh from a file of gmsh, of Abaqus or in a format of meshio."""
 
     kind: Literal["file"]
     path: Word = setting(description="path of the file")

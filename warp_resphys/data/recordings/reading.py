@@ -8,8 +8,8 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...io.decoding import Arrays, DecodingError, decode
-from ...io.errors import DataFileError, InputError
+from ...io.decoding import Arrays, decode
+from ...io.errors import DataFileError, DecodingError, InputError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from ...settings.trials import BagSettings, TableSettings
 from .bag import SUFFIXES, is_bag, read_raw_bag, topics_of

@@ -1,0 +1,226 @@
+"""Reads meshes of gmsh: MSH 2, 4.0 and 4.1, as text or binary (https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format).
+
+An entity of geometry can be in several physical groups. MSH 4 lists the groups of each entity; MSH 2 repeats its cells
+for each of them, which are read once. Only groups with a name are read. Other sections, such as $Periodic, are ignored.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import DecodingError
+from .mesh_blocks import Block, IntArray, rows_of
+
+Names = Mapping[tuple[int, int], str]  # of physical groups by dimension and number
+
+_KINDS = {  # meshio's name, dimension and number of nodes by gmsh's number of a kind
+    **{1: ("line", 1, 2), 2: ("triangle", 2, 3), 3: ("quad", 2, 4), 4: ("tetra", 3, 4), 5: ("hexahedron", 3, 8)},
+    **{6: ("wedge", 3, 6), 7: ("pyramid", 3, 5), 8: ("line3", 1, 3), 9: ("triangle6", 2, 6), 10: ("quad9", 2, 9)},
+    **{11: ("tetra10", 3, 10), 12: ("hexahedron27", 3, 27), 13: ("wedge18", 3, 18), 14: ("pyramid14", 3, 14)},
+    **{15: ("vertex", 0, 1), 16: ("quad8", 2, 8), 17: ("hexahedron20", 3, 20), 18: ("wedge15", 3, 15)},
+    **{19: ("pyramid13", 3, 13)},
+}
+_HEXAHEDRON20 = [*range(9), 11, 13, 9, 16, 18, 19, 17, 10, 12, 14, 15]
+_ORDERS = {  # gmsh's node at each place of VTK's order, where they differ
+    "tetra10": [*range(8), 9, 8],
+    "hexahedron20": _HEXAHEDRON20,
+    "hexahedron27": [*_HEXAHEDRON20, 22, 23, 21, 24, 20, 25, 26],
+}
+_HEAD = re.compile(rb"^\$(?!End)(\w+)[ \t\r]*\n", re.MULTILINE)  # first line of a section
+
+
+class _Numbers:
+    """Numbers of a section, taken one after the other."""
+
+    def __init__(self, content: bytes, is_text: bool, order: str) -> None:
+        self._content = np.fromstring(content.decode(), sep=" ") if is_text else content
+        self._order, self._at = order, 0
+
+    def take(self, count: int, kind: str) -> NDArray[Any]:
+        """Returns the next numbers (count,); of the kind "i4", "i8" or "f8" in binary files."""
+        if isinstance(self._content, bytes):
+            taken = np.frombuffer(self._content, self._order + kind, count, self._at)
+            self._at += taken.nbytes
+        else:
+            taken = self._content[self._at : self._at + count]
+            self._at += count
+            if len(taken) < count:
+                raise DecodingError("the file is not whole; save it again")
+        return taken
+
+    def integers(self, count: int, kind: str = "i4") -> IntArray:
+        return self.take(count, kind).astype(np.int64)
+
+    def integer(self, kind: str = "i4") -> int:
+        return int(self.integers(1, kind)[0])
+
+    def rows(self, count: int, integers: int, numbers: int) -> NDArray[np.float64]:
+        """Returns rows (count, integers + numbers), of 4-byte integers followed by 8-byte numbers in binary files."""
+        width = integers + numbers
+        if not isinstance(self._content, bytes):
+            return self.take(count * width, "f8").reshape(-1, width)
+        order = self._order
+        kind = np.dtype([("integers", order + "i4", (integers,)), ("numbers", order + "f8", (numbers,))])
+        taken = np.frombuffer(self._content, kind, count, self._at)
+        self._at += taken.nbytes
+        return np.concatenate([taken["integers"], taken["numbers"]], axis=1)
+
+
+def read_gmsh(path: str) -> tuple[NDArray[np.float64], list[Block]]:
+    """Returns points (N, 3) and blocks of cells of a file of gmsh.
+
+    Raises:
+        DecodingError: an unknown version or kind of cell, or a damaged file.
+    """
+    sections = _sections(Path(path).read_bytes())
+    if "MeshFormat" not in sections:
+        raise DecodingError("the file has no $MeshFormat; save the mesh by gmsh as version 4.1 or 2.2")
+    version, binary = re.split(rb"\s+", sections["MeshFormat"].strip())[:2]
+    number, is_text = float(version), binary == b"0"
+    mark = sections["MeshFormat"].partition(b"\n")[2][:4]
+    order = ">" if mark == b"\0\0\0\1" else "<"
+    names = {}
+    for line in sections.get("PhysicalNames", b"").decode(errors="replace").splitlines():
+        if match := re.match(r'\s*(\d)\s+(-?\d+)\s+"(.*)"', line):
+            names[int(match[1]), abs(int(match[2]))] = match[3]
+    if 2.0 <= number < 3.0:
+        return _version_2(sections, names, is_text, order)
+    if not 4.0 <= number <= 4.1:
+        raise DecodingError(f"version {number:g} of gmsh's format is not read; save the mesh as version 4.1 or 2.2")
+    used = ("Entities", "PartitionedEntities", "Nodes", "Elements")
+    return _version_4({key: _Numbers(sections[key], is_text, order) for key in used if key in sections}, number, names)
+
+
+def _sections(content: bytes) -> dict[str, bytes]:
+    """Returns the content of the sections by name; of a section without an end, all that follows."""
+    sections, at = dict[str, bytes](), 0
+    while head := _HEAD.search(content, at):
+        end = content.find(b"$End" + head[1], head.end())
+        at = len(content) if end < 0 else end
+        sections.setdefault(head[1].decode(), content[head.end() : at])
+    return sections
+
+
+def _version_4(
+    sections: Mapping[str, _Numbers], version: float, names: Names
+) -> tuple[NDArray[np.float64], list[Block]]:
+    """Reads a file of version 4.0 or 4.1, whose blocks belong to one entity each."""
+    groups: dict[tuple[int, int], IntArray] = {}
+    for key in ("Entities", "PartitionedEntities"):
+        if key in sections:
+            groups |= _entities(sections[key], key == "PartitionedEntities", version)
+    numbers, points = _nodes(sections["Nodes"], version)
+    elements, blocks, is_new = sections["Elements"], [], version > 4.0
+    for _ in range(elements.integers(4 if is_new else 2, "i8")[0]):
+        first, second, kind = elements.integers(3)
+        dimension, entity = (first, second) if is_new else (second, first)
+        name, _, nodes = _kind(kind)
+        count = elements.integer("i8")
+        cells = elements.integers(count * (1 + nodes), "i8" if is_new else "i4").reshape(count, -1)[:, 1:]
+        own = [names.get((dimension, abs(group))) for group in groups.get((dimension, entity), ())]
+        members = {group: np.arange(count) for group in own if group is not None}
+        cells = rows_of(numbers, cells)[:, _ORDERS.get(name, slice(None))]
+        blocks.append(Block(name, int(dimension), cells, members))
+    return points, blocks
+
+
+def _entities(numbers: _Numbers, is_partitioned: bool, version: float) -> dict[tuple[int, int], IntArray]:
+    """Returns the physical groups of entities by their dimension and number."""
+    groups = {}
+    if is_partitioned:
+        numbers.integer("i8")
+        numbers.integers(2 * numbers.integer("i8"))  # ghosts
+    for dimension, count in enumerate(numbers.integers(4, "i8")):
+        for _ in range(count):
+            entity = numbers.integer()
+            if is_partitioned:
+                numbers.integers(2)  # parent
+                numbers.integers(numbers.integer("i8"))  # partitions
+            numbers.take(3 if dimension == 0 and version > 4.0 else 6, "f8")  # bounding box
+            groups[dimension, entity] = numbers.integers(numbers.integer("i8"))
+            if dimension:
+                numbers.integers(numbers.integer("i8"))  # boundary
+    return groups
+
+
+def _nodes(numbers: _Numbers, version: float) -> tuple[IntArray, NDArray[np.float64]]:
+    """Returns the numbers (N,) and places (N, 3) of the nodes of version 4."""
+    is_new = version > 4.0
+    tags, points = [], []
+    for _ in range(numbers.integers(4 if is_new else 2, "i8")[0]):
+        first, second, is_parametric = numbers.integers(3)
+        count, width = numbers.integer("i8"), 3 + is_parametric * (first if is_new else second)
+        if is_new:
+            tags.append(numbers.integers(count, "i8"))
+            points.append(numbers.take(count * width, "f8").reshape(count, width)[:, :3])
+        else:
+            rows = numbers.rows(count, 1, width)
+            tags.append(rows[:, 0].astype(np.int64))
+            points.append(rows[:, 1:4])
+    return np.concatenate(tags), np.concatenate(points)
+
+
+def _version_2(
+    sections: Mapping[str, bytes], names: Names, is_text: bool, order: str
+) -> tuple[NDArray[np.float64], list[Block]]:
+    """Reads a file of version 2, whose cells have the number of their group."""
+    is_parametric = "ParametricNodes" in sections
+    head, _, content = sections["ParametricNodes" if is_parametric else "Nodes"].partition(b"\n")
+    numbers = _Numbers(content, is_text, order)
+    if is_parametric:
+        rows = np.empty((int(head), 4))
+        for row in rows:
+            row[:] = numbers.rows(1, 1, 3)
+            dimension = numbers.integers(2)[0]
+            numbers.take(dimension if dimension < 3 else 0, "f8")
+    else:
+        rows = numbers.rows(int(head), 1, 3)
+    tags, points = rows[:, 0].astype(np.int64), rows[:, 1:]
+    head, _, content = sections["Elements"].partition(b"\n")
+    if is_text:
+        values = np.fromstring(content.decode(), sep=" ", dtype=np.int64).tolist()
+    else:
+        values = np.frombuffer(content[: len(content) // 4 * 4], order + "i4").tolist()
+    cells: dict[int, list[list[int]]] = {}  # rows of a group and nodes by gmsh's number of the kind
+    at, left = 0, int(head)
+    while left > 0:
+        if is_text:
+            kind, count, tagged, at = values[at + 1], 1, values[at + 2], at + 3
+        else:
+            kind, count, tagged = values[at : at + 3]
+            at += 3
+        nodes = _kind(kind)[2]
+        for _ in range(count):
+            start = at + tagged + (0 if is_text else 1)
+            group = values[start - tagged] if tagged else 0
+            cells.setdefault(kind, []).append([abs(group), *values[start : start + nodes]])
+            at = start + nodes
+        left -= count
+    return points, [_once(kind, np.array(own, dtype=np.int64), names, tags) for kind, own in cells.items()]
+
+
+def _once(number: int, rows: IntArray, names: Names, tags: IntArray) -> Block:
+    """Returns a block of cells from rows (m, 1 + k) of a group and nodes, and the same nodes once."""
+    kind, dimension, _ = _kind(number)
+    _, first, cell = np.unique(rows[:, 1:], axis=0, return_index=True, return_inverse=True)
+    _, pair = np.unique(np.stack([rows[:, 0], cell.ravel()]), axis=1, return_index=True)
+    stays = np.ones(len(rows), dtype=bool)
+    stays[pair] = False  # a cell that is twice in a group is a fault, which `check_mesh` refuses
+    stays[first] = True
+    place = (np.cumsum(stays) - 1)[first[cell.ravel()]]
+    groups = {}
+    for group in np.unique(rows[:, 0]).tolist():
+        if (dimension, group) in names:
+            groups[names[dimension, group]] = np.unique(place[rows[:, 0] == group])
+    nodes = rows_of(tags, rows[stays, 1:])[:, _ORDERS.get(kind, slice(None))]
+    return Block(kind, dimension, nodes, groups)
+
+
+def _kind(number: int) -> tuple[str, int, int]:
+    if number not in _KINDS:
+        raise DecodingError(f"cells of gmsh's kind {number} are above order 2; set Mesh.ElementOrder to 1 or 2")
+    return _KINDS[number]

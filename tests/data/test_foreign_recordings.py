@@ -146,7 +146,7 @@ def test_read_c3d_converts_units_and_keeps_occlusions(tmp_path, trajectory, capl
     assert recording.rate == 200.0
     trajectory[3, 2] = np.nan
     np.testing.assert_allclose(recording.positions, trajectory, rtol=1e-6, atol=1e-9)
-    assert "1 positions at exactly (0, 0, 0) count as occlusions, of '*31'" in caplog.text
+    assert "1 position at exactly (0, 0, 0) read as occluded, of '*31'" in caplog.text
 
 
 def test_c3d_files_with_more_than_255_markers_and_without_model_outputs(tmp_path):

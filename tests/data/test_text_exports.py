@@ -143,7 +143,7 @@ def test_an_export_is_read(tmp_path, caplog, name, end):
     assert read.rate == 100.0
     seen = np.ones(30, bool) if "zeros" not in name else UNSEEN[:, 0] != 0.0
     np.testing.assert_array_equal(read.seen[:, 0], seen)
-    assert ("2 positions at exactly (0, 0, 0) count as occlusions" in caplog.text) == ("zeros" in name)
+    assert ("2 positions at exactly (0, 0, 0) read as occluded" in caplog.text) == ("zeros" in name)
     np.testing.assert_allclose(1e3 * read.positions[seen, 0], TIP[seen], atol=1e-5)
     if turns:
         first = read.labels.index(f"{read.labels[0]} +x")

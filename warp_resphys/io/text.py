@@ -32,32 +32,38 @@ _DECIMAL_POINT: Final = re.compile(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?")
 
 
 def read_text(path: str | Path) -> str:
-    r"""Returns the text of a file, with lines that end in \n.
-
-    The byte-order mark determines the encoding. Without one it is UTF-16 if every second byte is zero, else UTF-8, and
-    Windows-1252 for what is not valid UTF-8, with a warning.
+    r"""Returns the text of a file, with lines that end in \n; see `decoded`.
 
     Raises:
         DataFileError: The file cannot be read, or is not text.
     """
     try:
-        content = Path(path).read_bytes()
+        text = decoded(Path(path).read_bytes())
     except OSError as error:
         raise DataFileError(f"Cannot read {path}: {error.strerror}; check its path.") from error
+    if text is None or _NO_TEXT.search(text):
+        raise DataFileError(f"{path} is not a text file: export it as text again, a table as CSV or TSV.")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decoded(content: bytes) -> str | None:
+    """Returns bytes as text, None if they are none.
+
+    The byte-order mark determines the encoding. Without one it is UTF-16 if every second byte is zero, else UTF-8, and
+    Windows-1252 for what is not valid UTF-8, with a warning.
+    """
     for encoding in _encodings(content):
         try:
             text = content.decode(encoding)
         except UnicodeDecodeError:
             continue
-        if _NO_TEXT.search(text):
-            break
-        if encoding in ("cp1252", "latin-1"):
+        if encoding in ("cp1252", "latin-1") and not _NO_TEXT.search(text):
             warn(
                 "A text is not in UTF-8 and was read as Windows-1252: check names with accents or umlauts, or save "
                 "the file as UTF-8."
             )
-        return text.replace("\r\n", "\n").replace("\r", "\n")
-    raise DataFileError(f"{path} is not a text file: export it as text again, a table as CSV or TSV.")
+        return text
+    return None
 
 
 def _encodings(content: bytes) -> Sequence[str]:

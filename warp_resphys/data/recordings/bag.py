@@ -14,6 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -105,8 +106,13 @@ def _opened(path: Path) -> Iterator[Any]:
     if not path.exists():
         raise DataFileError(f"Cannot read {path}: there is no such file or folder; check the path of the recording.")
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            yield reader
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / f"bag{path.suffix.lower()}"
+            if path.is_file() and path.suffix != file.suffix:  # rosbags knows extensions in small letters only.
+                file.symlink_to(path.absolute())
+                path = file
+            with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+                yield reader
     except ResphysError:
         raise
     except Exception as error:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ...io.decoding import Arrays, decode
 from ...io.errors import DataFileError, DecodingError, InputError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
+from ...io.text import decoded
 from ...settings.trials import BagSettings, TableSettings
 from .bag import SUFFIXES, is_bag, read_raw_bag, topics_of
 from .recording import (
@@ -189,7 +190,8 @@ def _read_c3d(path: Path) -> RawRecording:
             f"{path} is truncated: it holds {points.shape[2]} of the {last - first + 1} frames that its header "
             "declares; copy or export it again."
         )
-    labels = arrays["labels"][: points.shape[1]].tolist()
+    raw_labels = arrays["labels"][: points.shape[1]].tolist()
+    labels = [decoded(label.encode(errors="surrogateescape")) or "" for label in raw_labels]
     labels += [""] * (points.shape[1] - len(labels))
     chosen = [column for column, label in enumerate(labels) if label not in arrays["computed"]]
     raw = RawRecording(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ...io.errors import DataFileError, InputError, listed
+from ...io.errors import DataFileError, InputError, listed, number_of
 from ..base_motion import since_first
 
 log = logging.getLogger(__name__)
@@ -129,7 +129,8 @@ def hide_zeros(raw: RawRecording, path: Path) -> RawRecording:
     if zero.any():
         names = [label for label, hidden in zip(raw.labels or (), zero.T, strict=False) if hidden.any()]
         log.warning(
-            "%s: %d positions at exactly (0, 0, 0) count as occlusions, of %s.", path.name, zero.sum(), listed(names)
+            "%s: %s at exactly (0, 0, 0) read as occluded, of %s.",
+            *(path.name, number_of(int(zero.sum()), "position"), listed(names)),
         )
     return dataclasses.replace(raw, positions=np.where(zero[..., None], np.nan, raw.positions))
 

@@ -40,6 +40,7 @@ _TIMES = ("time", "t", "timestamp", "zeit", "temps", "tiempo", "tempo")
 _FRAMES = ("frame", "frame#", "frames")
 _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
 _SPELLED = {unit.lower(): unit for unit in ("px", "iso", *SI_PER_ACTUATION_UNIT, *_SECONDS, *METRES_PER_UNIT)}
+_NAMED_UNITS = {*_SPELLED.values()} - {"1", "N"}  # of columns without square brackets
 _OF_DAY = re.compile(r"^(\d{1,2})(:.*)")
 _AXIS = r"(?P<axis>q?[xyz]|qw)"
 _DOTTED = re.compile(rf"(?P<label>.+)\.{_AXIS}", re.IGNORECASE)
@@ -74,7 +75,7 @@ def read_raw_text(path: Path, table: TableSettings | None = None) -> RawRecordin
         return _read_qualisys(rows, path)
     if first == "Format Version":
         return _read_motive(rows, path)
-    return _read_vicon(rows, path) if first in _VICON else _read_named(rows, path)
+    return _read_vicon(rows, path) if first.title() in _VICON else _read_named(rows, path)
 
 
 def _read_named(rows: Rows, path: Path) -> RawRecording:
@@ -171,10 +172,14 @@ def _read_table(
         elif unit is not None and unit in channel_units:
             channels[column] = SI_PER_ACTUATION_UNIT[unit]
         elif column != clock:
+            kept = {*coordinates, clock, *(other for other, (_, own) in columns.items() if own in channel_units)}
+            heads = {other: own if unit is None else f"{own} [{unit}]" for other, (own, unit) in columns.items()}
+            read = [f'"{heads[other]}"' if other in kept else "null" for other in range(width)]
             raise DataFileError(
                 f"{path}: column {column + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
                 f"channel with a unit in brackets ({', '.join(channel_units)}); rename it, or leave it out by naming "
-                f"those to read in data.table (recording.table of inspect and convert)."
+                f"the others: 'recording.table={{columns: [{', '.join(read)}], header_lines: {first}}}' for inspect "
+                "and convert, data.table in a configuration."
             )
     if len(units) > 1:
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
@@ -208,10 +213,10 @@ def _unit(text: str) -> str:
 
 
 def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    """Splits `name [unit]`, or `name (unit)` with a known unit; the unit is None without brackets at the end."""
-    for opening, closing in ("[]", "()"):
+    """Splits `name [unit]`, and `name (unit)` or `name_unit` with a known unit; None where there is no unit."""
+    for opening, closing in (("[", "]"), ("(", ")"), ("_", ""), (" ", "")):
         name, bracket, unit = cell.removesuffix(closing).rpartition(opening)
-        if bracket and cell.endswith(closing) and (opening == "[" or _unit(unit) in {*_SPELLED.values()} - {"1"}):
+        if bracket and cell.endswith(closing) and (opening == "[" or _unit(unit) in _NAMED_UNITS):
             return name.rstrip(), _unit(unit)
     return cell, None
 
@@ -332,49 +337,48 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
 
 
 def _read_vicon(rows: Rows, path: Path) -> RawRecording:
-    """Reads the sections Objects (rigid bodies of Tracker) and Trajectories (markers), or Segments without these."""
-    found = {row[0]: line for line, row in enumerate(rows) if row and row[0] in _VICON}
-    wanted = {"Objects", "Trajectories"} & {*found} or {"Segments"} & {*found}
-    starts = {name: line for name, line in found.items() if name in wanted}
-    if not starts:
-        raise DataFileError(
-            f"{path} has no section 'Trajectories' or 'Objects': export it from Vicon Nexus with its trajectories, or "
-            "from Vicon Tracker with its objects."
-        )
-    sections = [_vicon_section(rows, line, path) for line in starts.values()]
-    if len({raw.rate for _, raw in sections}) > 1:
-        raise DataFileError(f"{path} has {listed([*starts])} at different rates: export them into two files.")
-    first = min(start for start, _ in sections)
-    count = max(start + len(raw.positions) for start, raw in sections) - first
-    positions, turns, labels = list[FloatArray](), list[FloatArray](), list[str]()
-    for start, raw in sections:
-        frames, markers = slice(start - first, start - first + len(raw.positions)), len(raw.labels or ())
-        own = np.full((count, markers, 7), np.nan)
-        own[frames, :, :3] = raw.positions
-        if raw.turns is not None:
-            own[frames, :, 3:] = raw.turns
-        positions.append(own[..., :3])
-        turns.append(own[..., 3:])
-        short = without_subject(raw.labels or ())
-        labels += [full if name in labels else name for name, full in zip(short, raw.labels or (), strict=True)]
-    joined = np.concatenate(turns, axis=1)
-    return replace(
-        sections[0][1],
-        positions=np.concatenate(positions, axis=1),
-        labels=labels,
-        turns=joined if np.isfinite(joined).any() else None,
-    )
+    """Reads the sections Objects (rigid bodies of Tracker) and Trajectories (markers), or Segments without these.
 
-
-def _vicon_section(rows: Rows, at: int, path: Path) -> tuple[int, RawRecording]:
-    """Reads a section: its rate, names, axes and units, and a line for every frame until an empty one.
-
-    Velocities and accelerations are not read. Angles are rotation vectors ("helical"), unless there are quaternions.
-
-    Returns:
-        The number of the first frame, and the recording.
+    Angles are rotation vectors ("helical"), unless there are quaternions.
     """
-    if len(rows) < at + 6 or "Frame" not in rows[at + 3][:1]:
+    found = {row[0].title(): line for line, row in enumerate(rows) if row and row[0].title() in _VICON}
+    wanted = {"Objects", "Trajectories"} & {*found} or {"Segments"} & {*found}
+    starts = [line for name, line in found.items() if name in wanted]
+    sections = [_vicon_section(rows, start, path) for start in starts]
+    places, units, table, width = list[Place](), dict[int, str](), dict[str, list[str]](), 1
+    for first, section, of_columns in sections:
+        data = [*takewhile(any, rows[first:])]
+        for row in data:  # with the same frame of another section
+            cells = table.setdefault(row[0], [row[0]])
+            cells += [""] * (width - len(cells)) + row
+        labels = list(dict.fromkeys(label for label, *_ in section))
+        taken = {label for label, *_ in places}
+        short = {label: name for label, name in zip(labels, without_subject(labels), strict=True) if name not in taken}
+        places += [(short.get(label, label), axis, width + column) for label, axis, column in section]
+        units |= {width + column: cell for column, cell in enumerate(of_columns)}
+        width += max(map(len, data), default=0)
+    lengths = {units.get(column, "") for _, axis, column in places if axis in AXES}
+    rates = {number("".join(rows[start + 1][:1])) for start in starts}
+    if len(lengths) != 1 or len(rates) != 1:
+        raise DataFileError(
+            f"{path} has no markers in one unit and at one rate (units: {listed(sorted(lengths))}; rates: "
+            f"{listed(sorted(map(str, rates)))} Hz): export it from Vicon with its section 'Trajectories' or 'Objects'."
+        )
+    scale = np.pi / 180.0 if "deg" in {units.get(column) for _, axis, column in places if axis == "rx"} else 1.0
+    turn = Turn.of(("rx", "ry", "rz"), lambda vectors: Rotation.from_rotvec(scale * vectors))
+    if any(axis == "rw" for _, axis, _ in places):
+        turn = replace(QUATERNION, axes=("rw", "rx", "ry", "rz"))
+    first = sections[0][0]
+    filled = [*rows[:first], *(cells + [""] * (width - len(cells)) for cells in table.values())]  # empty: occlusions
+    return Layout(first, width, places, lengths.pop(), 0, rate=rates.pop(), turn=turn).read(filled, path)
+
+
+def _vicon_section(rows: Rows, at: int, path: Path) -> tuple[int, list[Place], list[str]]:
+    """Returns the number of the first line of numbers in a section, the places of its coordinates, and its units.
+
+    The lines before are its name, rate, names, axes, also of velocities, and in newer versions units.
+    """
+    if len(rows) < at + 6 or not "".join(rows[at + 3][:1]).startswith(("Frame", "Field")):
         raise DataFileError(
             f"{path} has no whole section '{rows[at][0]}': export it from Vicon Nexus or Tracker with its header."
         )
@@ -382,23 +386,7 @@ def _vicon_section(rows: Rows, at: int, path: Path) -> tuple[int, RawRecording]:
     for column, name in enumerate(_filled(rows[at + 2], len(axes))):
         label = re.sub(r"^(?:Global|Local) Angle ", "", name)
         subject, _, segment = label.partition(":")
-        if column > 1 and axes[column]:
+        if axes[column]:
             places.append((segment if subject == segment else label, axes[column], column))
-    if not places:
-        raise DataFileError(f"{path} has no markers in its section '{rows[at][0]}': export it again.")
-    units = dict(enumerate(rows[at + 4]))
-    lengths = {units.get(column, "") for _, axis, column in places if axis in AXES}
-    if len(lengths) != 1:
-        raise DataFileError(
-            f"{path}, line {at + 5}: positions are in {listed(sorted(lengths))}: export them in one unit."
-        )
-    scale = np.pi / 180.0 if "deg" in {units.get(column) for _, axis, column in places if axis == "rx"} else 1.0
-    turn = Turn.of(("rx", "ry", "rz"), lambda vectors: Rotation.from_rotvec(scale * vectors))
-    if "rw" in axes:
-        turn = replace(QUATERNION, axes=("rw", "rx", "ry", "rz"))
-    data = [*takewhile(any, rows[at + 5 :])]
-    width = max(map(len, data), default=0)
-    filled = [*rows[: at + 5], *(row + [""] * (width - len(row)) for row in data)]  # Empty ends are occlusions.
-    rate = number("".join(rows[at + 1][:1]))
-    raw = Layout(at + 5, width, places, lengths.pop(), 0, rate=rate, turn=turn).read(filled, path)
-    return int(number(data[0][0]) or 0), raw
+    old = is_data(rows[at + 4])
+    return at + 5 - old, places, [] if old else rows[at + 4]

@@ -173,7 +173,7 @@ with torch.no_grad():
     for number in range(STEPS):
         inputs = Inputs(muscle_stress=applied[number])
         after, _ = simulator.step(state, inputs)
-        contact = simulator.contacts(state, after, inputs)[""]
+        contact = simulator.contacts(state, after, inputs)["obstacles"]
         if front is None:
             front = torch.as_tensor(mesh.vertices[contact.vertices, 0] > LENGTH / 2)
         forces.append([float(contact.friction[0, chosen, 0, 0].sum()) for chosen in (~front, front)])

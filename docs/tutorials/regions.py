@@ -112,7 +112,7 @@ print(f"the cap deforms by {strain:.1e} of its size")
 # falls beside the beam:
 
 # %%
-cube = wr.Body(wr.box_hexahedra(size=(0.02, 0.02, 0.02), divisions=(2, 2, 2)))
+cube = wr.Body(wr.box_hexahedra(size=(0.02, 0.02, 0.02), divisions=(4, 4, 4)))
 scene = wr.Scene({"beam": beam, "cube": cube})
 both = wr.Simulator(
     scene,

@@ -5,13 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from warp_resphys.dynamics.plausibility import small_strain_stiffness
 from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.materials import ConvexMaterial, Corotated, StableNeoHookean
-from warp_resphys.fem.body import Body
+from warp_resphys.energies.obstacles import HalfSpace
+from warp_resphys.fem.body import Body, Rigid
 from warp_resphys.io.errors import ResphysWarning
-from warp_resphys.mesh.mesh import Mesh, box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys.stepping.inputs import Inputs
 
 
 def beam(scale=1.0, mesh=None):
@@ -64,6 +68,43 @@ def test_the_warnings_are_silenced_by_their_class():
         Simulator(beam(), Corotated(2e9, 0.3))  # a plate of plastic
         warnings.simplefilter("ignore", ResphysWarning)
         Simulator(beam(1e3), Corotated(0.2))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "ratio"),
+    [(box_hexahedra((0.04, 0.03, 0.02), (n, n, n)), 1.0 + 2.0 / n**2) for n in (1, 2, 3, 4)]
+    + [(box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3)), 1.0 + 2.0 / 9.0)]  # about its length
+    + [(quadratic(box_hexahedra((0.04, 0.03, 0.02), (1, 1, 1))), 1.0)],
+)
+def test_a_free_body_of_few_cells_turns_too_slowly(mesh, ratio):
+    """Its moment of inertia is m (a^2 + b^2) / 12, and more where its mass lies on the corners of linear cells."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        Simulator(Body(mesh))
+        Simulator(Body(mesh, fixed=[0]))
+        Simulator(Body(mesh, energies=[Contact({"floor": HalfSpace(position=(0.0, 0.0, -9e-4))})]))
+    if ratio < 1.15:
+        assert not caught
+        return
+    (warning,) = caught
+    assert f"the body, which nothing holds, has {ratio:.3g} times its true rotary inertia" in str(warning.message)
+
+
+@pytest.mark.parametrize("divisions", [1, 2, 3])
+def test_a_rigid_body_has_the_rotary_inertia_of_its_shape(divisions):
+    """Of m (a^2 + b^2) / 12 for a box, whatever its cells: a torque about z, for a short time."""
+    size, torque, step, steps = (0.06, 0.03, 0.02), 1e-3, 1e-4, 5
+    body = Body.rigid_body(box_hexahedra(size, (divisions,) * 3), Rigid(density=1000.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        simulator = Simulator(body, {}, step, gravity=(0.0, 0.0, 0.0))
+    arms = simulator.rest_positions - simulator.rest_positions.mean(0)
+    turn = torch.stack([-arms[:, 1], arms[:, 0], 0.0 * arms[:, 0]], 1)
+    weights = turn / turn.square().sum()
+    motion = simulator.rollout(simulator.rest_state(), steps, Inputs(torque * weights[None]))
+    rate = float((motion.v[-1, 0] * weights).sum())  # rad/s
+    expected = 1000.0 * np.prod(size) * (size[0] ** 2 + size[1] ** 2) / 12.0
+    assert torque * step * steps / rate == pytest.approx(expected, rel=1e-4)
 
 
 def test_stiffness_at_small_strains():

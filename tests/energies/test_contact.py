@@ -124,7 +124,7 @@ def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
     for _ in range(30):
         states.append(s.step(states[-1], None, given)[0])
     earlier, before, after = states[-3:]
-    old, new = (s.contacts(*pair, None, given)[""] for pair in ((earlier, before), (before, after)))
+    old, new = (s.contacts(*pair, None, given)["obstacles"] for pair in ((earlier, before), (before, after)))
     assert new.obstacles == ("obstacle",)
     weights = {"implicit_euler": (1.0, -1.0, 0.0), "bdf2": (1.5, -2.0, 0.5)}[integrator]
     v = [state.v for state in (after, before, earlier)]
@@ -167,7 +167,7 @@ def test_friction_of_a_region_of_the_body():
     for _ in range(3):
         states.append(s.step(states[-1])[0])
     earlier, before, after = states[-3:]
-    old, new = (s.contacts(*pair)[""] for pair in ((earlier, before), (before, after)))
+    old, new = (s.contacts(*pair)["obstacles"] for pair in ((earlier, before), (before, after)))
     normal, friction = old.normal[0, :, 0, 2].numpy(), new.friction[0, :, 0].norm(dim=-1).numpy()
     pressed = normal > 0.0
     assert pressed.sum() == 9
@@ -326,7 +326,7 @@ def test_a_free_block_rests_on_a_floor_by_friction():
     assert float((lying.q - s.rest_positions).abs().max()) < 2e-5
     aside = (pushed.q - lying.q)[:, select_vertices(BLOCK, z=0.0), 0]
     assert 0.0 < float(aside.min()) < float(aside.max()) < 1e-3 * 5e-3  # m: slip speed times step
-    forces = s.contacts(s.rest_state(), pushed)[""]
+    forces = s.contacts(s.rest_state(), pushed)["obstacles"]
     assert float(forces.normal.sum((1, 2))[0, 2]) == pytest.approx(weight, rel=1e-9)
     assert float(forces.friction.sum((1, 2))[0, 0]) == pytest.approx(-0.3 * weight, rel=1e-9)
 

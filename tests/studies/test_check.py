@@ -37,7 +37,7 @@ def test_a_beam_between_obstacles_slides_on_all_of_them():
     simulator = check.between_obstacles(moves=False)
     before, _ = simulator.step(simulator.rest_state())
     after, _ = simulator.step(before)
-    forces = simulator.contacts(before, after)[""]
+    forces = simulator.contacts(before, after)["obstacles"]
     assert bool((forces.normal.norm(dim=-1).sum(1) > 0.0).all())
     assert bool((forces.friction.norm(dim=-1).sum(1) > 1e-3 * forces.normal.norm(dim=-1).sum(1)).all())
 

@@ -191,10 +191,8 @@ class EnergySet:
         out: dict[str, ContactForces] = {}
         for i, (placed, bound) in enumerate(self._pairs):
             if isinstance(bound, BoundContact | BoundSurfaceContact):
-                name = (
-                    placed.prefix.removesuffix("_") if isinstance(bound, BoundContact) else f"{placed.prefix}surfaces"
-                )
-                out[name] = bound.forces(placed.step(step, i), x)
+                others = "obstacles" if isinstance(bound, BoundContact) else "surfaces"
+                out[f"{placed.prefix}{others}"] = bound.forces(placed.step(step, i), x)
         return out
 
     def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:

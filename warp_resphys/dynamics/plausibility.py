@@ -5,10 +5,15 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
+import scipy.linalg
 import torch
+from numpy.typing import NDArray
 
+from ..energies.contact import Contact
 from ..energies.materials import Material
+from ..energies.obstacles import HalfSpace
 from ..fem.body import Body
+from ..fem.elements import volume_points
 from ..io.errors import warn
 from ..mesh.mesh import Mesh
 from ..mesh.quality import scaled_jacobian
@@ -20,6 +25,7 @@ UNLIKELY: Final = (1e8, 1e9)  # Pa, stiffer than rubbers and softer than the pla
 DENSITIES: Final = ((0.5, 10.0), (1e-10, 1e-5), (2.5e4, np.inf))
 STRONGEST: Final = 100.0  # m/s^2
 FLAT_CELL: Final = 0.02  # scaled Jacobian
+INERTIA_ERROR: Final = 0.15  # of the rotary inertia
 MANY_UNKNOWNS: Final = 60_000  # steps take seconds on a core (docs/scaling.md)
 
 
@@ -35,7 +41,9 @@ def warn_of_implausible(
         on_cpu: whether it is simulated on the CPU.
     """
     for name, own, _ in body.members:
-        _warn_of_mesh(own.mesh, f"the body {name!r}" if name else "the body")
+        known = f"the body {name!r}" if name else "the body"
+        _warn_of_mesh(own.mesh, known)
+        _warn_of_inertia(own, known)
     for name, material in materials.items():
         _warn_of_material(material, f" of {name}" if name else "")
     size = float(np.linalg.norm(gravity))
@@ -63,6 +71,43 @@ def _warn_of_mesh(mesh: Mesh, name: str) -> None:
             f"cell {worst} of {name} around ({x:.4g}, {y:.4g}, {z:.4g}) mm is nearly flat (its scaled Jacobian is "
             f"{value:.2g}; 1 is ideal, 0 is flat): steps may be slow or fail there, so mesh the body anew."
         )
+
+
+def _warn_of_inertia(body: Body, name: str) -> None:
+    """Warns of a body that turns freely and whose mass, which lies on the vertices, has a wrong rotary inertia.
+
+    By uniform density: 1 + 2 / n^2 times that of a cube of n linear cells along an edge. Rigid parts are exact, and a
+    body that lies on a floor does not turn over.
+    """
+    soft = np.arange(len(body.mesh.cells)) if body.soft_cells is None else body.soft_cells
+    if len(body.fixed_vertices) or body.symmetry or not len(soft) or _lies_on_floor(body):
+        return
+    places, volumes = volume_points(body.mesh, np.arange(len(body.mesh.cells)))
+    centre = volumes @ places / volumes.sum()
+    exact = _inertia(places - centre, volumes)
+    lumped = _inertia(body.vertices - centre, np.asarray(body.mass_volume[:, soft].sum(axis=1)).ravel())
+    places, volumes = volume_points(body.mesh, soft)
+    ratios = 1.0 + scipy.linalg.eigh(lumped - _inertia(places - centre, volumes), exact, eigvals_only=True)
+    ratio = float(ratios[np.abs(ratios - 1.0).argmax()])
+    if abs(ratio - 1.0) > INERTIA_ERROR:
+        warn(
+            f"{name}, which nothing holds, has {ratio:.3g} times its true rotary inertia, because its mass lies on the "
+            "vertices of few cells: take more cells, quadratic hexahedra (quadratic(mesh) in Python, element_order: 2 "
+            "in a configuration), or Body.rigid_body, which is exact."
+        )
+
+
+def _lies_on_floor(body: Body) -> bool:
+    """Whether an undeformed body is within the distance of contact of a half-space."""
+    contacts = [energy for energy in body.energies if isinstance(energy, Contact)]
+    floors = [(own, floor) for own in contacts for floor in own.obstacles.values() if isinstance(floor, HalfSpace)]
+    return any(float(((body.vertices - f.position) @ f.turn[:, 2]).min()) < own.distance for own, f in floors)
+
+
+def _inertia(arms: NDArray[np.float64], masses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the inertia tensor (3, 3) of masses (P,) at places (P, 3) about the origin."""
+    second = np.einsum("p,pi,pj->ij", masses, arms, arms)
+    return np.asarray(np.trace(second) * np.eye(3) - second)
 
 
 @lru_cache(maxsize=16)

@@ -348,8 +348,8 @@ class Simulator:
             parameters: parameters or prepared constants (`prepare`).
 
         Returns:
-            Contact with obstacles by the name of the body, which is empty for a single body; that between surfaces
-            under ``surfaces``, or ``NAME_surfaces`` for the surface of one body of a scene.
+            Contact with ``obstacles``, and that between ``surfaces``; of the body NAME of a scene, ``NAME_obstacles``
+            and ``NAME_surfaces``.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.

@@ -23,9 +23,8 @@ from typing_extensions import override
 
 from ..fem.body import Body, Rigid
 from ..fem.coordinates import barycentric, weighted_sum
-from ..fem.elements import Points, SolidPoints, physical_gradients
+from ..fem.elements import Points, SolidPoints, volume_points
 from ..kernels import rigid as kernels
-from ..mesh.elements import conical_simplex, gauss_box
 from ..mesh.mesh import Mesh
 from ..stepping.constants import Mass
 from ..stepping.quantity import Parameter, Quantity
@@ -220,20 +219,11 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     corners = body.mesh.vertices[controls]
     # The gradients of barycentric coordinates do not depend on the orientation of the corners.
     gradients = np.linalg.inv(np.vstack([corners.T, np.ones(4)]))[:, :3]
-    moments, volume = _moments(body.mesh, cells, corners)
+    places, volumes = volume_points(body.mesh, cells)
+    w, volume = barycentric(corners, places), float(volumes.sum())
+    moments = np.einsum("p,pa,pb->ab", volumes, w, w)
     carried = scipy.sparse.csr_array(np.array([[volume]]))
     point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
     operators = np.asarray(np.linalg.cholesky(moments).T[None, :, :, None], dtype=np.float64)
     inertia = RigidInertia(Points(controls[None], operators), cells, part.density)
     return [Rigidity(point, part.stiffness, moments.sum(0) / volume), inertia]
-
-
-def _moments(mesh: Mesh, cells: NDArray[np.int64], corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Returns the integral (4, 4) of w w^T over cells, with barycentric coordinates w, and their volume [m^3]."""
-    points, weights = conical_simplex(4) if mesh.element.is_simplex else gauss_box(4)
-    values, reference = mesh.element.shape(points)
-    _, determinants = physical_gradients(mesh.vertices, mesh.cells[cells], reference)
-    volumes = (determinants * weights).ravel()
-    places = np.einsum("qk,cki->cqi", values, mesh.vertices[mesh.cells[cells]]).reshape(-1, 3)
-    w = barycentric(corners, places)
-    return np.einsum("p,pa,pb->ab", volumes, w, w), float(volumes.sum())

@@ -13,7 +13,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
-from ..mesh.elements import BY_NODES, Array
+from ..mesh.elements import BY_NODES, Array, conical_simplex, gauss_box
 from ..mesh.mesh import Mesh, check_mesh
 
 VolumeIntegration = Literal["centre", "full"]
@@ -69,6 +69,15 @@ def physical_gradients(vertices: Array, cells: NDArray[np.int64], reference_grad
     """Returns rest-space gradients (C, Q, K, 3) [1/m] and Jacobian determinants (C, Q) [m^3] of isoparametric cells."""
     jacobian = np.einsum("cki,qkj->cqij", vertices[cells], reference_gradients)
     return np.einsum("qkj,cqji->cqki", reference_gradients, np.linalg.inv(jacobian)), np.linalg.det(jacobian)
+
+
+def volume_points(mesh: Mesh, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Returns places (P, 3) [m] and volumes (P,) [m^3] of points by which to integrate polynomials over cells."""
+    points, weights = conical_simplex(4) if mesh.element.is_simplex else gauss_box(4)
+    values, reference = mesh.element.shape(points)
+    _, determinants = physical_gradients(mesh.vertices, mesh.cells[cells], reference)
+    places = np.einsum("qk,cki->cqi", values, mesh.vertices[mesh.cells[cells]])
+    return places.reshape(-1, 3), (determinants * weights).ravel()
 
 
 def _one_hot(volumes: Array) -> scipy.sparse.csr_array:

@@ -66,7 +66,7 @@ class Run:
 
     def execute(self) -> None:
         """Runs the command, unless its files are up to date; Ctrl-C interrupts it, and it saves its state."""
-        command = [sys.executable, "-m", "warp_resphys", *self.arguments, f"hydra.run.dir={_quoted(self.folder)}"]
+        command = [sys.executable, "-m", "warp_resphys", *self.arguments, f"hydra.run.dir={self.folder}"]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as child:
             assert child.stderr is not None
             sentence = ""
@@ -177,14 +177,8 @@ def robot_run(name: str, place: Path | None, beyond: Sequence[str]) -> Run:
         if "converted" in robot:
             place = RUNS / "recordings" / name
             convert_segment(files[0], place)
-        run.arguments.append(f"data.folder={_quoted(place.resolve())}")
+        run.arguments.append(f"data.folder={place.resolve()}")
     return run
-
-
-def _quoted(path: Path) -> str:
-    """A path as a value on Hydra's command line."""
-    text = str(path).replace("\\", r"\\").replace("'", r"\'")
-    return f"'{text}'"
 
 
 def kept_results(path: Path, names: Iterable[str], beyond: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -106,6 +106,15 @@ class TestRunFolder:
         assert command("--multirun", "experiment=beam,beam_twist", "material.density=900", "seed=3")[0] == 0
         assert command.outputs == [f"runs/{name}/material.density=900,seed=3" for name in ("beam", "beam_twist")]
 
+    def test_a_sweep_over_names(self, command, tmp_path):
+        (tmp_path / "a,b").mkdir()
+        assert command("name=20261128,1e5,'c, d',Ü (1)", "--multirun", "hydra.sweep.dir=Ü/${name}", "seed=1") == (0, "")
+        assert [folder.rpartition("/")[0] for folder in command.outputs] == [
+            f"Ü/{name}" for name in ("20261128", "1e5", "c, d", "Ü (1)")
+        ]
+        assert command("name=a,b", "--multirun") == (0, "")
+        assert command.outputs == ["runs/a,b/name=a,b"]
+
     def test_the_working_folder_stays(self, command, tmp_path):
         folders = []
         command.job = lambda config: folders.append(Path.cwd())

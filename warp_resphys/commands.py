@@ -89,7 +89,6 @@ VALUED: Final = (
     *("--info", "-i", "--experimental-rerun"),
 )
 _LABEL_LENGTH: Final = 100
-_PLAIN: Final = re.compile(r"[\w./-]+")  # a word without special characters of Hydra's syntax
 _OPTIONS: Final = """\
 --cfg job         show all keys and their values, for these settings
 --multirun, -m    run a sweep
@@ -109,13 +108,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
         InputError: there is no such command.
     """
     rest = list(arguments)
-    words = [
-        at
-        for at, argument in enumerate(rest)
-        if ("=" not in argument or _is_path(argument))
-        and argument[:1] not in ("-", "+", "~")
-        and (at == 0 or rest[at - 1] not in VALUED)
-    ]
+    words = [at for at, argument in enumerate(rest) if _is_word(argument, rest[at - 1] if at else "")]
     name = rest[words[0]] if words else "run"
     if name not in COMMANDS:
         firsts = [command for command in COMMANDS if " " not in command]
@@ -124,12 +117,12 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
     named = words[:1]
     if len(words) > 1 and rest[words[1]] in parts:
         name, named = f"{name} {rest[words[1]]}", words[:2]
-    after, command = words[len(named) :], COMMANDS[name]
-    quoted = [
-        word if _PLAIN.fullmatch(word) else "'{}'".format(word.replace("'", r"\'"))
-        for word in map(rest.__getitem__, after)
-    ]
-    dropped = set(named)
+    command = COMMANDS[name]
+    if command.word or command.words:  # Names of files may be like options or overrides: m=50g.csv, -1.csv, ~a.csv.
+        files = [at for at in range(named[-1] + 1, len(rest)) if os.path.exists(rest[at])]
+        words = sorted({*words, *(at for at in files if rest[at - 1] not in VALUED)})
+    after = [at for at in words if at not in named]
+    dropped, quoted = set(named), [quote_name(rest[at]) for at in after]
     if command.word and after:
         rest[after[0]] = f"{command.word}={quoted[0]}"
     elif command.words and after:
@@ -138,9 +131,21 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
     return name, [argument for at, argument in enumerate(rest) if at not in dropped]
 
 
-def _is_path(argument: str) -> bool:
-    """Whether an argument is an existing path, which may contain an equals sign: runs/beam_oscillation/seed=1."""
-    return os.sep in argument and Path(argument).exists()
+def _is_word(argument: str, before: str) -> bool:
+    """Whether an argument is a word: no option, no value of one, and no override."""
+    return "=" not in argument and argument[:1] not in ("-", "+", "~") and before not in VALUED
+
+
+def quote(text: str) -> str:
+    """Returns a text in quotes, as Hydra reads it unchanged."""
+    return "'" + re.sub(r"(\\*)('|\Z)", lambda found: found[1] * 2 + (r"\'" if found[2] else ""), text) + "'"
+
+
+def quote_name(name: str) -> str:
+    """Returns the name of a file or folder in quotes; in one that exists, ``${`` and a first ``~`` are letters."""
+    if os.path.exists(name):
+        name = (os.path.abspath(name) if name[:1] == "~" else name).replace("${", r"\${")
+    return quote(name)
 
 
 def help_text(command: str) -> str:
@@ -199,6 +204,7 @@ def run_label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
     settings = {}
     for override in overrides:
         key, _, value = override.removeprefix("++").partition("=")
+        value = re.sub(r"\A'([A-Za-z0-9._=,+~-]*)'\Z", r"\1", value)
         bare = key.lstrip("+~")
         if not any(bare == name or bare.startswith(f"{name}.") for name in excluded):
             settings[key] = f"{key}={value}" if value else key

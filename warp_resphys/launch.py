@@ -6,13 +6,15 @@ import gc
 import logging
 import os
 import re
+import shlex
 import signal
 import sys
 import threading
 import warnings
 from argparse import ArgumentParser
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module, resources
 from itertools import pairwise
 from pathlib import Path
@@ -37,19 +39,22 @@ from .commands import (
     USER_ERROR,
     configuration,
     ends_where_nobody_reads,
+    quote,
     run_label,
 )
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected
-from .io.settings import parse
+from .io.settings import Settings, parse
+from .option_files import names_are_texts
+from .overrides import LateOverride, readable
+from .settings.run import RunSettings
 
 INTERRUPTED: Final = 130
 # Commands that have the keys of `settings.run.RunSettings`, perhaps beside others.
 TYPED: Final = ("run", "tune")
 # Overrides of Hydra for a job that only prints.
 _SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")
-_PLAIN: Final = re.compile(r"[\w./~=+%@:,-]+")  # a value without quotes, brackets or interpolations
 
 
 def launch(command: str, function: str, arguments: Sequence[str]) -> None:
@@ -64,22 +69,22 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     reported: list[BaseException] = []
     started = False
     shown: str | None
+    late: list[LateOverride]
 
     def job(config: DictConfig) -> Any:
         nonlocal started
         started = True
         try:
+            for override in late:
+                override.apply(config)
             if shown is not None:
                 with ends_where_nobody_reads():
                     _show(config, shown)
                 return None
-            module, _, name = function.partition(":")
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
             gc.collect()  # What an earlier job of a sweep has left would be kept for good.
-            with uncollected():
-                run = getattr(import_module(f"{__package__}.{module}"), name)
-            settings, *_ = get_type_hints(run).values()
+            run, settings = _function(function)
             with ends_where_nobody_reads():
                 return run(parse(settings, values), folder)
         except Exception as error:
@@ -99,16 +104,18 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them and exiting
     logging.raiseExceptions = False  # no traceback for each log line if the disk is full
     warnings.formatwarning = _sentence_of_warning
-    OmegaConf.register_new_resolver("run_label", run_label, replace=True)
     try:
         if any(argument.startswith("--experimental-rerun") for argument in arguments):
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
-        rest, shown = [*_own_options(), *map(_quoted, arguments)], None
+        rest, shown = [*_own_options(), *arguments], None
         if command in TYPED:
             rest, shown = _without_shown(rest)
+        settings = RunSettings if command in TYPED else _function(function)[1]
+        rest, late = readable(rest, settings.model_json_schema(), _groups(rest))
+        OmegaConf.register_new_resolver("run_label", partial(_label, late), replace=True)
         sys.argv = [before[0], *freed(rest), *(_SILENT if shown is not None else ())]
         place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}
-        with _ends_as_after_ctrl_c():
+        with _ends_as_after_ctrl_c(), names_are_texts():
             hydra.main(version_base="1.3", **place)(job)()
     except KeyboardInterrupt as error:
         print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
@@ -126,6 +133,20 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         logging.raiseExceptions = raise_exceptions
         if not full_error:
             del os.environ["HYDRA_FULL_ERROR"]
+
+
+def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
+    """The function of a command, and the class of its settings."""
+    module, _, function = name.partition(":")
+    with uncollected():
+        run = getattr(import_module(f"{__package__}.{module}"), function)
+    settings, *_ = get_type_hints(run).values()
+    return run, settings
+
+
+def _label(late: Sequence[LateOverride], overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
+    """`run_label` of all overrides."""
+    return run_label([*overrides, *(override.argument for override in late)], excluded)
 
 
 @contextmanager
@@ -196,20 +217,11 @@ def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
 
 def _show(config: DictConfig, key: str) -> None:
     """Prints the settings of a run, with the defaults of all keys that are not in a YAML file."""
-    from .settings.run import RunSettings
-
     values: Any = OmegaConf.to_container(config, resolve=True)
     run = {name: value for name, value in values.items() if name != "tune"}
     whole = OmegaConf.create({**values, **parse(RunSettings, run).plain()})
     chosen = OmegaConf.select(whole, key) if key else whole
     print(OmegaConf.to_yaml(chosen).rstrip() if OmegaConf.is_config(chosen) else chosen)
-
-
-def _quoted(argument: str) -> str:
-    """Quotes the value of an argument for Hydra if it has an equals sign, as names of run folders do."""
-    key, _, value = argument.partition("=")
-    plain = _PLAIN.fullmatch(value) is not None and "=" in value
-    return f'{key}="{value}"' if plain and not key.startswith("-") else argument
 
 
 def _explain(error: BaseException, started: bool) -> str | None:
@@ -228,7 +240,11 @@ def _explain(error: BaseException, started: bool) -> str | None:
         group, _, option = error.missing_cfg_file.rpartition("/")
         return f"unknown {group} '{option}'{did_you_mean(option, error.options)}; known are {', '.join(error.options)}"
     if isinstance(error, OverrideParseException):
-        return f"cannot read the override {error.override.removeprefix('++')!r} ({_sentence(error)}): write key=value"
+        override = error.override.removeprefix("++")
+        key, equals, value = override.partition("=")
+        text = quote(value) if '"' in value else f'"{value}"'
+        hint = f", and a text with special characters in quotes, {shlex.quote(f'{key}={text}')}" if equals else ""
+        return f"cannot read the override {override!r} ({_sentence(error)}): write key=value{hint}"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _sentence(error)
     if is_disk_full(error):

@@ -38,6 +38,10 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
     if kind == "extra_forbidden":
         return _unknown(schema, values, where, path)
     value, node = _value(values, path), _node(schema, path, values)
+    if error["loc"][-1:] == ("[key]",):
+        return (
+            f"{_dotted(error['loc'][:-2], where)} has the name {_shown(error['input'])}, not a text: put it in quotes."
+        )
     if kind == "missing" and path[-1:] == [error["loc"][-1]]:
         return f"{key} is missing: it must be {in_words(node, schema)}."
     if kind.startswith("union_tag"):
@@ -51,7 +55,10 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
         if not isinstance(value, Mapping):
             return f"{key} is {_shown(value)}: {message}"
         return f"{key}.{message}" if key else message
-    return f"{key} is {_shown(value)}: it must be {in_words(node, schema)}."
+    texts = value if isinstance(value, (list, tuple)) else [value]
+    is_number = kind == "string_type" and any(isinstance(text, (bool, int, float)) for text in texts)
+    quoted = ", in quotes" if is_number else ""
+    return f"{key} is {_shown(value)}: it must be {in_words(node, schema)}{quoted}."
 
 
 def _shown(value: Any) -> str:
@@ -98,6 +105,32 @@ def options(schema: Schema, node: Schema) -> list[Schema]:
         node = schema["$defs"][node["$ref"].rpartition("/")[2]]
     choices = node.get("anyOf") or node.get("oneOf")
     return [node] if choices is None else [option for choice in choices for option in options(schema, choice)]
+
+
+def is_text(schema: Schema, path: Path, written: str) -> bool:
+    """Returns whether a value is a text, whatever it looks like: 001, on, or null in a list of names.
+
+    Args:
+        schema: JSON Schema of the class.
+        path: keys and list indices that lead to the value; ``defaults`` is that of Hydra.
+        written: the value in YAML or on the command line.
+    """
+    nodes: list[Schema] = [schema]
+    for part in path:
+        choices = [option for node in nodes for option in options(schema, node)]
+        below = [
+            option.get("items")
+            if isinstance(part, int)
+            else option.get("properties", {}).get(part) or option.get("additionalProperties")
+            for option in choices
+        ]
+        nodes = [node for node in below if isinstance(node, Mapping)]
+    types = {option.get("type") for node in nodes for option in options(schema, node)}
+    types |= {"string"} if path[:1] == ("defaults",) else set()
+    brackets = {"object": "{", "array": "["}
+    is_group = any(written.startswith(bracket) for kind, bracket in brackets.items() if kind in types)
+    is_null = written.lower() in ("null", "~", "") and (isinstance(path[-1], str) or "null" in types)
+    return "string" in types and not types & {"number", "integer", "boolean"} and not is_null and not is_group
 
 
 def in_words(node: Schema, schema: Schema) -> str:

@@ -169,6 +169,13 @@ class TestOwnOptions:
         assert command("experiment=my_robot") == (0, warning)
         assert command.outputs == ["runs/my_robot/default"]
 
+    @pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16"])
+    def test_another_encoding_is_named(self, command, own, encoding):
+        (own / "experiment" / "my_robot.yaml").write_text("# @package _global_\ntitle: Träger\n", encoding=encoding)
+        sentence = "error: configs/experiment/my_robot.yaml is not in UTF-8 without a byte-order mark: save it so in"
+        code, errors = command("experiment=my_robot")
+        assert (code, errors[: len(sentence)]) == (2, sentence)
+
     @pytest.mark.parametrize(
         ("text", "problem"),
         [("name: a\nname: b\n", "found duplicate key name"), ("name: [a\nseed: 1\n", "expected ',' or ']'")],

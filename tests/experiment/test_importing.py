@@ -255,7 +255,7 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     assert np.linalg.norm(results["held"] - results["bound"], axis=2).min() > 5e-4
     rest = np.median(shelf.recordings["load52"].positions[:40], axis=0)
     shelf.write("load52", positions=still(shelf, 5e-5), rest=rest)
-    refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that count")
+    refuse(shelf, r"load52\.h5: 'Tip - 1', .* never move by more than 0\.\d\d mm in the 0\.41 s that are read")
 
 
 def refuse(shelf, message, error=DataFileError):

@@ -187,7 +187,7 @@ def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(recordings, 
     with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
         seen = np.isfinite(read_array(file, "observed")).all(axis=(2, 3))
     assert seen.sum(axis=1).tolist() == [9, 13, 13, 13]
-    assert "t000.h5 ends after 8 of the 12 steps" in caplog.text
+    assert "shorter than the 12 steps of data.steps (t000.h5: 8); missing frames are ignored" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from .recording import FloatArray, RawRecording
 log = logging.getLogger(__name__)
 
 AXES = ("x", "y", "z")
-_OCCLUDED = ("", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--")
+_OCCLUDED = {"", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--"}
 _UNEVEN = 0.25  # of a frame: largest error of a time stamp
 _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording

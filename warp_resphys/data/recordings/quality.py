@@ -312,6 +312,6 @@ def check_motion(recording: Recording, labels: Sequence[str]) -> None:
     if farthest < _LEAST_MOTION:
         raise DataFileError(
             f"{recording.source}: {listed(labels)} never move by more than {_MILLI * farthest:.2f} mm in the "
-            f"{len(recording.positions) / recording.rate:.3g} s that count: follow markers that move, or leave the "
-            "recording out."
+            f"{len(recording.positions) / recording.rate:.3g} s that are read: follow markers that move, read "
+            "more by data.seconds or data.steps, or leave the recording out."
         )

@@ -37,8 +37,11 @@ Columns = Mapping[int, tuple[str, str | None]]  # names and units by number
 # A column in a length is a misspelt marker rather than an actuation.
 _CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
 _TIMES = ("time", "t", "timestamp", "zeit", "temps", "tiempo", "tempo")
-_FRAMES = ("frame", "frame#", "frames")
-_SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+_FRAMES = ("frame", "frame#", "frames", "frame number", "frame_number", "index")
+_SECONDS = {
+    **{"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3},
+    **{"us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9},  # two letters, which look alike
+}
 _SPELLED = {unit.lower(): unit for unit in ("px", "iso", *SI_PER_ACTUATION_UNIT, *_SECONDS, *METRES_PER_UNIT)}
 _NAMED_UNITS = {*_SPELLED.values()} - {"1", "N"}  # of columns without square brackets
 _OF_DAY = re.compile(r"^(\d{1,2})(:.*)")

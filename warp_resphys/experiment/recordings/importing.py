@@ -236,6 +236,7 @@ def _dataset(
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
     times, held = np.zeros(shape[:2]), np.full((shape[0], *shape[2:]), np.nan)
     inputs = np.zeros((len(observed), steps or 1, 0 if drive is None else len(drive.parts)))
+    short = list[str]()
     for row, trial in enumerate(observed):
         limit = frames if trial.settings.is_released or steps is None else steps + 1
         seen = trial.moving.positions[:limit]
@@ -255,10 +256,12 @@ def _dataset(
             series = trial.driven if len(trial.driven) == 1 else trial.driven[1 : inputs.shape[1] + 1]
             inputs[row, : len(series)], inputs[row, len(series) :] = series, trial.driven[-1]
             if 1 < len(series) < inputs.shape[1]:
-                log.warning(
-                    "import: %s ends after %d of the %d steps of data.steps; later frames count as not seen.",
-                    *(trial.raw.source.name, len(series), inputs.shape[1]),
-                )
+                short.append(f"{trial.raw.source.name}: {len(series)}")
+    if short:
+        log.warning(
+            "import: recordings are shorter than the %d steps of data.steps (%s); missing frames are ignored.",
+            *(steps, ", ".join(short)),
+        )
     driven: dict[str, Any] = {}
     if drive is not None:
         name = drive.quantity.name

@@ -162,7 +162,7 @@ print(", ".join(f"{name} {value:.4g}" for name, value in identified.items()))
 # ## Better physics
 #
 # A Prony branch adds memory: an additional shear modulus, given as a ratio to the long-term one, relaxes with a time
-# constant ([materials](../tendons.md#a-body-that-creeps)). A configuration based on the first one identifies both.
+# constant ([materials](../simulator.md#creep)). A configuration based on the first one identifies both.
 
 # %%
 Path("configs/experiment/my_creeping_robot.yaml").write_text("""# @package _global_

@@ -108,4 +108,4 @@ plt.show()
 
 # %% [markdown]
 # On the command line, `law=runs/beam/law.json` uses the law in any other experiment, and `shapes` tests it on other
-# bodies: [experiments](../experiments.md#other-bodies-of-the-same-material).
+# bodies: [experiments](../learning.md#other-bodies-of-the-same-material).

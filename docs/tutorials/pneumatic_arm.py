@@ -10,7 +10,7 @@
 #
 # A silicone arm with three chambers hangs from its base. Air pressure in a chamber lengthens its side,
 # and the arm bends away. This page generates such an arm from its dimensions, bends it, uses the adjoint to compute the
-# pressures that bring the tip to a target, and opens a valve. [The guide](../pressure.md) adds markers,
+# pressures that bring the tip to a target, and opens a valve. [The guide](../actuators.md) adds markers,
 # identification and a learned force (`experiment=sopra`).
 #
 # ## The arm
@@ -130,7 +130,7 @@ plt.show()
 # ## Your own arm
 #
 # An experiment needs a mesh with closed chambers, pressures and markers in CSV files, and about twenty lines of
-# configuration: [robots driven by pressure](../pressure.md). With the threads of SoPrA in the simulator
+# configuration: [robots driven by pressure](../actuators.md). With the threads of SoPrA in the simulator
 # (`experiment=sopra_fibres`), the error on its simulated laboratory is 0.44 mm after identification, and 0.23 mm with
 # the learned force ([robots](../robots.md#sopra)).
 #

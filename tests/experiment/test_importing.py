@@ -354,7 +354,7 @@ def test_a_changed_recording_is_imported_again(shelf):
     assert fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {}) != before
 
 
-TUTORIAL = [ROOT / "docs" / "bring_your_robot" / f"{page}.md" for page in ("mesh", "first_run", "tentacle")]
+TUTORIAL = [ROOT / "docs" / f"{page}.md" for page in ("bring_your_robot", "bring_your_robot/tentacle")]
 
 
 def tutorial_blocks():

@@ -26,7 +26,7 @@ DENSITIES: Final = ((0.5, 10.0), (1e-10, 1e-5), (2.5e4, np.inf))
 STRONGEST: Final = 100.0  # m/s^2
 FLAT_CELL: Final = 0.02  # scaled Jacobian
 INERTIA_ERROR: Final = 0.15  # of the rotary inertia
-MANY_UNKNOWNS: Final = 60_000  # steps take seconds on a core (docs/scaling.md)
+MANY_UNKNOWNS: Final = 60_000  # steps take seconds on a core (docs/gpu.md)
 
 
 def warn_of_implausible(

@@ -37,6 +37,7 @@ def pose(place, turn, seen=1.0):
 AXES = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{entry}]" for entry in range(9))]
 NAMES_3D = "Frame\tTime\t" + "\t".join(f"{label} {axis}" for label in ("Spitze_Ä", "Fuß") for axis in "XYZ") + "\n"
 NAMES_6D = "Frame\tTime\t" + "\t".join(f"{label} {axis}" for label in ("Spitze_Ä", "Fuß") for axis in AXES) + "\n"
+ANGLES_6D = "Frame\t" + "\t".join(AXES[:6] * 2) + "\n"
 POSES = [pose(TIP, TURN), pose(BASE, Rotation.identity(30))]
 
 
@@ -80,6 +81,10 @@ FILES = {  # text, encoding, labels, and whether the first one turns
         *("utf-8", "Spitze_Ä Fuß", False),
     ),
     "qualisys 6D": (qualisys(rows("\t", FRAMES, TIME, *POSES), NAMES_6D, "6D"), "cp1252", "Spitze_Ä Fuß", True),
+    "qualisys 6D, angles": (
+        qualisys(rows("\t", FRAMES, TIP, TURN.as_euler("XYZ", degrees=True), *POSES[1].T[:6]), ANGLES_6D, "6D"),
+        *("utf-8", "Spitze_Ä Fuß", True),
+    ),
     "qualisys 6D, no names": (qualisys(rows("\t", *POSES), "", "6D"), "utf-8", "Spitze_Ä Fuß", True),
     "qualisys 6D, commas": (
         qualisys(rows("\t", FRAMES, TIME, *POSES, decimal=","), NAMES_6D, "6D").replace("\t", ";"),
@@ -103,6 +108,10 @@ FILES = {  # text, encoding, labels, and whether the first one turns
         ),
         *("utf-8-sig", "plate", True),
     ),
+    "motive, quaternions": (
+        motive([BODY[0], *BODY], "X,Y,Z,W,X,Y,Z", rows(",", FRAMES, TIME, TURN.as_quat(), TIP)),
+        *("utf-8", "plate", True),
+    ),
     "motive, solved": (motive(SOLVED, "X,Y,Z", rows(",", FRAMES, TIME, TIP)), "utf-8", "plate:Marker1", False),
     "nexus": (trajectories("Arm:Tip", "Arm:Base", "*31"), "utf-8", "Tip Base *31", False),
     "nexus, a colon": (trajectories("Arm:Tip", "Arm:Base", "Unlabeled:u3"), "utf-8", "Tip Base Unlabeled:u3", False),
@@ -111,6 +120,9 @@ FILES = {  # text, encoding, labels, and whether the first one turns
     "tracker, degrees": (objects(np.degrees(ROTVEC), units="deg,deg,deg,", name="Tip"), "utf-16", "Tip", True),
     "tracker, quaternions": (objects(TURN.as_quat(), "RX,RY,RZ,RW,", ",,,,"), "utf-8", "Tip", True),
     "tracker, both": (objects(ROTVEC) + trajectories("Arm:Tip", "Arm:Base"), "utf-8", "Tip Arm:Tip Base", True),
+    "tracker, both ways": (
+        *(trajectories("Arm:Tip", "Arm:Base") + "\n" + objects(ROTVEC), "utf-8", "Tip Arm:Tip Base", True),
+    ),
     "nexus, segments": (DEVICES + objects(ROTVEC, section="Segments"), "utf-8", "Tip", True),
     "excel": (ENGLISH + rows("\t", TIME, TIP, decimal=","), "utf-16", "Tip", False),
     "excel, little": (ENGLISH + rows("\t", TIME, TIP), "utf-16-le", "Tip", False),

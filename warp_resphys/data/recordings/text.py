@@ -37,7 +37,7 @@ Columns = Mapping[int, tuple[str, str | None]]  # names and units by number
 # A column in a length is a misspelt marker rather than an actuation.
 _CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
 _TIMES = ("time", "t", "timestamp", "zeit", "temps", "tiempo", "tempo")
-_FRAMES = ("frame", "frame#", "frames", "frame number", "frame_number", "index")
+_FRAMES = ("frame", "frame#", "frames", "frame number", "frame_number", "index", "sample")
 _SECONDS = {
     **{"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3},
     **{"us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9},  # two letters, which look alike
@@ -279,10 +279,10 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
             f"{path} has {len(data)} of the {declared} frames of its NO_OF_FRAMES, and no column tells which: "
             "export it again, with the frame and its time before the positions."
         )
-    # Labels may occur twice.
-    places = [(f"{axes[: column + 1].count('x') - 1}", axis, column) for column, axis in enumerate(axes)]
+    unique = [f"{label} #{place}" if labels.count(label) > 1 else label for place, label in enumerate(labels, start=1)]
+    places = [(unique[axes[: column + 1].count("x") - 1], axis, column) for column, axis in enumerate(axes)]
     rate, clock = number("".join(keys.get("FREQUENCY", [])[:1])), 0 if leading else None
-    turn = Turn((*_MATRIX, *_ANGLES), _quaternions_of_qualisys)
+    turn = Turn(tuple(axis for axis in (*_MATRIX, *_ANGLES) if axis in axes), _quaternions_of_qualisys)
     layout = Layout(first, len(axes), places[len(leading) :], "mm", clock, rate=rate, turn=turn)
     raw = hide_zeros(replace(layout.read(rows, path), labels=labels), path)
     return replace(raw, start=number(data[0][1]) or 0.0) if len(leading) == 2 else raw
@@ -291,17 +291,23 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
 def _quaternions_of_qualisys(numbers: FloatArray) -> FloatArray:
     """Returns quaternions (T, 4) of matrices by their columns and angles roll, pitch and yaw [degrees] (T, 12).
 
-    Matrices of zeros were not seen. Qualisys has R = Rx(roll) Ry(pitch) Rz(yaw) by default; matrices that agree with
-    these angles by their rows instead are read so.
+    There may be matrices (T, 9) or angles (T, 3) alone. Rows of zeros were not seen. Qualisys has the rotation
+    Rx(roll) Ry(pitch) Rz(yaw) by default; matrices that agree with it by their rows, not their columns, are read so.
     """
 
     def rotations(seen: FloatArray) -> Rotation:
-        matrices = seen[:, :9].reshape(-1, 3, 3).swapaxes(1, 2)
-        angles = Rotation.from_euler("XYZ", seen[:, 9:], degrees=True).as_matrix()
-        by_columns, by_rows = (np.abs(own - angles).max() for own in (matrices, matrices.swapaxes(1, 2)))
-        return Rotation.from_matrix(matrices.swapaxes(1, 2) if by_rows < 0.01 < by_columns else matrices)
+        by_angles = Rotation.from_euler("XYZ", seen[:, -3:], degrees=True)
+        if seen.shape[1] == 3:
+            return by_angles
+        by_rows = seen[:, :9].reshape(-1, 3, 3)
+        by_columns = by_rows.swapaxes(1, 2)
+        if seen.shape[1] == 12:
+            columns_err, rows_err = (np.abs(own - by_angles.as_matrix()).max() for own in (by_columns, by_rows))
+            by_columns = by_rows if rows_err < 0.01 < columns_err else by_columns
+        return Rotation.from_matrix(by_columns)
 
-    return quaternions(np.where(numbers[:, :9].any(axis=1, keepdims=True), numbers, np.nan), rotations)
+    hidden = ~numbers[:, :9].any(axis=1, keepdims=True) & (numbers.shape[1] > 3)
+    return quaternions(np.where(hidden, np.nan, numbers), rotations)
 
 
 def _read_motive(rows: Rows, path: Path) -> RawRecording:
@@ -346,7 +352,7 @@ def _read_vicon(rows: Rows, path: Path) -> RawRecording:
     """
     found = {row[0].title(): line for line, row in enumerate(rows) if row and row[0].title() in _VICON}
     wanted = {"Objects", "Trajectories"} & {*found} or {"Segments"} & {*found}
-    starts = [line for name, line in found.items() if name in wanted]
+    starts = [found[name] for name in sorted(wanted)]
     sections = [_vicon_section(rows, start, path) for start in starts]
     places, units, table, width = list[Place](), dict[int, str](), dict[str, list[str]](), 1
     for first, section, of_columns in sections:

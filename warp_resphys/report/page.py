@@ -5,6 +5,7 @@ import hashlib
 import logging
 import math
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from ..settings.run import RunSettings
 from .render import DrawingError, Renderer
 
 if TYPE_CHECKING:
+    import rich.console
     import rich.table
     from matplotlib.figure import Figure as Drawing
 
@@ -33,6 +35,7 @@ NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
 MOST_PERCENT = 10.0  # Relative change above which a multiple is written in place of a percentage.
+_WIDEST, _NARROW = 1000, 78  # characters: beyond every table; terminals below it wrap the heads of rows as well
 _LEAST_DECIMAL = 1e-4  # Smaller numbers are written with a power of ten.
 
 
@@ -81,25 +84,33 @@ class PageTable:
         """Whether a row is marked."""
         return any(row.mark for row in self.rows)
 
-    def __rich__(self) -> "rich.table.Table":
-        """Returns the table for a terminal, without lines; what is too wide is wrapped."""
-        import rich.table
-        import rich.text
+    def __rich_console__(
+        self, console: "rich.console.Console", options: "rich.console.ConsoleOptions"
+    ) -> Iterator[Any]:
+        """Yields the table for a terminal, without lines; where it is too wide, its heads are wrapped."""
+        table, wide = self._drawn(self.head, True), options.update(max_width=_WIDEST)
+        if console.measure(table, options=wide).maximum > options.max_width:
+            head = textwrap.fill(self.head, max(len(row.head) for row in self.rows))
+            table = self._drawn(head, options.max_width >= _NARROW)
+        yield table
 
-        title = rich.text.Text(self.summary) if self.summary else None
-        justified: Any = {
-            "title_justify": "left",
-            "caption_justify": "left",
-            "caption": rich.text.Text(self.note) if self.note else None,
+    def _drawn(self, head: str, whole: bool) -> "rich.table.Table":
+        import rich.table
+        from rich.text import Text as Plain  # "[mm]" is no markup.
+
+        texts = {
+            "title": Plain(self.summary) if self.summary else None,
+            "caption": Plain(self.note) if self.note else None,
         }
-        table = rich.table.Table(title=title, box=None, padding=(0, 3, 0, 0), pad_edge=False, **justified)
-        table.add_column(rich.text.Text(self.head))  # "[mm]" is no markup.
+        justified: Any = {"title_justify": "left", "caption_justify": "left", **texts}
+        table = rich.table.Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, **justified)
+        table.add_column(Plain(head), no_wrap=whole)
         for column in self.columns:
-            table.add_column(rich.text.Text(column), justify="right")
+            table.add_column(Plain(column), justify="right")
         for row in self.rows:
             cells = (" ".join(filter(None, (cell.text, cell.beside, cell.small))) for cell in row.cells)
             marked = [row.mark] if self.marked else []
-            table.add_row(*map(rich.text.Text, (row.head, *cells, *marked)), style="bold" if row.mark else None)
+            table.add_row(*map(Plain, (row.head, *cells, *marked)), style="bold" if row.mark else None)
         return table
 
 

@@ -76,6 +76,8 @@ from .settings.trials import ReadingSettings, Split, Trial
 
 log = logging.getLogger(__name__)
 
+_SHORT = 60  # characters of advice beside which the path of the report is printed
+
 Work = Callable[[StageContext], None]
 
 
@@ -372,4 +374,6 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     tables += [tracking_table(tracking)] if tracking else []
     tables += [shapes_table(shapes)] if shapes else []
     said, *advice = (*verdict(metrics, run), "")
-    show(*tables, *filter(None, (said, "  ".join([*filter(None, advice), f"Report: {folder / REPORT}"]))))
+    last = [" ".join(filter(None, advice)), f"Report: {folder / REPORT}"]
+    lines = ["  ".join(filter(None, last))] if len(last[0]) < _SHORT else last
+    show(*tables, *filter(None, (said, *lines)))

@@ -64,10 +64,10 @@ def test_lines_have_their_style_in_every_panel_and_none_hides_another():
     (figure,) = _tip_figure(body, trials, CANVAS)
     motion, distance = figure.axes
     above, below = ({line.get_label(): line for line in axes.lines} for axes in (motion, distance))
-    for label in ("Regression", "SysID", "ResPhys"):
+    for label in ("Kernel regression", "SysID", "ResPhys"):
         assert above[label].get_linestyle() == below[label].get_linestyle()
         assert above[label].get_linewidth() == below[label].get_linewidth()
-    for label in ("Regression", "SysID"):  # dashed, over the thicker line of ResPhys
+    for label in ("Kernel regression", "SysID"):  # dashed, over the thicker line of ResPhys
         assert above[label].get_linestyle() == "--"
         assert above[label].get_zorder() > above["ResPhys"].get_zorder()
 

@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 MODELS: Final[Mapping[str, tuple[str, str]]] = {
     "rest": ("At rest", "without physics: nothing moves"),
     "interpolation": ("Interpolation", "without physics: straight lines between the training trials"),
-    "regression": ("Regression", "without physics: kernel ridge regression over the training trials"),
+    "regression": ("Kernel regression", "without physics: ridge regression over the training trials"),
     "linear": ("Linear model", "without physics: linear from frame to frame, with powers of the inputs (DMDc)"),
     "published": ("Published setting", "the simulator as the published code sets it up"),
     "simulation": ("Uncorrected simulator", "with the values of the data sheet"),

@@ -88,22 +88,22 @@ class PageTable:
         self, console: "rich.console.Console", options: "rich.console.ConsoleOptions"
     ) -> Iterator[Any]:
         """Yields the table for a terminal, without lines; where it is too wide, its heads are wrapped."""
+        from rich.text import Text as Plain
+
         table, wide = self._drawn(self.head, True), options.update(max_width=_WIDEST)
         if console.measure(table, options=wide).maximum > options.max_width:
             head = textwrap.fill(self.head, max(len(row.head) for row in self.rows))
             table = self._drawn(head, options.max_width >= _NARROW)
         yield table
+        if self.note:
+            yield Plain(self.note)
 
     def _drawn(self, head: str, whole: bool) -> "rich.table.Table":
         import rich.table
         from rich.text import Text as Plain  # "[mm]" is no markup.
 
-        texts = {
-            "title": Plain(self.summary) if self.summary else None,
-            "caption": Plain(self.note) if self.note else None,
-        }
-        justified: Any = {"title_justify": "left", "caption_justify": "left", **texts}
-        table = rich.table.Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, **justified)
+        title = Plain(self.summary) if self.summary else None
+        table = rich.table.Table(title=title, title_justify="left", box=None, padding=(0, 2, 0, 0), pad_edge=False)
         table.add_column(Plain(head), no_wrap=whole)
         for column in self.columns:
             table.add_column(Plain(column), justify="right")

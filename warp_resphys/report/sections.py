@@ -9,16 +9,17 @@ import numpy as np
 
 from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, mean_interval, published_errors
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, published_errors
 from ..settings.run import RunSettings
 from .data import (
     MODELS,
     Driven,
+    Errors,
     RunReport,
     folds_in,
+    grouped_errors,
     missing_baselines,
     models_in_figures,
-    trial_errors,
     untrained,
 )
 from .page import (
@@ -39,7 +40,7 @@ from .page import (
     share_text,
     unbroken,
 )
-from .verdict import LEAST_TRIALS, known_errors
+from .verdict import error_cell, interval_text
 
 BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
@@ -51,22 +52,31 @@ _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places
 
 
 def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
-    """Return mean, deviation and interval of the errors of all models, beside those that were published.
+    """Return the errors of all models with their deviations and intervals, beside those that were published.
+
+    With two groups of test trials, each has a column; published errors are of trials as in training.
 
     Args:
         metrics: Of a split or of folds.
         settings: Of the run.
     """
-    errors, known, idle = metrics["errors_mm"], known_errors(trial_errors(metrics)), untrained(metrics)
-    intervals = {model: mean_interval(own) for model, own in known.items() if len(own) >= LEAST_TRIALS}
-    reconstructed = metrics.get("errors_vs_reconstruction_mm", {})
+    errors, groups, idle = metrics["errors_mm"], grouped_errors(metrics, settings), untrained(metrics)
     published = published_beside(published_errors(settings.name), list(errors))
-    columns: dict[str, Mapping[str, Cell]] = {
-        "Mean error": {model: Cell.of(error_parts(own)) for model, own in errors.items()},
-        "90 % interval": {m: Cell(" to ".join(map(number_text, ends))) for m, ends in intervals.items()},
-        "Against the reconstruction": {model: Cell.of(error_parts(own)) for model, own in reconstructed.items()},
-        "Published": {model: Cell.of(own) for model, own in published.items()},
-    }
+    beside = {"Published": {model: Cell.of(own) for model, own in published.items()}}
+    columns: dict[str, dict[str, Cell]] = {}
+    if len(groups) > 1:
+        parts = {title: {m: error_cell(x, with_interval=True) for m, x in own.items()} for title, own in groups.items()}
+        first, last = parts.items()
+        columns = dict([first, *beside.items(), last])
+    else:
+        reconstructed = metrics.get("errors_vs_reconstruction_mm", {})
+        own: Errors = next(iter(groups.values()), {})
+        columns = {
+            "Mean error": {model: Cell.of(error_parts(summary)) for model, summary in errors.items()},
+            "90 % interval": {m: Cell(text) for m, x in own.items() if (text := interval_text(x))},
+            "Against the reconstruction": {m: Cell.of(error_parts(summary)) for m, summary in reconstructed.items()},
+            **beside,
+        }
     columns = {title: cells for title, cells in columns.items() if cells}
     rows, missing = [], missing_baselines(metrics)
     for model, (name, meaning) in MODELS.items():

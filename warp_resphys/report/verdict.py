@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import Any, Final, NamedTuple
 
 from ..learning.baselines import BASELINES
-from ..learning.metrics import Gain, paired_gain
+from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
 from .data import MODELS, Errors, folds_in, grouped_errors, missing_baselines, untrained
@@ -97,7 +97,7 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
         settings: of the run.
     """
     groups, idle = grouped_errors(metrics, settings), untrained(metrics)
-    columns = {title: {model: _cell(own) for model, own in errors.items()} for title, errors in groups.items()}
+    columns = {title: {model: error_cell(own) for model, own in errors.items()} for title, errors in groups.items()}
     plain = {title: best_of(known_errors(errors), BASELINES) for title, errors in groups.items()}
     for scale, errors in sorted(metrics.get("scales", {}).items(), key=lambda item: float(item[0])):
         if float(scale) != 1.0:
@@ -122,10 +122,19 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
     return PageTable(f"{settings.title}: mean error of the {of} [mm]", list(columns), rows, note)
 
 
-def _cell(errors: Sequence[float | None]) -> Cell:
-    lost = sum(error is None for error in errors)
+def error_cell(errors: Sequence[float | None], with_interval: bool = False) -> Cell:
+    """Returns the mean error over trials [mm], with its interval below, or how many roll-outs diverged."""
     known = [error for error in errors if error is not None]
-    return Cell(f"{lost} of {len(errors)} diverged" if lost else number_text(fmean(known)))
+    if lost := len(errors) - len(known):
+        return Cell(f"{lost} of {len(errors)} diverged")
+    return Cell(number_text(fmean(known)), interval_text(errors) if with_interval else "")
+
+
+def interval_text(errors: Sequence[float | None]) -> str:
+    """Returns the 90 % interval of a mean error [mm]; empty with fewer than five trials, or where one diverged."""
+    known = [error for error in errors if error is not None]
+    whole = LEAST_TRIALS <= len(known) == len(errors)
+    return " to ".join(map(number_text, mean_interval(known))) if whole else ""
 
 
 def less_error(best: str, second: str, share: float) -> str:
@@ -177,7 +186,7 @@ def _best_text(known: Known) -> str:
         word = "no" if gain.share < _EQUAL else "no significant"
         return f"{model_name(best)} and {model_name(second)} show {word} difference {on}, {mm_text(fmean(known[best]))}"
     lower = sum(a < b for a, b in zip(known[best], known[second], strict=True))
-    return f"{less_error(best, second, gain.share)} (on {lower} of {count} trials)"
+    return f"{less_error(best, second, gain.share)} ({f'on {lower} of {count} trials' if count > 1 else on})"
 
 
 def compared(before: Sequence[float], after: Sequence[float]) -> Gain:

@@ -138,7 +138,7 @@ class TestSentences:
             ({"placement": {"turned_deg": 1.0, "rms_mm": 2.1}}, "fit their positions to 2.10 mm only", "Measure"),
             (
                 {"mesh_check": {"model": "sysid", "moved_mm": 2.9}},
-                "a finer mesh moves the markers by 2.90 mm, ResPhys gains 0.200 mm",
+                "a finer mesh moves the markers by 2.90 mm, but ResPhys gains 0.200 mm",
                 "Refine the mesh first.",
             ),
             ({"intervals": {"models": {"resphys": {"coverage": 0.3}}}}, "within the 90 % intervals, 30 % do", "Valid"),

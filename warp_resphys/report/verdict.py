@@ -241,14 +241,15 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
     if checks and model in known and (base := checks[0]["model"]) in known and base != model:
         moved, gained = fmean(check["moved_mm"] for check in checks), fmean(known[base]) - error
         if moved > gained:
-            text = f"a finer mesh moves the markers by {mm_text(moved)}, {model_name(model)} gains {mm_text(gained)}"
+            text = f"a finer mesh moves the markers by {mm_text(moved)}, but {model_name(model)} gains {mm_text(gained)}"
             yield Doubt(text, "refine the mesh first")
     if 0 < count < LEAST_TRIALS:
         few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
         yield Doubt(f"{few} too few for an interval", "test on five trials or more")
     left = sum(len(fold.get("range", {}).get(model, {}).get("first_s", ())) for fold in folds)
     if groups == 1 and 2 * left > count:
-        yield Doubt(f"{left} of {count} trials leave the training range", "train on trials that reach as far")
+        trials = f"{left} of {count} trials leave" if count > 1 else "the trial leaves"
+        yield Doubt(f"{trials} the training range", "train on trials that reach as far")
     covered = metrics.get("intervals", {}).get("models", {}).get(model, {}).get("coverage", 1.0)
     if covered < _COVERED:
         text = f"90 % of the measurements should lie within the 90 % intervals, {100.0 * covered:.0f} % do"

@@ -130,9 +130,9 @@ DECKS = {  # text, largest coordinates [mm], regions, surfaces
     ),
     "two instances": (
         PART + "*Assembly\n" + INSTANCE.format(1, "") + INSTANCE.format(2, "0., 30., 0.\n") + "*Node\n1, 0., 0., 99.\n"
-        "*Elset, elset=ends, instance=b-2\n 1\n*Elset, elset=ends\nb-1.2\n*Elset, elset=tips\nB-1.tip, b-2.TIP\n",
+        "*Elset, elset=ends, instance=b-2\n 1\n*Elset, elset=ends\nb-1.2\n*Elset, elset=TIP\nB-1.tip, b-2.TIP\n",
         [20.0, 40.0, 10.0],
-        {"b-1": [0, 1], "b-1_tip": [1], "b-2": [2, 3], "b-2_tip": [3], "ends": [1, 2], "tips": [1, 3]},
+        {"b-1": [0, 1], "b-1_tip": [1], "b-2": [2, 3], "b-2_tip": [3], "ends": [1, 2], "tip": [1, 3]},
         {},
     ),
     "independent instance, surface": (

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .errors import DecodingError
 from .mesh_blocks import Block, IntArray, rows_of
+from .text import decoded
 
 FloatArray = NDArray[np.float64]
 Member = tuple[str, IntArray | str]  # instance or "" for the set's own scope; numbers of elements or name of a set
@@ -78,18 +79,23 @@ class _Deck:
         """Returns the model's own scope and the instances by name; the parts if none has an instance."""
         return {"": self.model, **(self.instances or self.parts)}
 
-    def members(self, scope: str, member: Member, trail: tuple[str, ...] = ()) -> Iterator[tuple[str, IntArray]]:
+    def members(self, scope: str, member: Member, *trail: tuple[str, str]) -> Iterator[tuple[str, IntArray]]:
         """Yields scopes and numbers of the elements of a member of a set."""
         scope, content = member[0] or scope, member[1]
+        if scope not in self.scopes():
+            raise DecodingError(f"*ELSET: there is no *INSTANCE of the name '{scope}'")
         if not isinstance(content, str):
             yield scope, content
-        elif scope not in self.scopes() or content not in self.scopes()[scope].sets:
-            raise DecodingError(f"*ELSET: there is no element set '{content}' of which a set or surface could be made")
-        elif content in trail:
+        elif (scope, content) in trail:
             raise DecodingError(f"*ELSET: the element set '{content}' contains itself")
+        elif own := self.scopes()[scope].sets.get(content):
+            for inner in own:
+                yield from self.members(scope, inner, *trail, (scope, content))
+        elif "." in content:  # such as beam-1.tip or beam-1.12
+            instance, _, name = content.rpartition(".")
+            yield from self.members(instance, _member(name), *trail)
         else:
-            for own in self.scopes()[scope].sets[content]:
-                yield from self.members(scope, own, (*trail, content))
+            raise DecodingError(f"*ELSET: there is no element set '{content}' of which a set or surface could be made")
 
 
 def read_abaqus(path: str) -> tuple[FloatArray, list[Block]]:
@@ -100,7 +106,7 @@ def read_abaqus(path: str) -> tuple[FloatArray, list[Block]]:
     """
     deck = _Deck()
     scope = deck.model
-    for line, keyword, options, data in _cards(Path(path).read_text(encoding="utf-8-sig", errors="replace")):
+    for line, keyword, options, data in _cards(decoded(Path(path).read_bytes()) or ""):
         try:
             if keyword in _REFUSED:
                 raise DecodingError("this keyword is not read; save the mesh with all nodes and elements written out")
@@ -128,8 +134,7 @@ def read_abaqus(path: str) -> tuple[FloatArray, list[Block]]:
             elif keyword == "SURFACE" and options.get("TYPE", "ELEMENT").upper() == "ELEMENT":
                 rows = [_words(row) for row in data]
                 if all(len(row) == 2 and re.fullmatch("[sS][1-6]", row[1]) for row in rows):
-                    own = [(_member(row[0], ""), int(row[1][1])) for row in rows]
-                    scope.sides[deck.name(options["NAME"])] = own
+                    scope.sides[deck.name(options["NAME"])] = [(_member(row[0]), int(row[1][1])) for row in rows]
         except KeyError as error:
             raise DecodingError(f"line {line}, *{keyword} needs {error.args[0]}=") from error
         except (DecodingError, ValueError) as error:
@@ -190,18 +195,16 @@ def _elements(scope: _Scope, kind: str, data: list[str]) -> IntArray:
 def _set_members(options: Mapping[str, str], data: list[str]) -> Iterator[Member]:
     instance = options.get("INSTANCE", "").upper()
     for words in map(_words, data):
-        if "GENERATE" in options:
+        if any(key.startswith("GEN") for key in options):
             first, last, step = ([int(word) for word in words] + [1])[:3]
             yield instance, np.arange(first, last + 1, step)
         else:
             yield instance, np.array([int(word) for word in words if word.isdigit()], dtype=np.int64)
-            yield from (_member(word, instance) for word in words if not word.isdigit())
+            yield from ((instance, word.upper()) for word in words if not word.isdigit())
 
 
-def _member(word: str, instance: str) -> Member:
-    """Returns a member by a number or a name, which an instance may precede, as in "beam-1.tip"."""
-    before, _, name = word.rpartition(".")
-    return before.upper() or instance, np.array([int(name)]) if name.isdigit() else name.upper()
+def _member(word: str) -> Member:
+    return "", np.array([int(word)]) if word.isdigit() else word.upper()
 
 
 def _groups(deck: _Deck) -> dict[tuple[str, str], list[IntArray]]:
@@ -232,10 +235,9 @@ def _arranged(deck: _Deck) -> tuple[FloatArray, list[Block]]:
             blocks.append(Block(kind, dimension, nodes, cells))
             if dimension == 3:
                 solids.setdefault(at, []).append((kind, rows[:, 0], nodes))
-        defined = [number for _, _, rows in scope.blocks for number in rows[:, 0].tolist()]
-        elements, times = np.unique(defined, return_counts=True)
-        if (times > 1).any():
-            raise DecodingError(f"*ELEMENT: element {elements[times > 1][0]} is defined {times.max()} times")
+        defined = Counter(number for _, _, rows in scope.blocks for number in rows[:, 0].tolist())
+        if (times := max(defined.values(), default=0)) > 1:
+            raise DecodingError(f"*ELEMENT: element {max(defined, key=defined.__getitem__)} is defined {times} times")
         rotation, translation = scope.motion
         points.append(np.array([*scope.nodes.values()]).reshape(-1, 3) @ rotation.T + translation)
         first += len(numbers)

@@ -7,14 +7,15 @@ for each of them, which are read once. Only groups with a name are read. Other s
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import DecodingError
 from .mesh_blocks import Block, IntArray, rows_of
+from .text import decoded
 
+FloatArray = NDArray[np.float64]
 Names = Mapping[tuple[int, int], str]  # of physical groups by dimension and number
 
 _KINDS = {  # meshio's name, dimension and number of nodes by gmsh's number of a kind
@@ -40,37 +41,27 @@ class _Numbers:
         self._content = np.fromstring(content.decode(), sep=" ") if is_text else content
         self._order, self._at = order, 0
 
-    def take(self, count: int, kind: str) -> NDArray[Any]:
-        """Returns the next numbers (count,); of the kind "i4", "i8" or "f8" in binary files."""
+    def rows(self, count: int, kinds: str) -> FloatArray:
+        """Returns the next rows (count, k); in binary files of the kinds i and q, integers of 4 and 8 bytes, and d."""
         if isinstance(self._content, bytes):
-            taken = np.frombuffer(self._content, self._order + kind, count, self._at)
+            kind = np.dtype([(str(number), self._order + letter) for number, letter in enumerate(kinds)])
+            taken = np.frombuffer(self._content, kind, count, self._at)
             self._at += taken.nbytes
-        else:
-            taken = self._content[self._at : self._at + count]
-            self._at += count
-            if len(taken) < count:
-                raise DecodingError("the file is not whole; save it again")
-        return taken
+            return np.stack([taken[name].astype(np.float64) for name in taken.dtype.names or ()], axis=1)
+        end = self._at + count * len(kinds)
+        if end > len(self._content):
+            raise DecodingError("the file is not whole; save it again")
+        numbers, self._at = self._content[self._at : end], end
+        return numbers.reshape(count, len(kinds))
 
-    def integers(self, count: int, kind: str = "i4") -> IntArray:
-        return self.take(count, kind).astype(np.int64)
+    def integers(self, count: int, kind: str = "i") -> IntArray:
+        return self.rows(count, kind)[:, 0].astype(np.int64)
 
-    def integer(self, kind: str = "i4") -> int:
-        return int(self.integers(1, kind)[0])
-
-    def rows(self, count: int, integers: int, numbers: int) -> NDArray[np.float64]:
-        """Returns rows (count, integers + numbers), of 4-byte integers followed by 8-byte numbers in binary files."""
-        width = integers + numbers
-        if not isinstance(self._content, bytes):
-            return self.take(count * width, "f8").reshape(-1, width)
-        order = self._order
-        kind = np.dtype([("integers", order + "i4", (integers,)), ("numbers", order + "f8", (numbers,))])
-        taken = np.frombuffer(self._content, kind, count, self._at)
-        self._at += taken.nbytes
-        return np.concatenate([taken["integers"], taken["numbers"]], axis=1)
+    def count(self) -> int:
+        return int(self.integers(1, "q")[0])
 
 
-def read_gmsh(path: str) -> tuple[NDArray[np.float64], list[Block]]:
+def read_gmsh(path: str) -> tuple[FloatArray, list[Block]]:
     """Returns points (N, 3) and blocks of cells of a file of gmsh.
 
     Raises:
@@ -84,7 +75,7 @@ def read_gmsh(path: str) -> tuple[NDArray[np.float64], list[Block]]:
     mark = sections["MeshFormat"].partition(b"\n")[2][:4]
     order = ">" if mark == b"\0\0\0\1" else "<"
     names = {}
-    for line in sections.get("PhysicalNames", b"").decode(errors="replace").splitlines():
+    for line in (decoded(sections.get("PhysicalNames", b"")) or "").splitlines():
         if match := re.match(r'\s*(\d)\s+(-?\d+)\s+"(.*)"', line):
             names[int(match[1]), abs(int(match[2]))] = match[3]
     if 2.0 <= number < 3.0:
@@ -105,9 +96,7 @@ def _sections(content: bytes) -> dict[str, bytes]:
     return sections
 
 
-def _version_4(
-    sections: Mapping[str, _Numbers], version: float, names: Names
-) -> tuple[NDArray[np.float64], list[Block]]:
+def _version_4(sections: Mapping[str, _Numbers], version: float, names: Names) -> tuple[FloatArray, list[Block]]:
     """Reads a file of version 4.0 or 4.1, whose blocks belong to one entity each."""
     groups: dict[tuple[int, int], IntArray] = {}
     for key in ("Entities", "PartitionedEntities"):
@@ -115,12 +104,12 @@ def _version_4(
             groups |= _entities(sections[key], key == "PartitionedEntities", version)
     numbers, points = _nodes(sections["Nodes"], version)
     elements, blocks, is_new = sections["Elements"], [], version > 4.0
-    for _ in range(elements.integers(4 if is_new else 2, "i8")[0]):
+    for _ in range(elements.integers(4 if is_new else 2, "q")[0]):
         first, second, kind = elements.integers(3)
         dimension, entity = (first, second) if is_new else (second, first)
         name, _, nodes = _kind(kind)
-        count = elements.integer("i8")
-        cells = elements.integers(count * (1 + nodes), "i8" if is_new else "i4").reshape(count, -1)[:, 1:]
+        count = elements.count()
+        cells = elements.rows(count, (1 + nodes) * ("q" if is_new else "i"))[:, 1:].astype(np.int64)
         own = [names.get((dimension, abs(group))) for group in groups.get((dimension, entity), ())]
         members = {group: np.arange(count) for group in own if group is not None}
         cells = rows_of(numbers, cells)[:, _ORDERS.get(name, slice(None))]
@@ -132,41 +121,40 @@ def _entities(numbers: _Numbers, is_partitioned: bool, version: float) -> dict[t
     """Returns the physical groups of entities by their dimension and number."""
     groups = {}
     if is_partitioned:
-        numbers.integer("i8")
-        numbers.integers(2 * numbers.integer("i8"))  # ghosts
-    for dimension, count in enumerate(numbers.integers(4, "i8")):
+        numbers.count()
+        numbers.integers(2 * numbers.count())  # ghosts
+    for dimension, count in enumerate(numbers.integers(4, "q")):
         for _ in range(count):
-            entity = numbers.integer()
+            entity = int(numbers.integers(1)[0])
             if is_partitioned:
                 numbers.integers(2)  # parent
-                numbers.integers(numbers.integer("i8"))  # partitions
-            numbers.take(3 if dimension == 0 and version > 4.0 else 6, "f8")  # bounding box
-            groups[dimension, entity] = numbers.integers(numbers.integer("i8"))
+                numbers.integers(numbers.count())  # partitions
+            numbers.rows(3 if dimension == 0 and version > 4.0 else 6, "d")  # bounding box
+            groups[dimension, entity] = numbers.integers(numbers.count())
             if dimension:
-                numbers.integers(numbers.integer("i8"))  # boundary
+                numbers.integers(numbers.count())  # boundary
     return groups
 
 
-def _nodes(numbers: _Numbers, version: float) -> tuple[IntArray, NDArray[np.float64]]:
+def _nodes(numbers: _Numbers, version: float) -> tuple[IntArray, FloatArray]:
     """Returns the numbers (N,) and places (N, 3) of the nodes of version 4."""
     is_new = version > 4.0
-    tags, points = [], []
-    for _ in range(numbers.integers(4 if is_new else 2, "i8")[0]):
+    nodes = []
+    for _ in range(numbers.integers(4 if is_new else 2, "q")[0]):
         first, second, is_parametric = numbers.integers(3)
-        count, width = numbers.integer("i8"), 3 + is_parametric * (first if is_new else second)
+        count, places = numbers.count(), "d" * (3 + is_parametric * (first if is_new else second))
         if is_new:
-            tags.append(numbers.integers(count, "i8"))
-            points.append(numbers.take(count * width, "f8").reshape(count, width)[:, :3])
+            rows = np.concatenate([numbers.rows(count, "q"), numbers.rows(count, places)], axis=1)
         else:
-            rows = numbers.rows(count, 1, width)
-            tags.append(rows[:, 0].astype(np.int64))
-            points.append(rows[:, 1:4])
-    return np.concatenate(tags), np.concatenate(points)
+            rows = numbers.rows(count, "i" + places)
+        nodes.append(rows[:, :4])
+    rows = np.concatenate(nodes)
+    return rows[:, 0].astype(np.int64), rows[:, 1:]
 
 
 def _version_2(
     sections: Mapping[str, bytes], names: Names, is_text: bool, order: str
-) -> tuple[NDArray[np.float64], list[Block]]:
+) -> tuple[FloatArray, list[Block]]:
     """Reads a file of version 2, whose cells have the number of their group."""
     is_parametric = "ParametricNodes" in sections
     head, _, content = sections["ParametricNodes" if is_parametric else "Nodes"].partition(b"\n")
@@ -174,11 +162,11 @@ def _version_2(
     if is_parametric:
         rows = np.empty((int(head), 4))
         for row in rows:
-            row[:] = numbers.rows(1, 1, 3)
+            row[:] = numbers.rows(1, "iddd")[0]
             dimension = numbers.integers(2)[0]
-            numbers.take(dimension if dimension < 3 else 0, "f8")
+            numbers.rows(dimension if dimension < 3 else 0, "d")
     else:
-        rows = numbers.rows(int(head), 1, 3)
+        rows = numbers.rows(int(head), "iddd")
     tags, points = rows[:, 0].astype(np.int64), rows[:, 1:]
     head, _, content = sections["Elements"].partition(b"\n")
     if is_text:

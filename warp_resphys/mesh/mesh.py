@@ -206,8 +206,11 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
 
 def is_mirrored(mesh: Mesh) -> bool:
     """Whether all cells have a negative volume, as in files that wind their nodes the other way; indices must exist."""
-    volumes = _normalised_volumes(mesh)[0]
-    return bool((volumes < DEGENERATE_VOLUME).all() and (volumes < -DEGENERATE_VOLUME).any())
+    for cells in (mesh.cells[:1], mesh.cells):  # one cell decides for most meshes
+        volumes = _normalised_volumes(Mesh(mesh.vertices, cells))[0]
+        if not (volumes < DEGENERATE_VOLUME).all():
+            return False
+    return bool((volumes < -DEGENERATE_VOLUME).any())
 
 
 def boundary_faces(mesh: Mesh) -> IntArray:

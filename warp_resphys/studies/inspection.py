@@ -104,7 +104,8 @@ def inspect_mesh(
         unused = len(points) - len(read_mesh(path, units, drop_unreferenced=True).vertices)
         rows.append(("vertices in the file", f"{len(points):,} = {3 * len(points):,} degrees of freedom"))
         if unused:
-            rows.append(("of these unused", f"{unused} belong to no cell; drop_unreferenced leaves them out"))
+            how = "left out of .msh and .inp, and elsewhere by drop_unreferenced"
+            rows.append(("of these unused", f"{unused} belong to no cell: {how}"))
         surfaces = read_surfaces(path, units, order, True)
     else:
         mesh = build_mesh(settings)
@@ -119,6 +120,8 @@ def inspect_mesh(
     if isinstance(settings, FileMesh):
         names = ", ".join(f"{name} ({len(faces)})" for name, faces in surfaces.items())
         rows.append(("surfaces with a name", names or "none"))
+        names = ", ".join(f"{name} ({len(cells)})" for name, cells in mesh.regions.items())
+        rows.append(("regions", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
     if file is not None:
         if isinstance(settings, GeneratedArm):

@@ -241,8 +241,8 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
     if checks and model in known and (base := checks[0]["model"]) in known and base != model:
         moved, gained = fmean(check["moved_mm"] for check in checks), fmean(known[base]) - error
         if moved > gained:
-            text = f"a finer mesh moves the markers by {mm_text(moved)}, but {model_name(model)} gains {mm_text(gained)}"
-            yield Doubt(text, "refine the mesh first")
+            text = f"a finer mesh moves the markers by {mm_text(moved)}"
+            yield Doubt(f"{text}, but {model_name(model)} gains {mm_text(gained)}", "refine the mesh first")
     if 0 < count < LEAST_TRIALS:
         few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
         yield Doubt(f"{few} too few for an interval", "test on five trials or more")

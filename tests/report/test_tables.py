@@ -208,7 +208,7 @@ class TestIdentification:
         prior = {"mean": 250e3, "deviation": 10e3}
         ranges = {"youngs_modulus": parse(RangeSettings, {"lower": 5e4, "upper": 2e6, "prior": prior})}
         said = uncertainty_text("sysid", identified, ranges)
-        assert said.endswith("at its prior, 250 ± 10 kPa.") is not informs
+        assert said.endswith("do not constrain Young's modulus beyond its prior (250 ± 10 kPa).") is not informs
 
     def test_where_markers_and_recordings_lie(self):
         offsets = {"A": [0.001, 0.0, 0.0], "B": [0.0, 0.003, 0.004]}

@@ -211,10 +211,12 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
         if abs(correlation[i, j]) > _TIED
     ]
     text += f" The data do not separate {', '.join(tied)}." if tied else ""
+    unknown = list[str]()
     for parameter, deviation in uncertainty["deviation"].items():
         prior = ranges[parameter].prior if parameter in ranges else None
         if prior is not None and ranges[parameter].per == "all" and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)
             where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
-            text += f" The data do not constrain {words[parameter]}: it stays at its prior, {where}."
+            unknown.append(f"{words[parameter]} beyond its prior ({where})")
+    text += f" The data do not constrain {', '.join(unknown)}." if unknown else ""
     return text.replace(" %", f"{NO_BREAK_SPACE}%")

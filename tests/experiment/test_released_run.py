@@ -2,19 +2,26 @@
 
 import shutil
 
+import meshio
 import numpy as np
 import pytest
 
 from support.configured import settings
 from support.main_job import run_without_report
+from warp_resphys.experiment.evaluate import check_mesh
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.trials import split_of
 from warp_resphys.io.files import read_checkpoint, read_hdf5, read_json
-from warp_resphys.io.stages import StageInterrupted, run_stages
+from warp_resphys.io.settings import parse
+from warp_resphys.io.stages import StageContext, StageInterrupted, run_stages
 from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
+from warp_resphys.mesh.mesh import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
+from warp_resphys.report.error_section import mesh_text
+from warp_resphys.report.page import NO_BREAK_SPACE
+from warp_resphys.settings.stages import StageSettings
 
 PLAIN = ("rest", "interpolation", "linear")  # two training trials are too few for a regression
 MODELS = [model for model in ALL_MODELS if model not in (LAW, "resphys_uncorrected")]
@@ -131,6 +138,21 @@ class TestCompleteRun:
             assert np.nanmean(file["error"][()]) == pytest.approx(own["mean_mm"], rel=1e-5)
             assert np.isfinite(file["force"][()]).all()
             assert not file["force"][:, 0].any()
+
+
+def test_the_error_of_a_mesh_that_cannot_be_refined_is_not_known(finished, tmp_path):
+    shutil.copy(finished / "dataset.h5", tmp_path)
+    mesh = box_tetrahedra((0.1, 0.03, 0.03), (2, 1, 1), order=2)
+    meshio.Mesh(mesh.vertices, [("tetra10", mesh.cells)]).write(tmp_path / "beam.vtk")
+    given = read_json(finished / "stages" / "mesh_check.json")["settings"]
+    given["mesh"] = {"kind": "file", "path": str(tmp_path / "beam.vtk")}
+    check_mesh(StageContext("mesh_check", tmp_path, "", parse(StageSettings, given)))
+    text = mesh_text(read_json(tmp_path / "mesh_check.json"))
+    assert text.startswith("The error of the mesh is not known: its cells are given, and quadratic already")
+    linear = {"model": "sysid", "cells": [24, 24], "vertices": [63, 325], "trials": ["m50"]}
+    text = mesh_text(linear | {"errors_mm": [0.6, 1.16], "moved_mm": 1.161}).replace(NO_BREAK_SPACE, " ")
+    assert text.startswith("With quadratic cells (325 instead of 63 vertices) and the same parameters, SysID moves")
+    assert "by 1.16 mm, and its error is 1.16 mm instead of 0.600 mm" in text
 
 
 @pytest.mark.slow

@@ -58,6 +58,10 @@ def test_trials_have_equal_weight() -> None:
     assert result["resphys"] == {"mean": 3.0, "std": 1.5, "trajectories": 3, "diverged": 0}
     assert result["simfree"] == {"mean": None, "std": None, "trajectories": 2, "diverged": 1}
     assert summarise([np.array([1.0, 1.0, 1.0]), np.array([3.0])])["mean"] == 2.0
+    simulated, seen = 1e-3 * np.array([[1.0], [4.0]]) * np.ones((2, 3)), np.zeros((2, 3))
+    seen[1, 1:] = np.nan
+    by_marker = errors_per_marker(*(x[..., None, None] * [1.0, 0.0, 0.0] for x in (simulated, seen)), ["tip"])
+    assert by_marker == {"tip": pytest.approx(2.5)}
     assert summarise_folds(folds[:1])["resphys"] == {"mean": 1.0, "std": None, "trajectories": 1, "diverged": 0}
 
 
@@ -92,10 +96,3 @@ def test_a_driven_trial_rises_holds_and_is_released():
     assert found(-np.ones(12)) == "ris ris ris" + 9 * " hol"
     assert found(np.ones(12), before=1.0) == " ".join(12 * "-")
     assert found(0.2 * np.ones(12), before=1.0) == " ".join(12 * ["rel"])
-
-
-def test_trials_of_other_lengths_count_alike_for_a_marker():
-    off, seen = np.zeros((2, 6, 1, 3)), np.zeros((2, 6, 1, 3))
-    off[0, :, 0, 0], off[1, :, 0, 0] = 1e-3, 4e-3
-    seen[1, 2:] = np.nan
-    assert errors_per_marker(off, seen, ["tip"]) == {"tip": pytest.approx(2.5)}

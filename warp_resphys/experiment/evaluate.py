@@ -359,11 +359,11 @@ def check_mesh(context: StageContext) -> None:
     model = "simulation" if settings.identified is None else "sysid"
     content: dict[str, Any] = {"model": model}
     try:
-        if other == settings:
-            raise InputError("The cells of a file are quadratic already: make a finer mesh to compare with.")
         check_memory({"": other})
         experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
         meshes = [experiment.body.mesh for experiment in experiments]
+        if len(meshes[0].vertices) == len(meshes[1].vertices):
+            raise InputError("its cells are given, and quadratic already; compare it with a finer one.")
         content |= {"cells": [len(mesh.cells) for mesh in meshes], "vertices": [len(m.vertices) for m in meshes]}
         amplitudes = _amplitudes(experiments[0], settings.groups["1"])
         moving = experiments[0].moving([*amplitudes])

@@ -18,7 +18,7 @@ from warp_resphys.data.recordings.reading import read_recording, write_recording
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment
-from warp_resphys.experiment.files import Dataset
+from warp_resphys.experiment.files import Dataset, read_dataset
 from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
@@ -132,10 +132,16 @@ class Recordings:
             recording = read_recording(self.finished / "recordings" / f"{name}.h5")
             write_recording(self.folder / f"{name}.h5", change(recording))
 
-    def stages(self):
+    def stages(self, *overrides):
         path = f"hydra.searchpath=[file://{self.finished.parent / 'configs'}]"
         split = ("data.train=[t000,t001]", "data.validation=[t002]", "data.test=[t003]")
-        return pipeline.acquisition_stages(settings(path, *COMMAND, f"data.folder={self.folder}", *split))
+        return pipeline.acquisition_stages(settings(path, *COMMAND, f"data.folder={self.folder}", *split, *overrides))
+
+    def imported(self, *overrides):
+        """The dataset of their import."""
+        (imports,) = [stage for stage in self.stages(*overrides) if stage.name == "import"]
+        import_recordings(StageContext("import", self.folder, "", imports.settings))
+        return read_dataset(self.folder / "dataset.h5")
 
     def refused(self):
         """The sentence with which they are refused, before the run or by its import."""
@@ -180,14 +186,52 @@ def test_pressures_in_another_unit_and_two_files_of_one_name_cost_one_sentence(r
     assert "two recordings of one name, t001.csv and t001.h5" in recordings.refused()
 
 
-def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(recordings, tmp_path, caplog):
-    recordings.write(lambda r: dataclasses.replace(r, positions=r.positions[:9], actuation=r.actuation[:9]), "t000")
-    (imports,) = [stage for stage in recordings.stages() if stage.name == "import"]
-    import_recordings(StageContext("import", tmp_path, "", imports.settings))
-    with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
-        seen = np.isfinite(read_array(file, "observed")).all(axis=(2, 3))
-    assert seen.sum(axis=1).tolist() == [9, 13, 13, 13]
-    assert "shorter than the 12 steps of data.steps (t000.h5: 8); missing frames are ignored" in caplog.text
+def test_a_short_recording_is_named_and_its_rest_counts_as_not_seen(recordings, caplog):
+    recordings.write(lambda recording: recording.frames(slice(9)), "t000")
+    recordings.write(lambda recording: recording.frames(slice(11)), "t002")
+    seen = np.isfinite(recordings.imported().observed).all(axis=(2, 3))
+    assert seen.sum(axis=1).tolist() == [9, 13, 11, 13]
+    said = "shorter than the 12 steps of data.steps (t000.h5: 8, t002.h5: 10); missing frames are ignored"
+    assert [said in record.message for record in caplog.records if record.levelname == "WARNING"] == [True]
+
+
+def rested(recording, frames=150):
+    """A recording that begins with more frames at rest."""
+    positions = np.concatenate([np.repeat(recording.positions[:1], frames, axis=0), recording.positions])
+    pressures = np.concatenate([np.zeros((frames, 2)), recording.actuation])
+    return dataclasses.replace(recording, positions=positions, actuation=pressures)
+
+
+def test_whole_recordings_are_read_without_a_number_of_steps(recordings, caplog):
+    recordings.write(rested, "t000")
+    whole = recordings.imported("data.steps=null")
+    seen = np.isfinite(whole.observed).all(axis=(2, 3))
+    assert seen.sum(axis=1).tolist() == [163, 13, 13, 13]
+    np.testing.assert_array_equal(whole.inputs["pressure"][0, :149], 0.0)
+    assert "shorter" not in caplog.text
+
+
+def test_recordings_are_read_from_where_something_happens(recordings):
+    """More frames at rest at their start change nothing; without the lead, nothing happens in the first steps."""
+    expected = recordings.imported("data.lead=0.02")
+    recordings.write(rested, "t000", "t003")
+    read = recordings.imported("data.lead=0.02")
+    np.testing.assert_allclose(read.observed, expected.observed, atol=1e-9)
+    np.testing.assert_allclose(read.inputs["pressure"], expected.inputs["pressure"])
+    assert "t000.h5: 'T1', 'T2', 'T3' never move by more than" in recordings.refused()
+
+
+def test_constant_inputs_are_pulses(recordings):
+    pulse = "t000: {file: t000.h5, inputs: [1.0e4, 0], onset: 0.025, until: 0.06}"
+    others = ", ".join(f"{name}: {name}.h5" for name in ("t001", "t002", "t003"))
+    trials = f"+data.trials={{{pulse}, {others}}}"
+    pressure = recordings.imported(trials).inputs["pressure"][0]
+    np.testing.assert_allclose(pressure[:, 0], 1e4 * np.array([0, 0, 0.5, 1, 1, 1, 0, 0, 0, 0, 0, 0]), atol=1e-6)
+    np.testing.assert_array_equal(pressure[:, 1], 0.0)
+    with pytest.raises(ResphysError, match=r"t000.until is 0.02: it must be above onset, 0.025 s"):
+        recordings.stages(trials, "data.trials.t000.until=0.02")
+    with pytest.raises(ResphysError, match=r"t000.inputs is null: onset and until are of constant inputs"):
+        recordings.stages(trials, "data.trials.t000.inputs=null")
 
 
 @pytest.mark.parametrize(

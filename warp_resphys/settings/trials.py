@@ -84,6 +84,7 @@ class _Performed(Settings):
     file: Word | None = setting(None, "recording, in the folder of the data")
     inputs: Some[float] | None = setting(None, "constant inputs, one for each chamber, tendon or muscle")
     onset: NotNegative | None = setting(None, "start of the inputs, by the clock of the recording; null: at once", "s")
+    until: Positive | None = setting(None, "end of the inputs, by the same clock; null: that of the recording", "s")
     input_delay: float = setting(0.0, "delay of the inputs against their log", "s")
     labels: Labels | None = setting(None, "labels in the order of its file; null: those of the file")
     session: Word | None = setting(None, "session in which it was recorded; null: one session")
@@ -92,6 +93,16 @@ class _Performed(Settings):
     pull: Vector | None = setting(None, "force at the tip of a simulated body before its release", "N")
     base_motion: MotionSettings | None = setting(None, "in place of data.base_motion")
     obstacle_motion: ObstacleMotions = setting({}, "in place of data.obstacle_motion")
+
+    @model_validator(mode="after")
+    def _is_a_pulse(self) -> Self:
+        if (self.onset is not None or self.until is not None) and self.inputs is None:
+            raise ValueError(
+                "inputs is null: onset and until are of constant inputs, so give these, or leave them out."
+            )
+        if self.until is not None and self.until <= (self.onset or 0.0):
+            raise ValueError(f"until is {self.until:g}: it must be above onset, {self.onset or 0.0:g} s.")
+        return self
 
 
 class TrialSettings(_Performed):
@@ -317,7 +328,10 @@ class ReadingSettings(Settings):
     seconds: Positive | None = setting(None, "evaluated duration after a release", "s")
     rest_seconds: NotNegative = setting(0.05, "duration before the inputs for the rest positions", "s")
     longest_gap: Count = setting(5, "frames; longer occlusions are masked")
-    steps: Natural | None = setting(None, "time steps read of a driven recording")
+    steps: Natural | None = setting(None, "time steps read of a driven recording; null: the whole recording")
+    lead: NotNegative | None = setting(
+        None, "driven recordings are read from here before inputs or markers first change; null: their first frame", "s"
+    )
     parts: Annotated[Some[Natural], AfterValidator(different)] | None = setting(
         None, "chamber, tendon or muscle, from 1, of each column; null: in order"
     )

@@ -313,5 +313,5 @@ def check_motion(recording: Recording, labels: Sequence[str]) -> None:
         raise DataFileError(
             f"{recording.source}: {listed(labels)} never move by more than {_MILLI * farthest:.2f} mm in the "
             f"{len(recording.positions) / recording.rate:.3g} s that are read: follow markers that move, read "
-            "more by data.seconds or data.steps, or leave the recording out."
+            "more by data.seconds or data.steps, begin later by data.lead, or leave the recording out."
         )

@@ -40,8 +40,8 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     payload_inputs(body, data.payload_at, np.array([trial.payload for trial in trials]))
     if begins & {"held", "released"} and data.seconds is None:
         raise InputError("data.seconds is not set: give the time after the release of each trial that is used, in s.")
-    if begins & {*RESTING} and data.steps is None:
-        raise InputError("data.steps is not set: give the number of time steps that are read from each recording.")
+    if begins & {*RESTING} and data.steps is None and data.folder is None:
+        raise InputError("data.steps is not set: give the number of time steps of a simulated trial.")
     drive = drive_of(run, body)
     if drive is not None and data.input_limit is None:
         raise InputError(

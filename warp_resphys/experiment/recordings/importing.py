@@ -227,10 +227,11 @@ def _dataset(
     settings, drive = observer.settings, observer.drive
     cutoff, steps, step = settings.data.cutoff, settings.data.steps, settings.time_step
     frames = max(len(x.moving.positions) if x.settings.is_released else 1 for x in observed)
+    resting = [len(x.moving.positions) for x in observed if x.settings.begins in RESTING]
     begins = ["released" if x.settings.is_released else x.settings.begins for x in observed]
     begins = [UNDER_INPUTS if word == SLACK else word for word in begins]
-    if {*begins} & {*RESTING}:
-        assert steps is not None
+    if resting:
+        steps = steps or max(*resting, 2) - 1
         frames = max(frames, steps + 1)
     shape = (len(observed), frames, len(observer.tracked), 3)
     markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -257,7 +258,7 @@ def _dataset(
             inputs[row, : len(series)], inputs[row, len(series) :] = series, trial.driven[-1]
             if 1 < len(series) < inputs.shape[1]:
                 short.append(f"{trial.raw.source.name}: {len(series)}")
-    if short:
+    if short and settings.data.steps is not None:
         log.warning(
             "import: recordings are shorter than the %d steps of data.steps (%s); missing frames are ignored.",
             *(steps, ", ".join(short)),
@@ -275,7 +276,8 @@ def _dataset(
         motion, points = np.zeros((len(observed), len(at_steps), 6)), observer.simulator.body.mesh.vertices
         for row, (trial, own) in enumerate(zip(observed, poses, strict=True)):
             if own is not None:
-                motion[row] = at_times(own, trial.moving.time, at_steps)
+                zero = 0.0 if trial.settings.is_released else trial.moving.start  # of the simulation
+                motion[row] = at_times(own, trial.moving.time - zero, at_steps)
                 check_steps(motion[row], points, trial.raw.source, what)
         return motion
 

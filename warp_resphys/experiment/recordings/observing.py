@@ -29,6 +29,8 @@ FloatArray = NDArray[np.float64]
 
 _LEAST_RATE = 40.0  # Hz; the release is estimated from the first tenth of a second, i.e. at least four frames
 _MILLI = 1e3
+_SHARE_AT_REST = 0.1  # of the largest displacement of a marker: up to there, the body counts as at rest
+_NOISE = 2e-4  # m; likewise
 _START = Release(0.0, (0, 1))  # of a recording that begins with its release
 
 
@@ -110,7 +112,8 @@ class Observer(Reader):
     def _timed(self, trial: Trial, recording: Recording) -> tuple[Recording, Release | None]:
         """Resamples the recording of a driven body to the steps of the simulation; finds the release of a held body."""
         if not trial.is_released:
-            return resample(recording, 1.0 / self.settings.time_step), None
+            resampled = resample(recording, 1.0 / self.settings.time_step)
+            return resampled if trial.begins == STATIC else self._with_lead(trial, resampled), None
         if recording.rate < _LEAST_RATE:
             raise DataFileError(
                 f"{recording.source} has {recording.rate:g} frames per second, too few to estimate the release of "
@@ -126,6 +129,22 @@ class Observer(Reader):
         if trial.begins == "released":
             return recording, _START
         return recording, release_of(recording, self.tracked_in(trial), self.data.longest_gap)
+
+    def _with_lead(self, trial: Trial, recording: Recording) -> Recording:
+        """Leaves out frames of a body at rest that are earlier than `data.lead` before its inputs or markers change."""
+        if self.data.lead is None or self.data.folder is None:
+            return recording
+        positions, seen = (own.swapaxes(0, 1) for own in (recording.positions, recording.seen))
+        changes = np.zeros(len(recording.positions), dtype=np.bool_)
+        for label, path, known in zip(recording.labels, positions, seen, strict=True):
+            if label in self.tracked_in(trial) and known.any():
+                moved = np.linalg.norm(path - path[known][0], axis=1)
+                changes |= moved > max(_SHARE_AT_REST * np.nanmax(moved), _NOISE)
+        if recording.actuation is not None and self.data.valve == "recorded":
+            changes |= ~self._is_at_rest(recording.actuation - recording.actuation[0])
+        before = np.ceil(max(self.data.lead, self.data.rest_seconds) * recording.rate)
+        first = max(int(np.argmax(changes)) - int(before), 0)
+        return replace(recording.frames(slice(first, None)), start=float(recording.time[first]))
 
     def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
         """Refuses recordings if reference markers moved relative to each other between trials."""
@@ -236,8 +255,7 @@ class Observer(Reader):
         """Observes a body that rests until its inputs begin, or a static pose."""
         static, tracked = trial.begins == STATIC, self.tracked_in(trial)
         if not static:
-            assert self.data.steps is not None
-            check_motion(_frames(recording, 0, self.data.steps + 1), tracked)
+            check_motion(_frames(recording, 0, self.data.steps and self.data.steps + 1), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
         loaded = driven is not None and not self._is_at_rest(driven[:1])[0] and trial.begins != SLACK
         unloaded = trial.payload == 0.0 and not loaded

@@ -125,17 +125,12 @@ class Reader:
         recordings = [self._read(trial) for trial in trials]
         if self.markers.labels == "assigned":
             recordings = self._assigned(trials, recordings)
-        result = []
+        result, lacking = [], dict[tuple[str, str], list[str]]()
         for trial, recording in zip(trials, recordings, strict=True):
             labels = self.labels(trial)
             if absent := [label for label in self.tracked if label not in labels]:
-                others = [label for label in trial.labels or () if label not in owners(labels)]
-                log.log(
-                    logging.WARNING if others else logging.INFO,
-                    "import: %s has no %s, by data.trials.%s.labels%s",
-                    *(trial.name, listed(owners(absent)), trial.name),
-                    f", and {listed(others)} of it are not configured" if others else "",
-                )
+                unused = [label for label in trial.labels or () if label not in owners(labels)]
+                lacking.setdefault((listed(owners(absent)), listed(unused) if unused else ""), []).append(trial.name)
             own, unseen = recording.select(labels), self.view(trial).unseen
             if unseen is not None:
                 assert self.rotation is not None  # A plane needs data.axes.
@@ -148,6 +143,12 @@ class Reader:
                 assert positions is not None
                 own = replace(own, positions=positions, rest=rest)
             result.append(own)
+        for (absent, others), names in lacking.items():
+            log.log(
+                logging.WARNING if others else logging.INFO,
+                "import: no %s in %s, by data.trials.NAME.labels%s",
+                *(absent, ", ".join(names), f", and {others} there are not configured" if others else ""),
+            )
         return result
 
     def _read(self, trial: Trial) -> Recording:
@@ -181,9 +182,11 @@ class Reader:
                 )
             return recording
         if trial.inputs is not None:
-            since = frames + (recording.start - (trial.onset or 0.0)) * rate
-            share = np.ones(len(frames)) if trial.onset is None else np.clip(since, 0.0, 1.0)
-            driven = share[:, None] * np.asarray(trial.inputs, dtype=np.float64)
+            begun, ended = (
+                np.full(len(frames), without) if time is None else np.clip((recording.time - time) * rate, 0.0, 1.0)
+                for time, without in ((trial.onset, 1.0), (trial.until, 0.0))
+            )
+            driven = (begun - ended)[:, None] * np.asarray(trial.inputs, dtype=np.float64)
         if driven is None:
             return recording
         parts, count = data.parts, len(drive.parts)

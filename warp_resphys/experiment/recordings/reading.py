@@ -143,11 +143,11 @@ class Reader:
                 assert positions is not None
                 own = replace(own, positions=positions, rest=rest)
             result.append(own)
-        for (absent, others), names in lacking.items():
+        for (markers, others), names in lacking.items():
             log.log(
                 logging.WARNING if others else logging.INFO,
                 "import: no %s in %s, by data.trials.NAME.labels%s",
-                *(absent, ", ".join(names), f", and {others} there are not configured" if others else ""),
+                *(markers, ", ".join(names), f", and {others} there are not configured" if others else ""),
             )
         return result
 

@@ -68,43 +68,15 @@ def test_columns_are_chosen_by_the_names_of_the_file(tmp_path):
         read_recording(path, table=TableSettings(names={**NAMES, "X": "a.x"}, header_lines=1))
 
 
-def vicon(path, cut=0, subject="Arm:"):
-    """Vicon's export, with analogue devices before the trajectories, and a marker that is not seen in a frame."""
-    lines = ["Devices", "1000", ",,Force,", "Frame,Sub Frame,Fx,Fy", ",,N,N", "1,0,1,2", "1,1,1,2", ""]
-    lines += [
-        "Trajectories",
-        "50",
-        f",,{subject}Tip,,,{subject}Base,,",
-        "Frame,Sub Frame,X,Y,Z,X,Y,Z",
-        ",,mm,mm,mm,mm,mm,mm",
-    ]
-    for frame, tip in enumerate(TIP, 1):
-        lines.append(
-            ",".join([str(frame), "0", *(f"{1e3 * x:.6f}" for x in tip), *(["", "", ""] if frame == 4 else "123")])
-        )
-    path.write_text("\n".join(lines[: len(lines) - cut]) + "\n")
-    return path
-
-
-def test_trajectories_of_vicon_are_read(tmp_path):
-    read = read_recording(vicon(tmp_path / "a.csv"))
-    assert (read.labels, read.rate) == (("Tip", "Base"), 50.0)
-    np.testing.assert_allclose(read.positions[:, 0], TIP, atol=1e-9)
-    np.testing.assert_allclose(read.positions[0, 1], [1e-3, 2e-3, 3e-3])
-    assert np.flatnonzero(~read.seen[:, 1]).tolist() == [3]
-    with pytest.raises(DataFileError, match="no whole section 'Trajectories': export it from Vicon Nexus"):
-        read_recording(vicon(tmp_path / "a.csv", cut=33))
-
-
 def test_recordings_are_converted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_points(tmp_path / "swing", {"/tip": TIP}, 50.0)
     assert "seen" in outcome("convert", "swing/swing.mcap", "recording.bag={markers: {tip: /tip}}").out
-    vicon(tmp_path / "arm.csv")
+    table(tmp_path / "arm.csv", [HEADER.format(" [s]")], [f"{time:.2f}" for time in TIMES])
     assert "seen" in outcome("convert", "arm.csv", "to=other").out
     tip, arm = (read_recording(tmp_path / place) for place in ("recordings/swing.h5", "other/arm.h5"))
     np.testing.assert_allclose(tip.positions[:, 0], TIP, atol=1e-9)
-    assert arm.labels == ("Tip", "Base")
+    assert arm.labels == ("tip",)
     assert "arm.csv" in refusal("convert", "arm.csv", "other/arm.h5")
     assert "nothing to convert" in refusal("convert")
 

@@ -74,6 +74,14 @@ ENGLISH = "Time (s)\tTip X (mm)\tTip Y (mm)\tTip Z (mm)\n"
 FILES = {  # text, encoding, labels, and whether the first one turns
     "qualisys 3D": (qualisys(rows("\t", FRAMES, TIME, TIP, BASE), NAMES_3D), "cp1252", "Spitze_Ä Fuß", False),
     "qualisys 3D, zeros": (qualisys(rows("\t", FRAMES, TIME, UNSEEN, BASE), NAMES_3D), "utf-8", "Spitze_Ä Fuß", False),
+    "qualisys 3D, no frames": (
+        qualisys(rows("\t", UNSEEN, BASE).replace("\n", "\t\n"), NAMES_3D.removeprefix("Frame\tTime\t")),
+        *("utf-8", "Spitze_Ä Fuß", False),
+    ),
+    "qualisys 3D, NULL": (
+        qualisys(rows("\t", FRAMES, TIME, UNSEEN, BASE).replace("\t0\t0\t0\t", "\tNULL\tNULL\tNULL\t"), ""),
+        *("utf-8", "Spitze_Ä Fuß", False),
+    ),
     "qualisys 3D, residuals": (
         qualisys(
             rows("\t", FRAMES, TIP, TIME, BASE, TIME), "Frame\tA X\tA Y\tA Z\tA Residual\tB X\tB Y\tB Z\tB Residual\n"
@@ -98,6 +106,14 @@ FILES = {  # text, encoding, labels, and whether the first one turns
         motive(MARKERS, "X,Y,Z,X,Y,Z", rows(",", FRAMES, TIME, TIP, BASE), "Übung, schnell, 2"),
         *("cp1252", "Spitze_Ä Fuß", False),
     ),
+    "motive, no rotation": (
+        motive(
+            [("Rigid Body", "plate", "Position")] * 2 + [*MARKERS[:3], ("Marker", "Spitze_Ä", "Marker Quality")],
+            "X,Y,X,Y,Z,",
+            rows(",", FRAMES, TIME, TIP[:, :2], TIP, TIME),
+        ),
+        *("utf-8", "Spitze_Ä", False),
+    ),
     "motive, angles": (
         motive(
             [*BODY, *SOLVED],
@@ -114,6 +130,7 @@ FILES = {  # text, encoding, labels, and whether the first one turns
     ),
     "motive, solved": (motive(SOLVED, "X,Y,Z", rows(",", FRAMES, TIME, TIP)), "utf-8", "plate:Marker1", False),
     "nexus": (trajectories("Arm:Tip", "Arm:Base", "*31"), "utf-8", "Tip Base *31", False),
+    "nexus, devices": (DEVICES + trajectories("Arm:Tip", "Arm:Base"), "utf-8", "Tip Base", False),
     "nexus, a colon": (trajectories("Arm:Tip", "Arm:Base", "Unlabeled:u3"), "utf-8", "Tip Base Unlabeled:u3", False),
     "nexus, two subjects": (trajectories("Arm:Tip", "Post:Base", "*31"), "utf-8", "Arm:Tip Post:Base *31", False),
     "tracker": (objects(ROTVEC), "utf-8", "Tip", True),
@@ -153,9 +170,10 @@ def test_an_export_is_read(tmp_path, caplog, name, end):
     read = read_recording(path)
     assert read.labels[: len(labels.split())] == tuple(labels.split())
     assert read.rate == 100.0
-    seen = np.ones(30, bool) if "zeros" not in name else UNSEEN[:, 0] != 0.0
+    zeros = "zeros" in name or "no frames" in name
+    seen = UNSEEN[:, 0] != 0.0 if zeros or "NULL" in name else np.ones(30, bool)
     np.testing.assert_array_equal(read.seen[:, 0], seen)
-    assert ("2 positions at exactly (0, 0, 0) read as occluded" in caplog.text) == ("zeros" in name)
+    assert ("2 positions at exactly (0, 0, 0) read as occluded" in caplog.text) == zeros
     np.testing.assert_allclose(1e3 * read.positions[seen, 0], TIP[seen], atol=1e-5)
     if turns:
         first = read.labels.index(f"{read.labels[0]} +x")
@@ -163,6 +181,50 @@ def test_an_export_is_read(tmp_path, caplog, name, end):
         np.testing.assert_allclose(arms[seen], 50.0 * TURN.as_matrix().swapaxes(1, 2)[seen], atol=1e-5)
     else:
         assert not any(label.endswith("+x") for label in read.labels)
+
+    assert ("rigid bodies without a position and a quaternion are not read ('plate')" in caplog.text) == (
+        name == "motive, no rotation"
+    )
+
+
+@pytest.mark.filterwarnings("ignore:A text is not in UTF-8")
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("qualisys 3D", "FREQUENCY\t100", "FREQUENCY\tEXT", "does not say how many frames a second"),
+        ("qualisys 3D", "FREQUENCY\t100", "FREQUENCY", "does not say how many frames a second"),
+        ("qualisys 3D", "_NAMES\tSpitze_Ä", "_NAMES", "numbers do not fit 1 markers"),
+        ("qualisys 3D", "MARKER_NAMES", "NAMES", "has no MARKER_NAMES"),
+        ("qualisys 3D, no frames", "FRAMES\t30", "FRAMES\t31", "has 30 of the 31 frames of its NO_OF_FRAMES, and no"),
+        ("qualisys 6D", "Fuß Rot[8]", "Fuß Rest", r"rigid body Fuß has no column 'Fuß\.rot\[8\]'"),
+        ("qualisys 3D", "\n3\t", "\n2\t", r"line 11: the time or frame does not rise"),
+        ("motive", "Millimeters", "Cubits", "gives positions in 'Cubits'"),
+        ("motive", "Fuß", "Spitze_Ä", r"two columns named 'Spitze_Ä\.x'"),
+        ("motive", "Marker", "Bone", "holds no markers"),
+        ("motive", "Frame,Time", "Time", "has no line that begins with 'Frame'"),
+        ("nexus", ",mm\n", ",m\n", "no markers in one unit and at one rate"),
+        ("nexus", "Frame,Sub", "Sub", "has no whole section 'Trajectories'"),
+        ("nexus", "Trajectories", "Joints", "has no markers in one unit"),
+        ("tracker, both", "Trajectories\n100", "Trajectories\n50", "rates: '100.0', '50.0' Hz"),
+    ],
+)
+def test_a_wrong_export_is_named(tmp_path, name, old, new, message):
+    text, encoding, *_ = FILES[name]
+    assert old in text
+    (tmp_path / "a.csv").write_bytes(text.replace(old, new).encode(encoding))
+    with pytest.raises(DataFileError, match=rf"a\.csv.*{message}"):
+        read_recording(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("names", ["", NAMES_3D])
+def test_the_frames_of_an_export_are_counted(tmp_path, names):
+    lines = qualisys(rows("\t", FRAMES, TIME, TIP, BASE), names).split("\n")
+    kept = [line for number, line in enumerate(lines, start=31 - len(lines)) if number not in (0, 6, 7)]
+    (tmp_path / "a.tsv").write_text("\n".join(kept))
+    read = read_recording(tmp_path / "a.tsv")
+    np.testing.assert_array_equal(np.flatnonzero(~read.seen.any(axis=1)), [5, 6])
+    np.testing.assert_allclose(1e3 * read.positions[[0, 4, 7, 28], 0], TIP[[1, 5, 8, 29]], atol=1e-5)
+    assert read.start == pytest.approx(0.01)
 
 
 PLANAR = np.column_stack([TIP[:, :2], 0 * TIME])

@@ -174,7 +174,7 @@ def _read_table(
             units |= {unit} if unit and axis in AXES else set()
         elif unit is not None and unit in channel_units:
             channels[column] = SI_PER_ACTUATION_UNIT[unit]
-        elif column != clock:
+        elif column != clock and any(number(row[column]) is not None for row in rows[first:] if len(row) > column):
             kept = {*coordinates, clock, *(other for other, (_, own) in columns.items() if own in channel_units)}
             heads = {other: own if unit is None else f"{own} [{unit}]" for other, (own, unit) in columns.items()}
             read = [f'"{heads[other]}"' if other in kept else "null" for other in range(width)]

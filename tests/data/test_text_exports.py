@@ -233,7 +233,7 @@ BARE = {  # of tables without units, or without a rate
     "pt1_X,pt1_Y,pt1_Z,pt2_X,pt2_Y,pt2_Z": (rows(",", TIP, BASE), TIP, ("pt1", "pt2")),
     "mass_A\nt\tx\ty": (rows("\t", TIME, TIP[:, :2]), PLANAR, ("mass_A",)),
     "# t x y z": (rows(" ", TIME, TIP), TIP, ("marker 1",)),
-    '"Time (ms)","Ball X","Ball Y"': (
+    '"Time (ms)","Ball/X","Ball/Y"': (
         "\n".join(f'"{x}","{y}","{z}"'.replace(".", ",") for x, y, z in np.column_stack([1e3 * TIME, TIP[:, :2]])),
         *(PLANAR, ("Ball",)),
     ),
@@ -268,6 +268,17 @@ def test_the_encoding_is_said_once_a_command_and_a_refusal_shows_what_to_write(t
     assert "has no header that is known" in sentence
     table = re.search(r"recording\.table=\S+: \[.*\]\}", sentence)[0].replace('"tip.y [mm]"', '"tip.z [mm]"')
     assert "30 frames, 0.30 s at 100 Hz" in outcome("inspect", "log.csv", table.replace("null", '"tip.y [mm]"')).out
+
+
+def test_a_time_in_an_unknown_unit_is_not_taken_for_seconds_and_words_are_not_read(tmp_path):
+    path, data = tmp_path / "a.csv", rows(",", 10.0 * FRAMES, TIP).replace("\n", ",ok\n")
+    path.write_text(f"Time,Tip/X,Tip/Y,Tip/Z,remark\n{data}")
+    with pytest.raises(
+        DataFileError, match=r"in which unit its time is, which rises by more than 1 a line: write 'time"
+    ):
+        read_recording(path, units="mm")
+    path.write_text(f"Time (msec),Tip/X,Tip/Y,Tip/Z,remark\n{data}")
+    assert read_recording(path, units="mm").rate == 100.0
 
 
 def test_text_of_windows_is_read_with_a_warning_and_other_files_are_refused(tmp_path):

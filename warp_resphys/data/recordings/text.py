@@ -49,7 +49,7 @@ _AXIS = r"(?P<axis>q?[xyz]|qw)"
 _DOTTED = re.compile(rf"(?P<label>.+)\.{_AXIS}", re.IGNORECASE)
 _FORMS = (  # of names of coordinates; all but the first need a second axis beside them
     _DOTTED,
-    re.compile(rf"(?P<label>.+)[ _]{_AXIS}", re.IGNORECASE),  # tip_x
+    re.compile(rf"(?P<label>.+)[ _/]{_AXIS}", re.IGNORECASE),  # tip_x
     re.compile(r"(?P<axis>[xyz])[ _]?(?P<label>.+)", re.IGNORECASE),  # x1
     re.compile(r"(?P<label>.*)(?P<axis>[xyz])", re.IGNORECASE),  # tipX, x
 )
@@ -162,6 +162,12 @@ def _read_table(
         stamps = [row[clock] for row in rows[first:] if len(row) > clock and row[clock]]
         if unit == "iso" or (unit is None and stamps and number(stamps[0]) is None):
             rows, unit = _since_first(rows, first, clock, path), "s"
+        known = [value for value in map(number, stamps) if value is not None]
+        if unit is None and len(known) > 1 and known[-1] - known[0] > len(known):
+            raise DataFileError(
+                f"{path} does not say in which unit its time is, which rises by more than 1 a line: write 'time [ms]' "
+                "or 'time [s]' above it."
+            )
         if (seconds := _SECONDS.get((unit or "s").lower())) is None:
             raise DataFileError(
                 f"{path} gives its time in '{unit}': it must be in s, ms, us, ns or iso, as in 'time [s]'."

@@ -72,8 +72,10 @@ _LITERAL = re.compile(r"(``.+?``|`.+?`)")
 _MARKUP = re.compile(r"(?<!\\)([|*])")
 
 
-def _escape(_app: Sphinx, _what: str, _name: str, _found: Any, _options: Any, lines: list[str]) -> None:
+def _escape(_app: Sphinx, what: str, _name: str, _found: Any, _options: Any, lines: list[str]) -> None:
     """Docstrings are plain text beside their literals: a bar is a norm and a star a product, not markup."""
+    if what == "module":
+        del lines[:1]  # it stands below the heading, by `extensions/api_pages.py`
     for number, line in enumerate(lines):
         parts = _LITERAL.split(line)
         parts[::2] = [_MARKUP.sub(r"\\\1", part) for part in parts[::2]]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import runpy
 import shutil
 import subprocess
 import tomllib
@@ -162,3 +163,10 @@ def test_fragments_have_a_valid_name_and_one_entry():
         assert re.fullmatch(rf"[a-z0-9]+(-[a-z0-9]+)*\.({types})\.md", path.name), path.name
         assert not path.read_text(encoding="utf-8").lstrip().startswith(("-", "#")), path.name
     assert PROJECT["tool"]["towncrier"]["start_string"].strip() in text("CHANGELOG.md")
+
+
+def test_pages_of_the_api_have_the_first_sentences_of_their_modules():
+    pages = runpy.run_path(str(REPOSITORY / "docs" / "extensions" / "api_pages.py"))["pages"]()
+    assert len(pages) > 8
+    for path, expected in pages.items():
+        assert path.read_text(encoding="utf-8") == expected, "run python docs/extensions/api_pages.py"

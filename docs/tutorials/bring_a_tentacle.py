@@ -10,7 +10,7 @@
 #
 # A tapered silicone rod hangs from its base, pulled by two tendons. It was recorded at rest, in one pose after
 # another, with markers without names. The mesh is generated from the rod's dimensions.
-# [The guide](../bring_your_robot/tentacle.md) explains how to adapt this.
+# `experiment=tentacle` is the configuration of a real one. [Your robot](../bring_your_robot.md) explains the steps.
 #
 # ## Poses
 #

@@ -354,22 +354,16 @@ def test_a_changed_recording_is_imported_again(shelf):
     assert fingerprint(acquisition_stages(parse(RunSettings, shelf.config))[0], {}) != before
 
 
-TUTORIAL = [ROOT / "docs" / f"{page}.md" for page in ("bring_your_robot", "bring_your_robot/tentacle")]
-
-
-def tutorial_blocks():
-    """Languages and texts of the code blocks of the guide, in its order."""
-    text = "\n".join(page.read_text(encoding="utf-8") for page in TUTORIAL)
-    return re.findall(r"```(\w*)\n(.*?)```", text, flags=re.DOTALL)
+TUTORIAL = ROOT / "docs" / "bring_your_robot.md"
 
 
 def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     """Its mesh, its configuration and its output, on the recordings that it was written with."""
-    blocks = tutorial_blocks()
-    (mesh,), (written, _) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
-    log, _ = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
+    blocks = re.findall(r"```(\w*)\n(.*?)```", TUTORIAL.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (mesh,), (written,) = ([text for kind, text in blocks if kind == wanted] for wanted in ("python", "yaml"))
+    (log,) = [text.splitlines() for _, text in blocks if text.startswith("import: ")]
     monkeypatch.chdir(tmp_path)
-    exec(compile(mesh, TUTORIAL[0].name, "exec"), {})
+    exec(compile(mesh, TUTORIAL.name, "exec"), {})
     (tmp_path / "recordings").symlink_to(shared_data / "beam_mocap")
     place = tmp_path / "configs" / "experiment" / "my_robot.yaml"
     place.parent.mkdir(parents=True)

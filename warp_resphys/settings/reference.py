@@ -21,10 +21,10 @@ from .run import RunSettings
 
 _HEAD: Final = """# Settings
 
-All keys of a run, with their defaults, values and units [in brackets]; [Bring your robot](bring_your_robot.md) shows
-the few that a configuration needs. Set one with `key=value` on the command line, or in a file of `configs/experiment`;
-`warp-resphys --cfg job` shows the values of a run. `NAME` stands for any name. A key without a default is required.
-Keys of `simfree` that are left out are as in `network` and `trainer`.
+All keys of a run: `key=default`, its meaning, and its values with their unit [in brackets].
+[Your robot](bring_your_robot.md) shows the few that a configuration needs. Set one with `key=value` on the command
+line, or in a file of `configs/experiment`; `warp-resphys --cfg job` shows the values of a run. `NAME` stands for any
+name. A key without a default is required. Keys of `simfree` that are left out are as in `network` and `trainer`.
 
 `python -m warp_resphys.settings.reference configs/settings.schema.json` writes a JSON Schema, with which editors
 complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`.
@@ -61,7 +61,7 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
     inherited = _inherited(path)
     below: list[tuple[Schema, str, str]] = []
 
-    def rows(members: Mapping[str, Schema], required: list[str]) -> Iterator[str]:
+    def entries(members: Mapping[str, Schema], required: list[str]) -> Iterator[str]:
         lines = []
         for name, key in members.items():
             if name in inherited or ("const" in key and kinds[1:]):
@@ -78,10 +78,10 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
             default = key.get("default")
             word = default if isinstance(default, str) else json.dumps(default, separators=(",", ":"))
             set_to = name if name in required else f"{name}={word}"
-            cells = (f"`{set_to}`", values, key.get("description", ""))
-            lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+            meaning = f"{key['description']} ({values})" if "description" in key else values
+            lines.append(f"- `{set_to}`: {meaning}")
         if lines:
-            yield "\n".join(["| key=default | values | meaning |", "|---|---|---|", *lines, ""])
+            yield "\n".join([*lines, ""])
 
     yield f"## {f'`{path}`' if path else 'The run'}\n"
     about = kinds[0].get("description", "") if len(kinds) == 1 and path else ""
@@ -90,13 +90,13 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
     if inherited:
         names = ", ".join(f"`{name}`" for name in inherited if name != "material")
         yield f"{(_OF_SHAPE if path.startswith('shapes') else _REPLACED).format(names)}\n"
-    yield from rows(common, kinds[0].get("required", []))
+    yield from entries(common, kinds[0].get("required", []))
     for kind in kinds if kinds[1:] else []:
         own = {name: key for name, key in kind["properties"].items() if name not in common}
         words = [f"`{name}: {key['const']}`" for name, key in own.items() if "const" in key]
         yield f"### {' '.join(words)}\n"
         yield f"{kind.get('description', '')}\n"
-        yield from rows(own, kind.get("required", []))
+        yield from entries(own, kind.get("required", []))
     for inner, at, note in below:
         yield from _sections(schema, inner, at, note, shown)
 

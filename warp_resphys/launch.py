@@ -43,7 +43,7 @@ from .commands import (
     run_label,
 )
 from .io.atomic import is_disk_full
-from .io.errors import InputError, ResphysError, ResphysWarning, did_you_mean
+from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected
 from .io.settings import Settings, parse
 from .option_files import names_are_texts
@@ -179,12 +179,6 @@ def _own_options() -> list[str]:
     packaged = resources.files(CONFIG_PACKAGE)
     for path in sorted(folder.glob("*/*.yaml")):
         name = path.relative_to(Path.cwd())
-        try:
-            readable = not path.read_text(encoding="utf-8").startswith("\ufeff")
-        except UnicodeDecodeError:
-            readable = False
-        if not readable:
-            raise InputError(f"{name} is not in UTF-8 without a byte-order mark: save it so in your editor.")
         if packaged.joinpath(path.parent.name, path.name).is_file():
             print(f"warning: {name} is ignored: the package has an option of that name", file=sys.stderr)
     return ["--config-dir", str(folder)]

@@ -22,6 +22,7 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import OmegaConf
 
 from .io.setting_errors import is_text
+from .io.text import read_text
 
 _QUOTE: Final = "'"
 _REPLACE: Final = "_replace_"  # in a group of settings: it replaces that of the files below, which Hydra would merge
@@ -37,7 +38,7 @@ class _OptionSource(file_config_source.FileConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         name = config_path.removesuffix(_EMPTYING)
         path = Path(self.path, self._normalize_file_name(name)).resolve()
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         header = self._get_header_dict(text)
         package = header["package"] or name.rpartition("/")[0].replace("/", ".")
         config = OmegaConf.load(_with_quotes(text, () if package == "_global_" else tuple(package.split(".")), path))

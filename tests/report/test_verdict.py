@@ -10,7 +10,7 @@ from support.configured import settings
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.report.data import trial_errors, untrained
-from warp_resphys.report.page import NO_BREAK_SPACE
+from warp_resphys.report.page import NO_BREAK_SPACE, write_page
 from warp_resphys.report.verdict import LEAST_TRIALS, best_pair, known_errors, model_name, results_table, verdict
 from warp_resphys.settings.learning import IdentifySettings
 
@@ -25,7 +25,7 @@ IDENTIFY = parse(
         "elastic": {"poissons_ratio": {"lower": 0.48, "upper": 0.4995}},
     },
 )
-WORDS = {"title": "My robot", "test_titles": ("weights of the paper", "other loads")}
+WORDS = {"heading": "My robot", "test_titles": ("weights of the paper", "other loads")}
 SETTINGS = SimpleNamespace(name="my_robot", data=None, identify=IDENTIFY, markers=0, **WORDS)
 
 
@@ -195,3 +195,11 @@ class TestSentences:
 
 def test_models_that_are_equal_count_as_the_simplest():
     assert best_pair(known_errors({"sysid": [1.0], "law": [1.0], "rest": [2.0], "linear": [2.0]})) == ("sysid", "rest")
+
+
+def test_a_quick_look_says_so_in_the_table_and_at_the_top_of_the_page(tmp_path):
+    run = settings("budget=quick")
+    assert results_table(metrics_of({"sysid": [1.0]}), run).head.startswith("Oscillating beam, quick look: mean error")
+    metrics = {"seconds": {}, "peak_memory_gib": 1.0, "versions": {}, "device": "cpu"}
+    write_page(tmp_path / "report.html", [], run, [], metrics)
+    assert "<h1>Oscillating beam, quick look</h1>" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -263,7 +263,7 @@ def write_page(
         script = resources.files(__package__).joinpath("view.js").read_text(encoding="utf-8")
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     page = environment.get_template("page.html").render(
-        title=run.title,
+        title=run.heading,
         experiment=run.name,
         verdict=verdict,
         parts=parts,

@@ -119,7 +119,7 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
     of = "vertices" if settings.markers is None else "markers"
     lacking = [f"{model_name(model)} ({why})" for model, why in missing_baselines(metrics).items()]
     note = f"Missing: {'; '.join(lacking)}." if lacking else ""
-    return PageTable(f"{settings.title}: mean error of the {of} [mm]", list(columns), rows, note)
+    return PageTable(f"{settings.heading}: mean error of the {of} [mm]", list(columns), rows, note)
 
 
 def error_cell(errors: Sequence[float | None], with_interval: bool = False) -> Cell:

@@ -134,6 +134,11 @@ class RunSettings(SimulatorSettings):
     budget: Word = setting("full", "full or quick")
 
     @property
+    def heading(self) -> str:
+        """Title of its results."""
+        return f"{self.title}, quick look" if self.budget == "quick" else self.title
+
+    @property
     def recorded(self) -> RecordedData | None:
         """Data of bodies that are observed through markers; None where every vertex is observed."""
         return self.data if isinstance(self.data, RecordedData) else None

@@ -26,7 +26,7 @@ from .nuisance import NuisanceFit, Nuisances
 from .parameters import Bounds, check_names, split_name
 from .placement import Accuracy, DisplacedMarkers
 from .replay import Replay, Start, exact
-from .uncertainty import FloatArray, LinearMisfit, LinearSystem, Uncertainty, left_out, uncertainty_of
+from .uncertainty import FloatArray, LinearMisfit, LinearSystem, LinearTrial, Uncertainty, left_out, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
@@ -158,19 +158,20 @@ class Misfit(BoundedMisfit):
             self.failure = str(error)
             return None
         fitted, nuisances = self._fit(series, self.prior_weight)
-        rows, columns, counts = list[FloatArray](), list[FloatArray](), list[list[float]]()
+        trials = list[LinearTrial]()
         for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
             observed = self._replays[number][0].trials
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
             flat = weighted.reshape(*weighted.shape[:2], -1)
             slopes = self._slopes(flat[1:] - flat[:1], moves, steps, observed)  # (R, 3 T M, P)
+            columns = nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
             shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
             shown = shown if self._shares is None else self._shares * shown
-            rows.append(weighted[0].reshape(*weighted.shape[1:3], -1))
-            counts.append((observed.observed.shape[-1] * shown.sum(1)).tolist())
-            columns.append(slopes)
-        groups = [replay.trials for replay, _ in self._replays]
-        return LinearSystem(groups, rows, columns, counts, nuisances, self.prior_rows(unit), self.prior_weight)
+            rows = weighted[0].reshape(*weighted.shape[1:3], -1)
+            seen = (observed.observed.shape[-1] * shown.sum(1)).tolist()
+            of_trials = zip(observed.names, rows, slopes, columns, seen, strict=True)
+            trials += [LinearTrial(name, observed.session, *own) for name, *own in of_trials]
+        return LinearSystem(trials, nuisances, self.prior_rows(unit), self.prior_weight)
 
     def _slopes(
         self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: Trials

@@ -52,44 +52,6 @@ class Nuisances:
         named = {session: placement.plain(labels) for session, placement in self.sessions.items() if session}
         return self.common.plain(labels) | ({"sessions": named} if named else {})
 
-    def projected(self, jacobians: Sequence[FloatArray], weight: float) -> tuple[list[FloatArray], FloatArray]:
-        """Derivatives of the residuals, and of those of the prior, where places and delays follow the parameters.
-
-        To first order they follow as in a linear problem (Kaufman, BIT 15 (1975) 49).
-
-        Args:
-            jacobians: (R, D, P) of each group, at constant places and delays.
-            weight: root of the weight of the prior.
-
-        Returns:
-            (D, P) of each trial, and (K, P).
-        """
-        if not self.columns:
-            return [own for jacobian in jacobians for own in jacobian], np.zeros((0, jacobians[0].shape[-1]))
-        pairs = [*zip(self.columns, jacobians, strict=True)]
-        rows, slopes = (np.concatenate([x.reshape(-1, x.shape[-1]) for x in of]) for of in zip(*pairs, strict=True))
-        follows = np.linalg.solve(rows.T @ rows + weight**2 * np.eye(rows.shape[1]), rows.T @ slopes)
-        return [own for a, j in pairs for own in j - a @ follows], -weight * follows
-
-    def change(self, session: str, residuals: Sequence[FloatArray], weight: float) -> list[float] | None:
-        """(3 M + 6,) change of a session's placement by which residuals have their least squares.
-
-        Args:
-            session: name of the session.
-            residuals: (R, D) of each group, to first order with the places and delays as they are.
-            weight: root of the weight of the prior.
-
-        Returns:
-            The change; None if places are exact.
-        """
-        if self.common is None:
-            return None
-        columns = np.concatenate([own.reshape(-1, own.shape[-1]) for own in self.columns])
-        right = columns.T @ np.concatenate([own.ravel() for own in residuals]) + weight * self.rows
-        moved = -np.linalg.solve(columns.T @ columns + weight**2 * np.eye(len(right)), right)
-        moves = self.moves[session]
-        return [float(value) for value in moves @ moved[: moves.shape[1]]]
-
 
 class NuisanceFit:
     """Fits places and delays to simulated points, by Gauss-Newton.

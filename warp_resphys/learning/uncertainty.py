@@ -22,7 +22,6 @@ from itertools import takewhile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.trials import Trials
 from .nuisance import Nuisances
 from .parameters import Bounds
 
@@ -148,53 +147,57 @@ class LinearMisfit:
 
 
 @dataclass(frozen=True)
+class LinearTrial:
+    """Weighted residuals of a trial at P parameters, and their derivatives."""
+
+    name: str
+    session: str
+    rows: FloatArray  # (T, 3 M) residuals
+    slopes: FloatArray  # (3 T M, P) by the parameters, at constant places and delays
+    columns: FloatArray  # (3 T M, K) by places and delays
+    seen: float  # number of the coordinates that were seen
+
+
+@dataclass(frozen=True)
 class LinearSystem:
-    """Weighted residuals at P parameters, and their derivatives at constant places and delays.
+    """Weighted residuals of trials, of the priors (K',) of parameters and of places and delays, with their weight."""
 
-    Attributes:
-        groups: of R trials.
-        rows: (R, T, 3 M) residuals, by group.
-        slopes: (R, 3 T M, P) derivatives by the parameters, by group.
-        seen: number of the coordinates that were seen, by group and trial.
-        nuisances: places and delays.
-        prior: (K,) weighted residuals of the priors of parameters, and (K, P).
-        weight: of the priors.
-    """
-
-    groups: Sequence[Trials]
-    rows: list[FloatArray]
-    slopes: list[FloatArray]
-    seen: list[list[float]]
+    trials: Sequence[LinearTrial]
     nuisances: Nuisances
-    prior: tuple[FloatArray, FloatArray]
-    weight: float
+    prior: tuple[FloatArray, FloatArray]  # (K',), and (K', P)
+    weight: float  # of the priors
+
+    def without(self, number: int) -> "LinearSystem":
+        """Returns the system without a trial."""
+        return replace(self, trials=[*self.trials[:number], *self.trials[number + 1 :]])
+
+    def followed(self, values: Sequence[FloatArray], prior: FloatArray | float = 0.0) -> FloatArray:
+        """Returns the change (K, ...) of places and delays with the least squares of values, priors included.
+
+        Args:
+            values: (3 T M, ...) by trial.
+            prior: (K, ...) weighted residuals of the priors of places and delays.
+        """
+        normal = np.sum([own.columns.T @ own.columns for own in self.trials], axis=0)
+        right = np.sum([own.columns.T @ of for own, of in zip(self.trials, values, strict=True)], axis=0)
+        right = right + math.sqrt(self.weight) * prior
+        return np.asarray(-np.linalg.solve(normal + self.weight * np.eye(len(normal)), right))
 
     def misfit(self) -> LinearMisfit:
-        """Returns the misfit in which places and delays follow the parameters."""
-        jacobians, further = self.nuisances.projected(self.slopes, math.sqrt(self.weight))
-        counts = [count for counts in self.seen for count in counts]
-        trials = [*zip((own for rows in self.rows for own in rows), jacobians, counts, strict=True)]
+        """Returns the misfit in which places and delays follow the parameters (Kaufman, BIT 15 (1975) 49)."""
+        follow = self.followed([own.slopes for own in self.trials])
+        trials = [(own.rows, own.slopes + own.columns @ follow, own.seen) for own in self.trials]
         rows, slopes = self.prior
+        further = math.sqrt(self.weight) * follow
         return LinearMisfit(trials, np.concatenate([rows, self.nuisances.rows]), np.concatenate([slopes, further]))
-
-    def without(self, group: int, row: int) -> "LinearSystem":
-        """Returns the system in which a trial has no residuals."""
-
-        def blank(values: Sequence[FloatArray]) -> list[FloatArray]:
-            result = [*values]
-            if result:
-                result[group] = result[group].copy()
-                result[group][row] = 0.0
-            return result
-
-        nuisances = replace(self.nuisances, columns=blank(self.nuisances.columns))
-        return replace(self, rows=blank(self.rows), slopes=blank(self.slopes), nuisances=nuisances)
 
     def places(self, step: FloatArray, session: str) -> list[float] | None:
         """(3 M + 6,) change of a session's placement with a step (P,) of the parameters; None if places are exact."""
-        pairs = zip(self.rows, self.slopes, strict=True)
-        residuals = [rows.reshape(len(rows), -1) + slopes @ step for rows, slopes in pairs]
-        return self.nuisances.change(session, residuals, math.sqrt(self.weight))
+        if self.nuisances.common is None:
+            return None
+        moved = self.followed([own.rows.ravel() + own.slopes @ step for own in self.trials], self.nuisances.rows)
+        moves = self.nuisances.moves[session]
+        return [float(value) for value in moves @ moved[: moves.shape[1]]]
 
 
 def left_out(system: LinearSystem, bounds: Mapping[str, Bounds], unit: FloatArray) -> dict[str, LeftOut]:
@@ -207,20 +210,19 @@ def left_out(system: LinearSystem, bounds: Mapping[str, Bounds], unit: FloatArra
         bounds: range of each of the P parameters.
         unit: (P,) the minimum, in fractions of the ranges.
     """
-    order = [(group, row) for group, rows in enumerate(system.rows) for row in range(len(rows))]
     slopes = np.array([range_.slope(u) for range_, u in zip(bounds.values(), unit, strict=True)])
     result: dict[str, LeftOut] = {}
-    for number, (group, row) in enumerate(order if len(order) > 1 else ()):
-        others, trials = system.without(group, row), system.groups[group]
+    for number, out in enumerate(system.trials if len(system.trials) > 1 else ()):
+        others = system.without(number)
         linear = others.misfit()
-        kept = linear.trials[:number] + linear.trials[number + 1 :]
-        variance = sum(float(np.square(rows).sum()) for rows, _, _ in kept) / sum(seen for _, _, seen in kept)
+        seen = sum(own.seen for own in others.trials)
+        variance = sum(float(np.square(own.rows).sum()) for own in others.trials) / seen
         curvature = 0.5 * linear.gauss_newton + _UNIFORM * variance * np.eye(len(unit))
         step = np.asarray(-0.5 * np.linalg.lstsq(curvature, linear.gradient)[0], dtype=np.float64)
-        uncertainty = uncertainty_of(kept, linear.prior_slopes, system.weight, bounds, unit)
-        result[trials.names[row]] = LeftOut(
+        uncertainty = uncertainty_of(linear.trials, linear.prior_slopes, system.weight, bounds, unit)
+        result[out.name] = LeftOut(
             change=dict(zip(bounds, (slopes * step).tolist(), strict=True)),
-            placement=others.places(step, trials.session),
+            placement=others.places(step, out.session),
             deviation=uncertainty.deviation,
             correlation=uncertainty.correlation,
         )

@@ -78,7 +78,7 @@ class TestSimulatedLaboratory:
         assert tested["outline_mm"]["sysid"] < 0.5 * tested["outline_mm"]["simulation"]
         assert tested["outline_mm"]["simulation"] < tested["outline_mm"]["undeformed"]
         assert tested["overlap"]["sysid"] > 0.95
-        assert "In 1 pose kept back the simulated pictures are" in out
+        assert "(on 1 pose kept back)." in out
         assert "Young's modulus [kPa]: 12" in out
         page = (folder / "run" / "report.html").read_text()
         assert "Young&#39;s modulus" in page
@@ -416,11 +416,12 @@ def test_the_verdict_says_where_an_identification_is_no_better():
         none = dict.fromkeys(distances)
         return PictureResult("a", "", tested, 1, distances, distances, distances, none, none)
 
-    better = picture_verdict([result(0.5, 2.0, True), result(9.0, 1.0, False)])
-    assert "no better" not in better
-    assert "0.500" in better
-    assert "hardly depend on it" in picture_verdict([result(0.95, 1.0, True)])
-    assert "no better than what needs none" in picture_verdict([result(1.5, 1.0, True)])
-    assert "(none was kept back)" in picture_verdict([result(0.5, 2.0, False)])
+    assert picture_verdict([result(0.5, 2.0, True), result(9.0, 1.0, False)]) == [
+        "The identified simulator has 75 % less error than the uncorrected simulator (on 1 pose kept back)."
+    ]
+    assert picture_verdict([result(0.95, 1.0, True)])[1].startswith("Check before use: these poses hardly depend on ")
+    (worse,) = picture_verdict([result(2.0, 1.0, True)])
+    assert worse.startswith("The uncorrected simulator has 50 % less error than the identified simulator (on 1 pose")
+    assert picture_verdict([result(0.5, 2.0, False)])[1] == "Check before use: no pose was kept back."
     away = replace(result(0.5, 2.0, True), overlap=dict.fromkeys(("undeformed", "simulation", "sysid"), 0.1))
-    assert "a is hardly seen where it was simulated" in picture_verdict([away])
+    assert "'a' hardly overlap: check the camera" in picture_verdict([away])[1]

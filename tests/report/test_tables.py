@@ -83,19 +83,19 @@ class TestErrors:
         table = horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
         assert table.columns == ["SysID", "ResPhys"]
         assert {row.head: row.cells for row in table.rows} == {
-            "First 5 s": [Cell("2.00 ± 0.10", "7.51 ± 3.63"), Cell("1.00 ± 0.10", "5.79 ± 3.09")],
-            "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50 ± 0.10", "6.10 ± 3.22")],
+            "First 5 s": [Cell("2.00", "7.51 ± 3.63"), Cell("1.00", "5.79 ± 3.09")],
+            "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50", "6.10 ± 3.22")],
             "Growth": [Cell(NONE, "+0.8 %"), Cell("+50.0 %", "+5.4 %")],
         }
         (row,) = horizon_table({"horizons": {"5": ERRORS}}, {}).rows
-        assert row.cells == [Cell("2.00 ± 0.10"), Cell("1.00 ± 0.10")]
+        assert row.cells == [Cell("2.00"), Cell("1.00")]
         assert horizon_table({}, {}) is None
 
     def test_by_scale_of_the_inputs(self):
         table = scale_table({"1.25": MORE, "1": ERRORS})
         assert {row.head: row.cells for row in table.rows} == {
-            "\N{MULTIPLICATION SIGN} 1": [Cell("2.00 ± 0.10"), Cell("1.00 ± 0.10", f"{MINUS}50 %")],
-            "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.50 ± 0.10")],
+            "\N{MULTIPLICATION SIGN} 1": [Cell("2.00"), Cell("1.00", f"{MINUS}50 %")],
+            "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.50")],
         }
         assert scale_table({}) is None
 
@@ -230,6 +230,10 @@ def test_rows_of_markers_that_were_never_seen():
     assert table.columns == ["t"]
     assert [row.head for row in table.rows] == [*many, "Root mean square"]
     assert table.rows[3].cells == [Cell("0.10", "left out")]
+    fit = {"rms_mm": 0.5, "residual_mm": many | {"4": 0.7, "5": None}, "outliers": []}
+    table = residual_table({f"t{k}": fit for k in range(9)})
+    assert table.columns == ["Largest", "Marker", "Root mean square"]
+    assert [cell.text for cell in table.rows[8].cells] == ["0.70", "4", "0.50"]
 
 
 class TestWhatIsShown:

@@ -60,9 +60,10 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
     metrics = _metrics(folder, run)
     write_json(folder / METRICS, metrics)
-    from ..report.ablation_page import ablation_table  # matplotlib
+    from ..report.ablation_page import ablation_table, verdict  # matplotlib
 
-    show(ablation_table(metrics["by_markers"]), f"Report: {folder / REPORT}")
+    rows = metrics["by_markers"]
+    show(ablation_table(rows), verdict(rows, metrics["uncorrected_mm"]), f"Report: {folder / REPORT}")
 
 
 def generate_motion(context: StageContext) -> None:

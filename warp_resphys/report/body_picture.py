@@ -19,7 +19,7 @@ from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.surface import closest_points
 from .bodies import face_edges, obstacle_layers, sharp_edges, stems
 from .data import Recordings
-from .figures import CHAMBER_COLOURS, in_style
+from .figures import CHAMBER_COLOURS, WIDE, in_style
 from .obstacles import ObstacleSurface
 from .render import (
     BODY,
@@ -45,7 +45,6 @@ _LIFT: Final = 2e-3  # Height of lines above their surface, over the body's long
 _DOT: Final = 0.011  # Radius of a marker, over the body's longest side.
 _MARGIN: Final = 0.02  # Around the body, over its longer side.
 _LONGER_SIDE: Final = 1400  # of a view [px]
-_DPI: Final = 200
 _NARROWEST: Final = 0.3  # width of a view over its height
 _ENTRY: Final = 1.9  # Width of an entry of the legend [inch]
 _LINE: Final = 0.24  # Height of a line of text [inch]
@@ -124,7 +123,7 @@ def _line(size: Sequence[int]) -> float:
 
 def _save(figure: Figure, path: Path) -> None:
     with atomic_path(path) as target:
-        figure.savefig(target, format="png", dpi=_DPI)
+        figure.savefig(target, format="png")
 
 
 @in_style()
@@ -203,13 +202,13 @@ def draw_registration(path: Path, recordings: Recordings, fixed: IntArray, rende
 def _with_titles(
     views: Sequence[View], size: Sequence[int], titles: Sequence[str], handles: Sequence[Any], renderer: Renderer | None
 ) -> Figure:
-    """A figure of views side by side, in pixels, with titles above and a legend below."""
+    """A figure of views side by side, of the width of all figures, with titles above and a legend below."""
     (picture,) = draw(RenderScene(views, size, background="white", sorts=True), renderer)
-    width, height = picture.shape[1] / _DPI, picture.shape[0] / _DPI
-    columns = max(1, int(width / _ENTRY))
+    dpi, columns = picture.shape[1] / WIDE, max(1, int(WIDE / _ENTRY))
     legend = _LINE * -(-len(handles) // columns) + _LINE if handles else 0.0
+    height = picture.shape[0] / dpi
     total = height + legend + _LINE
-    figure = Figure(figsize=(width, total))
+    figure = Figure(figsize=(WIDE, total), dpi=dpi)
     panel = figure.add_axes((0.0, legend / total, 1.0, height / total))
     panel.imshow(picture, aspect="auto", interpolation="antialiased")
     panel.set_axis_off()

@@ -12,6 +12,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ..io.errors import listed
 from ..io.files import read_array, read_hdf5
 from ..learning.parameters import TILTS
 from ..pictures.seen import NEUTRAL
@@ -19,7 +20,6 @@ from ..settings.run import RunSettings
 from .figures import TONES, FloatArray
 from .identification_section import parameter_rows
 from .page import (
-    NO_BREAK_SPACE,
     NONE,
     Block,
     Cell,
@@ -30,9 +30,12 @@ from .page import (
     Text,
     canvas_beside,
     number_text,
+    share_text,
     write_page,
 )
+from .verdict import counted
 
+_NAMES: Final = {"undeformed": "an undeformed body", "simulation": "the uncorrected simulator"}
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}
 _DRAWN: Final = {"simulation": TONES["simulation"].light, "sysid": "#35d0ff"}
 _FIRST: Final = next(iter(_MODELS))
@@ -77,32 +80,26 @@ class PictureResult:
         return float("nan") if value is None else value
 
 
-def picture_verdict(results: Sequence[PictureResult]) -> str:
-    """Returns what the identification is worth, by the poses that were kept back; by those of training without any."""
-    tested, trained = ([own for own in results if own.tested == kept] for kept in (True, False))
-    shown = tested or trained
-    undeformed, uncorrected, identified = (_mean(shown, model) for model in _MODELS)
-    count = f"{len(shown)} pose{'s' * (len(shown) > 1)}"
-    which = f"{count} kept back" if tested else f"{count} of training (none was kept back)"
-    text = (
-        f"In {which} the simulated pictures are {number_text(identified)} mm from the measured ones with the "
-        f"identified parameters, {number_text(uncorrected)} mm with those of the data sheet, and "
-        f"{number_text(undeformed)} mm with an undeformed body; in each, the place of the body before the camera is "
-        "fitted to the picture."
+def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
+    """Returns what is best, by how much and on how many poses, and advice; of poses of the training without others."""
+    shown = [own for own in results if own.tested] or results
+    errors = {model: _mean(shown, model) for model in _MODELS}
+    best, second = sorted(("sysid", min(_NAMES, key=lambda model: errors[model])), key=lambda model: errors[model])
+    lower = sum(own.distance(best) < own.distance(second) for own in shown)
+    names = {"sysid": "the identified simulator", **_NAMES}
+    share, which = (
+        share_text(1.0 - errors[best] / errors[second]),
+        "kept back" if shown[0].tested else "of the training",
     )
-    if abs(identified - uncorrected) < (1.0 - _BETTER) * uncorrected:
-        text += " With both materials it is nearly the same: these poses hardly depend on it, and do not test it."
-    elif not identified < min(uncorrected, undeformed):
-        text += " The identification is no better than what needs none."
-    if tested and trained:
-        own, sheet, rigid = (number_text(_mean(trained, model)) for model in ("sysid", "simulation", "undeformed"))
-        text += f" In training the three are {own}, {sheet} and {rigid} mm."
-    if lost := [own.pose for own in results if (share := own.overlap["sysid"]) is not None and share < _COVERED]:
-        text += (
-            f" {' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} hardly seen where it was simulated: check the "
-            "camera, the mesh and the mask."
-        )
-    return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
+    on = f"{counted(lower, len(shown), 'pose')} {which}"
+    text = f"{names[best]} has {share} less error than {names[second]} ({on})"
+    doubts = [] if shown[0].tested else ["no pose was kept back"]
+    if abs(errors["sysid"] - errors["simulation"]) < (1.0 - _BETTER) * errors["simulation"]:
+        doubts.append("these poses hardly depend on the material, and do not test it")
+    if lost := [own.pose for own in results if (common := own.overlap["sysid"]) is not None and common < _COVERED]:
+        doubts.append(f"{listed(lost)} hardly overlap: check the camera, the mesh and the mask")
+    advice = [f"Check before use: {'; '.join(doubts)}."] if doubts else []
+    return [f"{text[0].upper()}{text[1:]}.", *advice]
 
 
 def _mean(results: Sequence[PictureResult], model: str) -> float:
@@ -164,7 +161,7 @@ def write_pictures_report(
             Part("How it is compared", [Text(_HOW)]),
         ],
         run,
-        [picture_verdict(results)],
+        picture_verdict(results),
         metrics,
     )
 

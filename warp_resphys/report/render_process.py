@@ -173,7 +173,8 @@ def _add_texts(plotter: Any, scene: RenderScene) -> Any:
         plotter.subplot(0, column)
         left = 14 if column else 100
         for name, colour in view.legend:
-            plotter.add_text(name, position=(left, top), font_size=12, color=colour)
+            text = plotter.add_text(name, position=(left, top), font_size=12, color=colour)
+            text.prop.background_color, text.prop.background_opacity = "white", 0.75
             left += 24 + 12 * len(name)
     plotter.subplot(0, 0)
     return plotter.add_text(scene.texts[0], position=(14, top), font_size=12, color=INK)

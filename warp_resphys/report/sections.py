@@ -239,7 +239,7 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
     for horizon in sorted(horizons, key=float):
         theirs = {model: " ".join(published_parts(error)) for model, error in published.get(horizon, {}).items()}
         errors = horizons[horizon]
-        rows[f"First {float(horizon):g} s"] = {m: Cell(_error(e), theirs.get(m, "")) for m, e in errors.items()}
+        rows[f"First {float(horizon):g} s"] = {m: Cell(error_parts(e)[0], theirs.get(m, "")) for m, e in errors.items()}
     if len(rows) > 1 and metrics.get("growth"):
         ours = {m: NONE if growth is None else percent_text(growth, 1) for m, growth in metrics["growth"].items()}
         shares = published_growth(published, min(horizons, key=float), max(horizons, key=float))
@@ -267,15 +267,10 @@ def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
     rows = {}
     for scale in sorted(scales, key=float):
         base, shares = against(scales[scale])
-        cells = {m: Cell(_error(e), "" if m == base else shares.get(m, "")) for m, e in scales[scale].items()}
+        cells = {m: Cell(error_parts(e)[0], "" if m == base else shares.get(m, "")) for m, e in scales[scale].items()}
         rows[f"\N{MULTIPLICATION SIGN} {float(scale):g}"] = cells
     note = "Inputs of the test trials times a factor; below the error, its difference from that of SysID."
     return model_table("Inputs; mean error [mm]", rows, scales[min(scales, key=float)], note) if rows else None
-
-
-def _error(summary: Mapping[str, Any]) -> str:
-    """A mean with its deviation."""
-    return " ".join(error_parts(summary)).strip()
 
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
@@ -316,7 +311,7 @@ def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
 
 
 def residual_table(residuals: Mapping[str, Any]) -> PageTable:
-    """Return the residuals of the registration [mm] by trial and marker; many markers are in rows."""
+    """Return the residuals of the registration [mm] by trial and marker, of many markers in many trials the largest."""
     labels = list(dict.fromkeys(label for fit in residuals.values() for label in fit["residual_mm"]))
     head, last = "Residual [mm]", "Root mean square"
     note = "Distance of each marker at rest from its nominal position after the rigid motion that fits best."
@@ -326,11 +321,16 @@ def residual_table(residuals: Mapping[str, Any]) -> PageTable:
         return Cell(NONE if value is None else f"{value:.2f}", "left out" if label in fit["outliers"] else "")
 
     rms = {trial: Cell(f"{fit['rms_mm']:.2f}") for trial, fit in residuals.items()}
+    if len(labels) > _MOST_WIDE >= len(residuals):
+        rows = [Row(label, [cell(fit, label) for fit in residuals.values()]) for label in labels]
+        return PageTable(head, list(residuals), [*rows, Row(last, list(rms.values()))], note)
     if len(labels) <= _MOST_WIDE:
         rows = [Row(t, [*(cell(fit, label) for label in labels), rms[t]]) for t, fit in residuals.items()]
         return PageTable(head, [*labels, last], rows, note)
-    rows = [Row(label, [cell(fit, label) for fit in residuals.values()]) for label in labels]
-    return PageTable(head, list(residuals), [*rows, Row(last, list(rms.values()))], note)
+    known = {t: {x: mm for x, mm in fit["residual_mm"].items() if mm is not None} for t, fit in residuals.items()}
+    worst = {t: max(own, key=own.__getitem__) for t, own in known.items()}
+    rows = [Row(t, [cell(fit, worst[t]), Cell(worst[t]), rms[t]]) for t, fit in residuals.items()]
+    return PageTable(head, ["Largest", "Marker", last], rows, note)
 
 
 def quality_section(data: RunReport, canvas: Canvas) -> Part | None:

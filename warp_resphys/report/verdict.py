@@ -186,7 +186,12 @@ def _best_text(known: Known) -> str:
         word = "no" if gain.share < _EQUAL else "no significant"
         return f"{model_name(best)} and {model_name(second)} show {word} difference {on}, {mm_text(fmean(known[best]))}"
     lower = sum(a < b for a, b in zip(known[best], known[second], strict=True))
-    return f"{less_error(best, second, gain.share)} ({f'on {lower} of {count} trials' if count > 1 else on})"
+    return f"{less_error(best, second, gain.share)} ({counted(lower, count, 'trial')})"
+
+
+def counted(lower: int, count: int, noun: str) -> str:
+    """Returns on how many trials, or poses, an error is lower: "on 5 of 6 trials", "on 1 trial"."""
+    return f"on {lower} of {count} {noun}s" if count > 1 else f"on {count} {noun}"
 
 
 def compared(before: Sequence[float], after: Sequence[float]) -> Gain:
@@ -254,8 +259,8 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
     if covered < _COVERED:
         text = f"90 % of the measurements should lie within the 90 % intervals, {100.0 * covered:.0f} % do"
         yield Doubt(text, "validate on trials like those of the test")
-    counted = Counter(doubt for fold in folds for doubt in _bounds(fold, settings.identify))
-    for doubt, found in counted.items():
+    bounds = Counter(doubt for fold in folds for doubt in _bounds(fold, settings.identify))
+    for doubt, found in bounds.items():
         where = f"in {found} of {len(folds)} folds, " if len(folds) > 1 else ""
         yield Doubt(f"{where}{doubt.fact}", doubt.remedy)
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.spatial.distance import cdist
 
-from ...io.errors import DataFileError, InputError, listed
+from ...io.errors import DataFileError, InputError, listed, number_of
 from .processing import Release
 from .recording import FloatArray, Recording, bridged, runs
 
@@ -59,8 +59,8 @@ class MarkerQuality:
         warnings = []
         if self.masked_frames:
             warnings.append(
-                f"{self.label} is hidden for up to {self.longest_gap_frames} frames; {self.masked_frames} frames are "
-                "masked."
+                f"{self.label} is hidden for up to {number_of(self.longest_gap_frames, 'frame')}; "
+                f"{number_of(self.masked_frames, 'frame')} {'is' if self.masked_frames == 1 else 'are'} masked."
             )
         if self.jumps:
             largest = max(self.jumps, key=lambda jump: jump.mm)

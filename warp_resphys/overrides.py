@@ -172,6 +172,8 @@ def _pairs(value: str) -> list[tuple[str, str]]:
 
 def _members(value: str) -> list[str] | None:
     """Splits a list or a dictionary at commas outside of quotes and brackets; None where one of these is open."""
+    if not value[1:-1].strip():
+        return []
     members, opened, start = [], [value[0]], 1
     for at, letter in enumerate(value[1:-1], 1):
         if opened[-1] in "'\"":

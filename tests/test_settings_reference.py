@@ -46,6 +46,7 @@ def test_experiments_are_what_editors_expect(path, editor):
 def test_an_editor_marks_a_wrong_key(editor):
     with pytest.raises(ValidationError):
         editor.validate({"trainer": {"epoch": 3}})
+    editor.validate({"markers": {"reference": {"_replace_": True, "a": [0, 0, 0]}}})
 
 
 def test_choices_in_the_settings_are_those_in_the_code():

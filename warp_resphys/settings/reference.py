@@ -163,9 +163,11 @@ def editor_schema() -> dict[str, Any]:
 
 
 def _partial(node: Any) -> Any:
-    """A JSON Schema without lists of required keys."""
+    """A JSON Schema without lists of required keys, in which groups may replace others."""
     if isinstance(node, Mapping):
-        return {key: _partial(value) for key, value in node.items() if key != "required" or not isinstance(value, list)}
+        part = {key: _partial(value) for key, value in node.items() if key != "required" or not isinstance(value, list)}
+        replaces = {"properties": {**part.get("properties", {}), "_replace_": {"type": "boolean"}}}
+        return part | replaces if part.get("type") == "object" else part
     return list(map(_partial, node)) if isinstance(node, list) else node
 
 

@@ -134,16 +134,16 @@ class Observer(Reader):
         """Leaves out frames of a body at rest that are earlier than `data.lead` before its inputs or markers change."""
         if self.data.lead is None or self.data.folder is None:
             return recording
-        positions, seen = (own.swapaxes(0, 1) for own in (recording.positions, recording.seen))
-        changes = np.zeros(len(recording.positions), dtype=np.bool_)
-        for label, path, known in zip(recording.labels, positions, seen, strict=True):
-            if label in self.tracked_in(trial) and known.any():
-                moved = np.linalg.norm(path - path[known][0], axis=1)
+        changes, resting = np.zeros(len(recording.positions), dtype=np.bool_), self._rest_frames(recording)
+        paths = recording.select(self.tracked_in(trial))
+        for path, known in zip(paths.positions.swapaxes(0, 1), paths.seen.T, strict=True):
+            if known.any():
+                moved = np.linalg.norm(path - np.median(path[known][:resting], axis=0), axis=1)
                 changes |= moved > max(_SHARE_AT_REST * np.nanmax(moved), _NOISE)
         if recording.actuation is not None and self.data.valve == "recorded":
             changes |= ~self._is_at_rest(recording.actuation - recording.actuation[0])
-        before = np.ceil(max(self.data.lead, self.data.rest_seconds) * recording.rate)
-        first = max(int(np.argmax(changes)) - int(before), 0)
+        before = max(int(np.ceil(self.data.lead * recording.rate)), resting)
+        first = max(int(np.argmax(changes)) - before, 0)
         return replace(recording.frames(slice(first, None)), start=float(recording.time[first]))
 
     def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:

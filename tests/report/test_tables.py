@@ -13,7 +13,13 @@ from warp_resphys.data.recordings.quality import quality_table
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import write_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM, median_filter, published_errors
+from warp_resphys.learning.metrics import (
+    PUBLISHED_MM,
+    PUBLISHED_WINDOWS_MM,
+    mean_distance,
+    median_filter,
+    published_errors,
+)
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
 from warp_resphys.report.control_section import control_section
@@ -22,7 +28,6 @@ from warp_resphys.report.data import (
     along_body,
     at_times,
     drawn_markers,
-    mean_distance,
     shown_models,
     tip_markers,
 )

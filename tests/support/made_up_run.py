@@ -11,9 +11,8 @@ from support.configured import settings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.experiment.files import Dataset
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
-from warp_resphys.learning.metrics import marker_errors, median_filter, summarise, summarise_trajectories
+from warp_resphys.learning.metrics import marker_errors, mean_distance, median_filter, summarise, summarise_trajectories
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report.data import mean_distance
 
 GRAVITY = np.array([0.0, 0.02, -9.8])
 

@@ -8,7 +8,7 @@ import torch
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, write_json
 from ..io.stages import StageContext
-from ..learning.metrics import marker_errors
+from ..learning.metrics import mean_distance
 from ..learning.reconstruction import follow, make_reconstructor, without_ringing
 from ..settings.stages import StageSettings
 from .experiment import Experiment
@@ -66,9 +66,8 @@ def _of_trials(part: TrialPart, report: Report) -> Arrays:
         forces.append(step.force)
         report(iterations=step.iterations)
     reached = torch.stack([replay.observe(state.q) for state in states], 1).cpu().numpy()
-    pairs = zip(reached, observed.cpu().numpy(), strict=True)
-    error = [[next(iter(marker_errors(x[None], y[None])), np.nan) for x, y in zip(*own, strict=True)] for own in pairs]
+    error = mean_distance(reached, observed.cpu().numpy())
     series = {"q": [state.q for state in states], "v": [state.v for state in states], "force": forces}
     arrays = {name: torch.stack(values, 1).cpu().numpy() for name, values in series.items()}
     dtype = "float64" if experiment.dataset.bound is None else "float32"
-    return {name: (values.astype(dtype), _UNITS[name]) for name, values in {**arrays, "error": np.array(error)}.items()}
+    return {name: (values.astype(dtype), _UNITS[name]) for name, values in {**arrays, "error": error}.items()}

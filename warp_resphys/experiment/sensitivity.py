@@ -22,7 +22,7 @@ from ..data.rigid_bodies import as_markers, owners
 from ..dynamics.simulator import Simulator
 from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
-from ..learning.metrics import marker_errors
+from ..learning.metrics import mean_distance
 from ..learning.parameters import HUNG, configured_parameters, own_name, split_name
 from ..learning.placement import DisplacedMarkers, Placement, by_placement, placement_of
 from ..learning.replay import Replay, exact
@@ -236,7 +236,7 @@ def free_fits(
     def mean(error: FloatArray) -> float:
         """Mean error of a trial [mm], of its errors (T, M, 3), as the table of errors has it."""
         own = as_markers(error, labels)
-        return float(marker_errors(own, np.where(np.isfinite(own), 0.0, np.nan)).mean())
+        return float(np.nanmean(mean_distance(own, 0.0 * own)))
 
     left: dict[str, dict[str, float]] = {name: {} for name in errors}
     values: dict[str, dict[str, float]] = {name: {} for name in errors}

@@ -121,21 +121,27 @@ PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedErro
 }
 
 
-def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
+def mean_distance(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns the mean distance of the seen markers or vertices (the paper's eq. 4 and 7).
 
     Args:
-        simulated: (T, M, 3) [m], NaN where the roll-out diverged.
-        observed: (T, M, 3) [m], NaN where a marker was not seen.
+        simulated: (..., M, 3) [m], not finite where the roll-out diverged.
+        observed: (..., M, 3) [m], NaN where a marker was not seen.
 
     Returns:
-        (T',) errors of the frames in which a marker was seen [mm].
+        (...) [mm]; NaN where no marker was seen, infinite where a simulated one has diverged.
     """
     seen = np.asarray(np.isfinite(observed).all(-1))
-    with np.errstate(over="ignore"):  # A diverged roll-out reaches infinity.
-        distance = np.where(seen, np.linalg.norm(simulated - np.where(seen[..., None], observed, 0.0), axis=-1), 0.0)
-    any_seen = seen.any(1)
-    return np.asarray(1e3 * distance.sum(1)[any_seen] / seen.sum(1)[any_seen])
+    with np.errstate(invalid="ignore", over="ignore"):
+        distance = 1e3 * np.linalg.norm(simulated - observed, axis=-1)
+        distance = np.where(seen, np.where(np.isfinite(distance), distance, np.inf), 0.0)
+        return np.where(seen.any(-1), distance.sum(-1) / np.maximum(seen.sum(-1), 1), np.nan)
+
+
+def marker_errors(simulated: NDArray[np.float64], observed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns `mean_distance` [mm] of the frames (T, M, 3) in which a marker was seen, (T',)."""
+    errors = mean_distance(simulated, observed)
+    return errors[~np.isnan(errors)]
 
 
 def errors_per_marker(

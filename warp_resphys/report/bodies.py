@@ -6,9 +6,10 @@ from typing import Final
 
 import numpy as np
 
+from ..learning.metrics import mean_distance
 from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
-from .data import MODELS, mean_distance
+from .data import MODELS
 from .obstacles import OBSTACLE, OBSTACLE_LIGHT, ObstacleSurface
 from .render import (
     INK,

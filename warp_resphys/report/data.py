@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PublishedError, published_errors
+from ..learning.metrics import PublishedError, mean_distance, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh
 from ..settings.run import RunSettings
@@ -239,24 +239,6 @@ def untrained(metrics: Mapping[str, Any]) -> set[str]:
 def missing_baselines(metrics: Mapping[str, Any]) -> dict[str, str]:
     """Returns why predictions without physics are missing, by model."""
     return {model: why for fold in folds_in(metrics) for model, why in fold.get("missing_baselines", {}).items()}
-
-
-def mean_distance(positions: FloatArray, target: FloatArray) -> FloatArray:
-    """Return mean distances (R, T) [mm] of the observed points.
-
-    The mean is NaN where no point was seen, and infinite where a simulated one has diverged.
-
-    Args:
-        positions: (R, T, M, 3) [m].
-        target: (R, T, M, 3) [m], NaN where a point was not seen.
-    """
-    with np.errstate(invalid="ignore", over="ignore"):
-        distance = 1e3 * np.linalg.norm(positions - target, axis=3)
-        seen = np.isfinite(target).all(axis=3)
-        distance = np.where(seen, np.where(np.isfinite(distance), distance, np.inf), 0.0)
-        count = seen.sum(axis=2)
-        mean: FloatArray = np.where(count > 0, distance.sum(axis=2) / np.maximum(count, 1), np.nan)
-    return mean
 
 
 def best_and_worst(trials: TrialResults) -> list[int]:

@@ -3,10 +3,14 @@ import re
 import meshio
 import numpy as np
 import pytest
+import torch
 import trimesh
 from matplotlib.image import imread
 
 from support.command_line import refusal, settings_of
+from warp_resphys.dynamics.simulator import Simulator
+from warp_resphys.energies.materials import Corotated
+from warp_resphys.fem.body import Body
 from warp_resphys.io.errors import InputError, MeshError, ResphysWarning
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm, name_surfaces
 from warp_resphys.mesh.cavities import open_cavities
@@ -51,6 +55,45 @@ class TestQuality:
         assert scaled_jacobian(sheared) == pytest.approx(np.sin(0.5))
         inverted = Mesh(box.vertices * [1.0, 1.0, -1.0], box.cells)
         assert scaled_jacobian(inverted) == pytest.approx(-1.0)
+
+
+class TestQuadraticCells:
+    @pytest.mark.parametrize(
+        ("mesh", "percent"),
+        [
+            (box_tetrahedra((0.1, 0.03, 0.03), (8, 2, 2)), 71),
+            (box_hexahedra((0.1, 0.03, 0.03), (20, 1, 1)), -34),
+            (box_hexahedra((0.1, 0.03, 0.03), (12, 4, 4)), 4),
+        ],
+    )
+    def test_they_are_compared_by_the_sag(self, tmp_path, mesh, percent):
+        """As two simulations of silicone differ, in the direction that differs most."""
+        write_mesh(tmp_path / "beam.msh", mesh)
+        row = inspected(f"mesh.path={tmp_path}/beam.msh", "fixed.x=0")["quadratic cells"]
+        assert row.startswith(f"sag {abs(percent)} % {'more' if percent > 0 else 'less'} under their weight")
+        assert "held at x = 0 m" in row
+        assert row.endswith("too coarse") == (abs(percent) > 7)
+        sags = []
+        for own in (mesh, quadratic(mesh)):
+            body = Body(own, fixed=np.flatnonzero(own.vertices[:, 0] == 0.0))
+            simulator = Simulator(body, Corotated(5e7, 0.49), relative_tolerance=1e-6)
+            mass = simulator.prepare().load_mass[0]
+            pulls = torch.tensor([[0.0, -9.81, 0.0], [0.0, 0.0, -9.81]])
+            falls = simulator.static_equilibrium(parameters={"gravity": pulls}).q - simulator.rest_positions
+            sags.append((mass @ falls)[[0, 1], [1, 2]])
+        change = max((sags[1] / sags[0] - 1.0).tolist(), key=abs)
+        assert 100.0 * change == pytest.approx(percent, abs=1.0)
+
+    def test_a_thin_region_is_named(self, tmp_path):
+        box = box_hexahedra((0.1, 0.03, 0.03), (6, 3, 3))
+        layer = box.vertices[box.cells].mean(axis=1)[:, 2] < 0.01
+        regions = {"layer": np.flatnonzero(layer), "soft": np.flatnonzero(~layer), "whole": np.arange(len(box.cells))}
+        write_mesh(tmp_path / "beam.msh", Mesh(box.vertices, box.cells, regions))
+        rows = inspected(f"mesh.path={tmp_path}/beam.msh")
+        assert rows["one cell thick"].startswith("layer: ")
+        assert "held at the lower end along x" in rows["quadratic cells"]
+        write_mesh(tmp_path / "beam.msh", quadratic(Mesh(box.vertices, box.cells, regions)))
+        assert not {"one cell thick", "quadratic cells"} & inspected(f"mesh.path={tmp_path}/beam.msh").keys()
 
 
 class TestOpenCavities:
@@ -135,6 +178,9 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
     assert rows["pieces"].startswith("2 of the body, 8 of its boundary")
     assert rows["open cavities"].count("cm2 around") == 6
     assert "pressure needs a closed chamber" in rows["open cavities"]
+    assert rows["quadratic cells"].startswith("sag 25 % more")
+    rows_of_one_end = inspected(f"mesh.path={tmp_path}/two.vtu", "fixed.x=[0.08,0.2]")
+    assert rows_of_one_end["quadratic cells"] == "not compared: a piece is not held, or all of it"
     assert "of these unused" not in rows
     assert "fixed" not in rows
 

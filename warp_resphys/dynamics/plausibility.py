@@ -92,8 +92,8 @@ def _warn_of_inertia(body: Body, name: str) -> None:
     if abs(ratio - 1.0) > INERTIA_ERROR:
         warn(
             f"{name}, which nothing holds, has {ratio:.3g} times its true rotary inertia, because its mass lies on the "
-            "vertices of few cells: take more cells, quadratic hexahedra (quadratic(mesh) in Python, element_order: 2 "
-            "in a configuration), or Body.rigid_body, which is exact."
+            "vertices of few cells: take more cells, quadratic hexahedra by quadratic(mesh), or a rigid body, "
+            "which is exact."
         )
 
 

@@ -29,6 +29,7 @@ from .assembly import BlockPattern
 from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
+from .mesh_error import CHECKED, warn_of_cells
 from .nonlinear_solver import SolveReport, SolverSettings, check_converged
 from .plausibility import warn_of_implausible
 from .statics import MOST_ITERATIONS, find_equilibrium, progress_of, settle
@@ -157,6 +158,7 @@ class Simulator:
         self.counts = {**energies.counts, "gravity": 3}
         self.inputs, self.parts = energies.inputs, energies.parts
         self._workspaces: dict[tuple[int, int], Workspace] = {}
+        self._checked_cells: list[bool] = []  # whether they are too coarse in the first equilibria
         self._attached_mass = self.tensor(body.attached_mass)
         self._built = True
 
@@ -433,6 +435,9 @@ class Simulator:
             InputError: wrong shapes, values that are not finite, or a body that is not held (`is_held`) in ``after``.
             ConvergenceError: no equilibrium was found, or the body grows without bound, like an inflated one whose
                 material cannot resist the pressure.
+
+        Warns:
+            ResphysWarning: linear cells that are too coarse for one of the first equilibria (`dynamics.mesh_error`).
         """
         inputs = self._fitted(inputs)
         constants = self.prepare(parameters)
@@ -463,6 +468,9 @@ class Simulator:
             x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
         else:
             x = find_equilibrium(solve, rest, guess, limited)
+        if len(self._checked_cells) < CHECKED and True not in self._checked_cells:
+            at = x[0].detach().double().cpu().numpy()
+            self._checked_cells.append(warn_of_cells(self.body, self._energies.placed, at, constants.values))
         return self._resting(step, x)
 
     def linearise_equilibrium(

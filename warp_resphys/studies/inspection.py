@@ -9,14 +9,27 @@ from pydantic import model_validator
 
 from ..data.recordings.bag import is_bag
 from ..data.recordings.reading import READERS
+from ..dynamics.mesh_error import NOTICED
+from ..dynamics.simulator import Simulator
+from ..energies.materials import Corotated
 from ..experiment.build import build_mesh
+from ..fem.body import Body
 from ..io.errors import InputError, MeshError
 from ..io.settings import Many, Positive, Word, setting
 from ..io.tables import aligned
 from ..mesh.arm import name_surfaces
 from ..mesh.cavities import open_cavities
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import FloatArray, IntArray, Mesh, Place, boundary_triangles, connected_parts, select_vertices
+from ..mesh.mesh import (
+    FloatArray,
+    IntArray,
+    Mesh,
+    Place,
+    boundary_triangles,
+    connected_parts,
+    quadratic,
+    select_vertices,
+)
 from ..mesh.quality import cell_volumes, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..mesh.tetrahedra import SURFACE_SUFFIXES
@@ -24,6 +37,10 @@ from ..report.body_picture import MeshSummary, draw_mesh
 from ..settings.mesh import FileMesh, GeneratedArm, MeshSettings, PlaceSettings, SurfaceMesh
 from .recording_quality import RecordingInspection, inspect_recording
 
+_MOST_UNKNOWNS: Final = 40_000  # of quadratic cells, which are solved in some seconds
+_SILICONE: Final = Corotated(1e5, 0.49)
+_HELD: Final = 0.05  # of its length, at the end of a body without fixed vertices
+_PERCENT: Final = 100.0
 _MILLI: Final = 1e3
 _CUBIC_CENTI: Final = 1e6
 
@@ -123,6 +140,10 @@ def inspect_mesh(
         names = ", ".join(f"{name} ({len(cells)})" for name, cells in mesh.regions.items())
         rows.append(("regions", names or "none"))
     rows.append(("open cavities", _cavities(mesh)))
+    if not mesh.element.parents:
+        rows.append(("quadratic cells", _quadratic_cells(mesh, place)))
+        if thin := [name for name, cells in mesh.regions.items() if _is_one_cell_thick(mesh, cells)]:
+            rows.append(("one cell thick", f"{', '.join(thin)}: if stiffer than the rest, take quadratic cells"))
     if file is not None:
         if isinstance(settings, GeneratedArm):
             if settings.order == 2 and settings.cells != "tetrahedra":
@@ -132,6 +153,53 @@ def inspect_mesh(
     if picture is not None:
         draw_mesh(picture, summary)
     return aligned(rows, left=2)
+
+
+def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
+    """Returns how much quadratic cells change the deflection under the weight, across the longest side of a body.
+
+    Args:
+        mesh: of linear cells.
+        fixed: where the body is held; None: at an end.
+    """
+    along, *across = np.argsort(-np.ptp(mesh.vertices, axis=0))
+    end = mesh.vertices[:, along].min() + _HELD * np.ptp(mesh.vertices[:, along])
+    held = mesh.vertices[:, along] <= end if fixed is None else fixed.holds(mesh.vertices)
+    finer, work = quadratic(mesh), []
+    if finer.vertices.size > _MOST_UNKNOWNS:
+        return f"not compared: they have {finer.vertices.size:,} degrees of freedom"
+    connected = connected_parts(mesh.cells)
+    pieces = [np.unique(mesh.cells[connected == number]) for number in np.unique(connected)]
+    if held.all() or not all(_spans_area(mesh.vertices[own[held[own]]]) for own in pieces):
+        return "not compared: a piece is not held, or all of it"
+    # Nodes between held vertices are held, too.
+    between = quadratic(Mesh(np.repeat(held[:, None], 3, axis=1).astype(np.float64), mesh.cells)).vertices[:, 0] == 1.0
+    for own, still in ((mesh, held), (finer, between)):
+        simulator = Simulator(Body(own, fixed=np.flatnonzero(still)), _SILICONE)
+        step = simulator.linearise_equilibrium()
+        step.factorise(simulator.rest_positions[None])
+        masses = simulator.prepare().load_mass[0]
+        pulls = masses[:, None, None] * simulator.tensor(np.eye(3)[:, across])  # (N, 3, 2)
+        moved = step.solve(pulls.flatten(0, 1)[None])[0].unflatten(0, (-1, 3))
+        work.append((pulls * moved).sum((0, 1)).numpy())
+    change = float(max(work[1] / work[0] - 1.0, key=abs))
+    where = f"at the lower end along {'xyz'[along]}" if fixed is None else f"at {fixed} m"
+    return (
+        f"sag {_PERCENT * abs(change):.0f} % {'more' if change > 0.0 else 'less'} under their weight, held {where}"
+        f"{': these cells are too coarse' if abs(change) > NOTICED else ''}"
+    )
+
+
+def _spans_area(points: FloatArray) -> bool:
+    """Whether three points of (n, 3) are not in a line, by which a body that is held there cannot turn."""
+    return len(points) > 2 and bool(np.linalg.svd(points - points.mean(axis=0))[1][1] > 1e-9)
+
+
+def _is_one_cell_thick(mesh: Mesh, cells: IntArray) -> bool:
+    """Whether every vertex of a region is on its surface."""
+    return len(np.unique(boundary_triangles(Mesh(mesh.vertices, mesh.cells[cells])))) == len(
+        np.unique(mesh.cells[cells])
+    )
 
 
 def _cavities(mesh: Mesh) -> str:

@@ -1,0 +1,117 @@
+"""How much other cells would change the deflection of a body of linear cells, estimated from one equilibrium.
+
+The strain E of linear cells jumps between neighbours. With the smooth strain S, whose values at the vertices are means
+over the cells around them, the error of the energy is about the sum of c V |E - S|^2 (Zienkiewicz and Zhu 1987), with
+the stiffness c of the material, and the deflection under given loads grows by the same share of the sum of c V |E|^2.
+Cells that are long beside the thickness of a body or of a stiff layer shear instead of bending, and tetrahedra lock.
+8-node hexahedra whose volume term is integrated at the centre miss the energy of volume changes that vary in a cell,
+nu c V (tr E - mean)^2, and are too soft where there is a single one through the thickness.
+
+The first estimate is low where it is large. Both are verified against quadratic cells in
+``tests/dynamics/test_mesh_error.py``.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import numpy as np
+import scipy.sparse
+import torch
+from numpy.typing import NDArray
+
+from ..energies.placement import PlacedEnergy
+from ..energies.solid import Solid
+from ..fem.body import Body
+from ..io.errors import warn
+from ..mesh.elements import BY_NODES
+from .plausibility import mean_of
+
+NOTICED: Final = 0.07  # change of the deflection
+CHECKED: Final = 4  # equilibria of a simulator, as the first one is often that of its weight alone
+_LEAST: Final = 1e-7  # strain, below which rounding dominates
+_INCOMPRESSIBLE: Final = 0.5  # Poisson's ratio of materials without this constant
+
+FloatArray = NDArray[np.float64]
+
+
+def warn_of_cells(
+    body: Body, placed: Iterable[PlacedEnergy], q: FloatArray, values: Mapping[str, torch.Tensor | None]
+) -> bool:
+    """Issues a `ResphysWarning` for each body whose deflection other cells would change by more than 7 %.
+
+    Args:
+        body: a body, or a `fem.scene.Scene`.
+        placed: energies of its simulator.
+        q: (N, 3) positions of an equilibrium [m].
+        values: of the energies' terms by name.
+
+    Returns:
+        Whether there is such a body.
+    """
+    warned = False
+    solids = [(item, item.energy) for item in placed if isinstance(item.energy, Solid)]
+    for name, own, first in body.members:
+        if own.mesh.element.parents:
+            continue
+        at, regions = q[first : first + own.n_vertices], dict[str, FloatArray]()
+        for item, solid in solids:
+            stiffness = values[f"{item.prefix}stiffness"]
+            if item.first == first and item.body is own and stiffness is not None:
+                region = item.prefix.removeprefix(f"{name}_" if name else "").removesuffix("_")
+                regions[region] = _energies(solid, at, stiffness[0].detach().double().cpu().numpy())
+        energies = sum(regions.values(), np.zeros(4))
+        if not energies[0] > _LEAST**2 * energies[3]:
+            continue
+        change, worst = _change(energies), max(regions, key=lambda key: float(regions[key][1]))
+        if abs(change) < NOTICED:
+            continue
+        kind = "tetrahedra" if own.mesh.element.is_simplex else "hexahedra"
+        by = f"at least {change:.0%} more" if change > 0.0 else f"about {-change:.0%} less"
+        where = f", mostly due to its region {worst!r}" if worst and change > 0.0 else ""
+        warn(
+            f"the linear {kind} of {f'the body {name!r}' if name else 'the body'} are too coarse for its equilibrium: "
+            f"with finer or quadratic ones it would deform by {by.replace('%', ' %')}{where} (estimated from jumps of "
+            "the strain between cells); take smaller cells, or quadratic(mesh), which is mesh.order=2 in a "
+            "configuration."
+        )
+        warned = True
+    return warned
+
+
+def _change(energies: FloatArray) -> float:
+    """Returns the relative change of the deflection from the energies of `_energies`."""
+    whole, jumps, missing, _ = energies
+    return float((1.0 + jumps / whole) / (1.0 + missing / whole) - 1.0)
+
+
+def _energies(solid: Solid, q: FloatArray, stiffness: FloatArray) -> FloatArray:
+    """Returns c V |E|^2, c V |E - S|^2, nu c V (tr E - mean)^2 and c V, summed over a solid of linear cells (4,) [J].
+
+    Args:
+        solid: the solid.
+        q: (N, 3) positions [m].
+        stiffness: (P, T) its value of that name [J].
+    """
+    points = solid.discretisation.point_sets[0]
+    nodes, element = points.nodes, BY_NODES[points.nodes.shape[1]]
+    count = len(element.rule[1])
+    gradients, cells = points.gradients[:, :count], len(nodes)
+    f = np.einsum("cki,cqkj->cqij", q[nodes], gradients)
+    strain = 0.5 * (np.einsum("cqki,cqkj->cqij", f, f) - np.eye(3))  # (C, Q, 3, 3)
+    weights = (stiffness[: points.n_points] @ np.array(solid.material.curvature)).reshape(cells, -1)[:, :count]
+    values, _ = element.shape(element.rule[0])  # (Q, K)
+    outwards = np.ones((nodes.shape[1], 1)) if count == 1 else np.linalg.inv(values)  # from points to nodes
+    at_nodes = np.einsum("kq,cqij->ckij", outwards, strain)
+    volumes = solid.discretisation.element_volumes.repeat(nodes.shape[1])
+    around = scipy.sparse.csr_array((volumes, (nodes.ravel(), np.arange(nodes.size))), (len(q), nodes.size))
+    means = around @ at_nodes.reshape(nodes.size, 9) / np.maximum(around.sum(axis=1), np.finfo(float).tiny)[:, None]
+    jumps = at_nodes - means.reshape(-1, 3, 3)[nodes]
+    if count == 1:  # the mean square of a linear function over a tetrahedron
+        square = 0.05 * (np.square(jumps.sum(1)).sum((1, 2)) + np.square(jumps).sum((1, 2, 3)))[:, None]
+    else:
+        square = np.square(np.einsum("qk,ckij->cqij", values, jumps)).sum((2, 3))
+    trace = np.trace(strain, axis1=2, axis2=3)
+    centred = points.points_per_cell > count > 1
+    poissons_ratio = mean_of(solid.material.constants.get("poissons_ratio", _INCOMPRESSIBLE)) if centred else 0.0
+    varying = poissons_ratio * np.square(trace - trace.mean(1, keepdims=True))
+    return np.array([(weights * part).sum() for part in (np.square(strain).sum((2, 3)), square, varying, 1.0)])

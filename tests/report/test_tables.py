@@ -48,14 +48,12 @@ from warp_resphys.report.page import (
 from warp_resphys.report.render import axes_from_below, motion_axes
 from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.sections import (
-    against,
     gain_text,
     horizon_table,
     published_beside,
     published_growth,
     residual_table,
     rest_table,
-    scale_table,
     shapes_table,
     trials_section,
 )
@@ -96,20 +94,7 @@ class TestErrors:
         assert row.cells == [Cell("2.00"), Cell("1.00")]
         assert horizon_table({}, {}) is None
 
-    def test_by_scale_of_the_inputs(self):
-        table = scale_table({"1.25": MORE, "1": ERRORS})
-        assert {row.head: row.cells for row in table.rows} == {
-            "\N{MULTIPLICATION SIGN} 1": [Cell("2.00"), Cell("1.00", f"{MINUS}50 %")],
-            "\N{MULTIPLICATION SIGN} 1.25": [Cell("1 of 3 diverged"), Cell("1.50")],
-        }
-        assert scale_table({}) is None
-
-    def test_against_what_was_identified_and_published(self):
-        means = {"simulation": 0.9, "sysid_elastic": 0.8, "sysid": None, "resphys": 0.2}
-        base, share = against({model: summary(mean) for model, mean in means.items()})
-        assert base == "sysid_elastic"
-        assert share["resphys"] == f"{MINUS}75 %"
-        assert "sysid" not in share
+    def test_published_errors_stand_beside_the_same_model(self):
         published = PUBLISHED_MM["beam_real"]
         beside = published_beside(published, ["published", "simulation", "sysid", "resphys"])
         assert beside.keys() == {"published", "sysid", "simfree", "resphys"}

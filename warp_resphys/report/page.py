@@ -35,6 +35,12 @@ NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
 MOST_PERCENT = 10.0  # Relative change above which a multiple is written in place of a percentage.
+_TIMED = {  # Models whose computing times are shown.
+    "simulation": "Uncorrected simulator",
+    "target": "Simulation with the true parameters",
+    "resphys": "Simulation with the learned force",
+    "inference": "of which the network",
+}
 _WIDEST, _NARROW = 1000, 78  # characters: beyond every table; terminals below it wrap the heads of rows as well
 _LEAST_DECIMAL = 1e-4  # Smaller numbers are written with a power of ten.
 
@@ -234,7 +240,6 @@ def write_page(
     run: RunSettings,
     verdict: Sequence[str],
     metrics: Mapping[str, Any],
-    timed: PageTable | None = None,
 ) -> None:
     """Write the page of a run.
 
@@ -244,7 +249,6 @@ def write_page(
         run: Settings, with the title.
         verdict: Sentences below the title.
         metrics: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
-        timed: Times of the simulations.
 
     Raises:
         DataFileError: The file cannot be written.
@@ -266,17 +270,29 @@ def write_page(
         title=run.heading,
         experiment=run.name,
         verdict=verdict,
-        parts=parts,
+        parts=[*parts, *_times(metrics)],
         script=Markup(script),
         digest=digest,
         kind_of=lambda block: type(block).__name__,
         metrics=metrics,
         settings=list(flatten(run.plain())),
-        timed=timed,
-        duration=duration_text,
     )
     write_text(path, page)
     _LOG.info("report written: %s", path)
+
+
+def _times(metrics: Mapping[str, Any]) -> Iterator[Part]:
+    """Yields the section on computing times and memory; nothing without times."""
+    if seconds := metrics.get("seconds"):
+        stages = {**seconds, "Sum, also of stages that ran at once": sum(seconds.values())}
+        rows = [Row(stage, [Cell(duration_text(spent))]) for stage, spent in stages.items()]
+        one = metrics.get("seconds_per_test_trajectory", {})
+        timed = [Row(name, [Cell(duration_text(one[m]["mean"]))]) for m, name in _TIMED.items() if m in one]
+        tables = [PageTable("Stage", ["Wall time"], rows)]
+        tables += [PageTable("One test trial at a time", ["Wall time"], timed)] if timed else []
+        peak = metrics["peak_memory_gib"]
+        memory = [] if peak is None else [Text(f"Peak memory: {peak:.2f}{NO_BREAK_SPACE}GiB.", note=True)]
+        yield Part("Time taken", [*tables, *memory])
 
 
 def number_text(value: float | None) -> str:

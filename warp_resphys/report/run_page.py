@@ -17,14 +17,10 @@ from .law_section import law_section
 from .motion_section import motion_section, start_drawing
 from .page import (
     Canvas,
-    Cell,
     Items,
-    PageTable,
     Part,
-    Row,
     Text,
     canvas_beside,
-    duration_text,
     mm_text,
     unbroken,
     write_page,
@@ -34,19 +30,12 @@ from .sections import (
     horizons_section,
     quality_section,
     registration_section,
-    scales_section,
     shapes_section,
     trials_section,
 )
 from .training_section import training_section
 from .verdict import LEAST_TRIALS, results_table, verdict
 
-_TIMED: Final = {
-    "simulation": "Uncorrected simulator",
-    "target": "Simulation with the true parameters",
-    "resphys": "Simulation with the learned force",
-    "inference": "of which the network",
-}
 _WITHOUT_RECORDINGS: Final = Markup(
     "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with noise on the "
     "markers, by the body that the settings below have as <code>laboratory</code>."
@@ -79,16 +68,8 @@ def write_report(path: Path, data: RunReport) -> None:
         canvas.started.update(start_drawing(data, canvas.folder, pool))
         ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for the other process.
         made = {section: section(data, canvas) for section in ready}
-    seconds = data.metrics.get("seconds_per_test_trajectory", {})
-    timed = [Row(name, [Cell(duration_text(seconds[m]["mean"]))]) for m, name in _TIMED.items() if m in seconds]
-    write_page(
-        path,
-        [part for section in SECTIONS if (part := made[section]) is not None],
-        data.settings,
-        verdict(data.metrics, data.settings),
-        data.metrics,
-        PageTable("Model", ["Wall time"], timed) if timed else None,
-    )
+    parts = [part for section in SECTIONS if (part := made[section]) is not None]
+    write_page(path, parts, data.settings, verdict(data.metrics, data.settings), data.metrics)
 
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:
@@ -109,32 +90,22 @@ def details_section(data: RunReport, canvas: Canvas) -> Part:
 
 def _what_is_measured(data: RunReport) -> str:
     """Definition of the errors, with notes on their contributions."""
-    trials, span, of = data.trials, "", "markers" if data.sees_markers else "vertices"
-    if data.settings.trial_seconds is not None:
-        span = f", the frames of the first {data.settings.trial_seconds:g} s after the release,"
-    if trials is None:
-        text = (
-            "Distance of the simulated markers from the measured ones, in millimetres: mean over the folds, each with "
-            f"one test trial{span} and the others for training, ± the standard deviation of the folds’ means."  # noqa: RUF001
-        )
-    elif data.sees_markers:
-        count, labels = len(trials.names), trials.labels
-        length = f" of {trials.times.max():g} s" if not span and trials.moves else ""
+    trials, seconds = data.trials, data.settings.trial_seconds
+    of, others = ("markers", "the measured ones") if data.sees_markers else ("vertices", "those of the target")
+    over, deviation = "the folds, each with one test trial", "the folds’ means"  # noqa: RUF001
+    if trials is not None:
+        labels, steps = trials.labels, trials.target.shape[1] - ("given" in trials.begins and trials.moves)
         named = (
             f"the markers {', '.join(labels)}" if 1 < len(labels) <= _MOST_LABELS else number_of(len(labels), "marker")
         )
-        text = (
-            f"Distance of the simulated markers from the measured ones, in millimetres: mean over "
-            f"{number_of(count, 'test trial')}{length}{span} and {named}, ± the standard deviation over trials and "
-            "frames of the mean over the markers. Frames in which a marker is hidden are left out for it."
-        )
-    else:
-        steps = trials.target.shape[1] - ("given" in trials.begins and trials.moves)
-        text = (
-            "Distance of the simulated vertices from the same points of the target, in millimetres: mean over "
-            f"{number_of(len(trials.names), 'test trial')}, {number_of(steps, 'step')} and {len(data.mesh.vertices)} "
-            "vertices, ± the standard deviation over trials and steps of the mean over the vertices."
-        )
+        length = f" of {trials.times.max():g} s" if labels and trials.moves and seconds is None else ""
+        points = f" and {named}" if labels else f", {number_of(steps, 'step')} and {len(data.mesh.vertices)} vertices"
+        over, deviation = f"{number_of(len(trials.names), 'test trial')}{length}{points}", "single frames"
+    first = "" if seconds is None else f", of which the first {seconds:g} s after the release count"
+    text = (
+        f"Distance of the simulated {of} from {others}: mean over {over}{first}; every trial counts alike. ± is the "
+        f"standard deviation of {deviation}."
+    )
     release = data.settings.release
     if trials is not None and {"rest", "driven"} & {*trials.begins} and release.delay > 0.0:
         text += (
@@ -150,8 +121,6 @@ def _what_is_measured(data: RunReport) -> str:
     ]
     kind = "arm" if data.settings.chambers is not None else "beam" if data.sees_markers else "vertices"
     learned += [_PUBLISHED_FOR[kind]] if data.published else []
-    if data.others:
-        learned.append(f"Beyond the training loads: {', '.join(data.others)}. No training trial was held like that.")
     many = len(next(iter(trial_errors(data.metrics).values()), ())) >= LEAST_TRIALS
     text += " Interval: of the mean, over draws of the trials." if many else ""
     return unbroken(" ".join([text, *_contributions(data.metrics), *learned]))
@@ -217,7 +186,6 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     motion_section,
     details_section,
     horizons_section,
-    scales_section,
     error_section,
     trials_section,
     control_section,

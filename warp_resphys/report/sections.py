@@ -92,16 +92,6 @@ def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dic
     return {renamed.get(model, model): published_parts(error) for model, error in published.items()}
 
 
-def against(errors: Mapping[str, Any]) -> tuple[str, dict[str, str]]:
-    """Return the model with which others are compared, and their errors relative to its error."""
-    base = next((m for m in ("sysid_elastic", "sysid", "law") if m in errors and errors[m]["mean"]), "")
-    if not base:
-        return "", {}
-    means = {m: summary["mean"] for m, summary in errors.items() if summary["mean"] is not None}
-    ratios = {m: mean / means[base] - 1.0 for m, mean in means.items()}
-    return base, {m: NONE if m == base else percent_text(ratio) for m, ratio in ratios.items()}
-
-
 def model_table(
     head: str,
     rows: Mapping[str, Mapping[str, Cell]],
@@ -254,23 +244,6 @@ def published_growth(published: Mapping[str, Mapping[str, PublishedError]], firs
     """Return the relative growth of published errors from one length of the roll-outs [s] to another, by model."""
     before, after = published.get(first, {}), published.get(last, {})
     return {model: after[model].mean / before[model].mean - 1.0 for model in before if model in after}
-
-
-def scales_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors at multiples of the inputs."""
-    table = scale_table(data.metrics.get("scales", {}))
-    return None if table is None else Part("Beyond the inputs of the training", [table])
-
-
-def scale_table(scales: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
-    """Return the errors at multiples of the inputs (a summary by scale and model), and relative to SysID."""
-    rows = {}
-    for scale in sorted(scales, key=float):
-        base, shares = against(scales[scale])
-        cells = {m: Cell(error_parts(e)[0], "" if m == base else shares.get(m, "")) for m, e in scales[scale].items()}
-        rows[f"\N{MULTIPLICATION SIGN} {float(scale):g}"] = cells
-    note = "Inputs of the test trials times a factor; below the error, its difference from that of SysID."
-    return model_table("Inputs; mean error [mm]", rows, scales[min(scales, key=float)], note) if rows else None
 
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:

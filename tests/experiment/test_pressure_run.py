@@ -79,7 +79,7 @@ def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(
         assert results["horizons"]["0.06"][model]["mean"] == pytest.approx(first, rel=1e-9)
     growth = results["horizons"]["0.12"]["sysid"]["mean"] / results["horizons"]["0.06"]["sysid"]["mean"] - 1.0
     assert results["growth"]["sysid"] == pytest.approx(growth)
-    checked = results["mesh_check"]  # whole trials are shorter than its 50 steps
+    checked = results["mesh_check"]  # whole trials are shorter than its half second
     assert checked["errors_mm"][0] == pytest.approx(results["scales"]["1"]["sysid"]["mean"], rel=1e-6)
     assert (checked["trials"], checked["model"]) == (["t003"], "sysid")
     assert checked["cells"][0] < checked["cells"][1]

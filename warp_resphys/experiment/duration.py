@@ -19,7 +19,7 @@ from ..io.stages import Stage
 from ..learning.reconstruction import make_reconstructor
 from ..report.page import duration_text
 from ..settings.stages import ReportStage, StageSettings
-from .evaluate import CHECKED_STEPS
+from .evaluate import CHECKED_SECONDS
 from .experiment import MODELS, Experiment
 from .models import SIMFREE
 from .trials import evenly
@@ -97,7 +97,7 @@ def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
         tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
         return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
     if settings.reads("mesh_check"):
-        return (1.0 + settings.mesh_check**3) * CHECKED_STEPS, 0.0, 0.0
+        return (1.0 + settings.mesh_check**3) * CHECKED_SECONDS / settings.time_step, 0.0, 0.0
     if settings.reads("groups"):  # three rows, one trial at a time, which takes twice as long
         return 6.0 * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
     if settings.reads("identify") and not settings.reads("law"):

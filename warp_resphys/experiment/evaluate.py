@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 _FILM_FRAMES = 256  # maximum
-CHECKED_STEPS, _CHECKED_POSES = 50, 3  # that are simulated with a finer mesh
+CHECKED_SECONDS, _CHECKED_POSES = 0.5, 3  # that are simulated with a finer mesh
 _WARM_UP = 20  # steps before computing times are measured
 _FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over one second
 
@@ -349,8 +349,8 @@ def time_models(context: StageContext) -> None:
 def check_mesh(context: StageContext) -> None:
     """Writes mesh_check.json: change of the simulation of test trials with a finer mesh, see `finer`.
 
-    The trial with the largest motion is simulated for a few steps from where its inputs begin; of poses, a few are. The
-    finer mesh uses the parameters that were identified on the original mesh.
+    The trial with the largest motion is simulated for half a second from where its inputs begin; of poses, a few are.
+    The finer mesh uses the parameters that were identified on the original mesh.
     """
     settings: StageSettings = context.settings
     times, parts = settings.mesh_check, settings.parts
@@ -373,7 +373,7 @@ def check_mesh(context: StageContext) -> None:
             for experiment in experiments:
                 replay = experiment.replay(experiment.model_simulator(model), names, model)
                 if moving:
-                    seconds = _first_change(experiment, names[0]) + CHECKED_STEPS * settings.time_step
+                    seconds = _first_change(experiment, names[0]) + CHECKED_SECONDS
                     replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
                 points = replay(experiment.start(replay, model), experiment.parameters(model))[0].cpu().numpy()
                 shown.append(as_markers(points, experiment.dataset.labels))

@@ -22,12 +22,13 @@ from pydantic import ConfigDict
 
 from support.command_line import outcome
 from support.main_job import end_of
-from warp_resphys import __version__, cli, commands, launch
+from warp_resphys import __version__, cli, commands
 from warp_resphys.commands import NOBODY_READS, run_label
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings
 from warp_resphys.io.stages import StageInterrupted
+from warp_resphys.overrides import readable
 from warp_resphys.settings.run import RunSettings
 
 REPOSITORY = Path(__file__).parents[1]
@@ -363,7 +364,7 @@ def test_every_documented_line_has_keys_that_exist():
             command, arguments = commands.parse([word for word in shlex.split(line) if word != "--multirun"])
             elsewhere = ("hydra/launcher=",)  # packages that are not installed
             known = [re.sub(r"^seed=0,.*", "seed=0", word) for word in arguments if not word.startswith(elsewhere)]
-            compose(commands.configuration(command), launch.freed(known))
+            compose(commands.configuration(command), readable(known)[0])
             if command in ("run", "tune"):
                 names = [word.partition("=")[0].lstrip("+~") for word in known]
                 assert all("." not in name or _is_key(name) for name in names), line

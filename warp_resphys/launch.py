@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module, resources
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, get_type_hints
 
@@ -111,9 +110,9 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         if command in TYPED:
             rest, shown = _without_shown(rest)
         settings = RunSettings if command in TYPED else _function(function)[1]
-        rest, late = readable(rest, settings.model_json_schema(), _groups(rest))
+        rest, late = readable(rest, settings.model_json_schema())
         OmegaConf.register_new_resolver("run_label", partial(_label, late), replace=True)
-        sys.argv = [before[0], *freed(rest), *(_SILENT if shown is not None else ())]
+        sys.argv = [before[0], *rest, *(_SILENT if shown is not None else ())]
         place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}
         with _ends_as_after_ctrl_c(), names_are_texts():
             hydra.main(version_base="1.3", **place)(job)()
@@ -182,28 +181,6 @@ def _own_options() -> list[str]:
         if packaged.joinpath(path.parent.name, path.name).is_file():
             print(f"warning: {name} is ignored: the package has an option of that name", file=sys.stderr)
     return ["--config-dir", str(folder)]
-
-
-def _groups(arguments: Sequence[str]) -> set[str]:
-    """Names of the configuration groups, in the package and in the user's folders."""
-    pairs = pairwise(arguments)
-    added = [Path(value) for option, value in pairs if option in ("--config-dir", "-cd")]
-    places = [resources.files(CONFIG_PACKAGE), *(folder for folder in added if folder.is_dir())]
-    return {entry.name for place in places for entry in place.iterdir() if entry.is_dir()}
-
-
-def freed(arguments: Sequence[str]) -> list[str]:
-    """Changes overrides so that they may set keys that no YAML file mentions; the settings classes check the keys."""
-    groups = _groups(arguments)
-
-    def free(argument: str) -> str:
-        key, equals, value = argument.partition("=")
-        first, dot, _ = key.partition("@")[0].partition(".")
-        chooses = first in groups and not dot and not value.startswith("{")
-        given = not equals or key[:1] in ("-", "+", "~") or "/" in first or first == "hydra" or chooses
-        return argument if given else f"++{argument}"
-
-    return [free(argument) for argument in arguments]
 
 
 def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:

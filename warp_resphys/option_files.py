@@ -70,7 +70,7 @@ def _with_quotes(text: str, package: tuple[str, ...], path: Path) -> io.StringIO
         if isinstance(node, yaml.MappingNode):
             for key, value in node.value:
                 add(key)
-                visit(value, (*path, str(key.value)))
+                visit(value, path if key.value == "<<" else (*path, str(key.value)))
         elif isinstance(node, yaml.SequenceNode):
             for at, item in enumerate(node.value):
                 visit(item, (*path, at))

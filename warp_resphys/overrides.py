@@ -12,13 +12,17 @@ import re
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from functools import reduce
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 
-from .commands import VALUED, quote, quote_name
+from .commands import CONFIG_PACKAGE, VALUED, quote, quote_name
 from .io.errors import InputError
 from .io.setting_errors import Schema, is_text
 
@@ -67,22 +71,30 @@ class LateOverride:
             config.merge_with(reduce(lambda inner, name: {name: inner}, reversed(self.path), override.value()))
 
 
-def readable(arguments: Sequence[str], schema: Schema, groups: Set[str]) -> tuple[list[str], list[LateOverride]]:
+def readable(arguments: Sequence[str], schema: Schema = MappingProxyType({})) -> tuple[list[str], list[LateOverride]]:
     """Returns the arguments as Hydra reads them, options first, and those that change the composed configuration.
+
+    Overrides may set keys that no YAML file mentions, since the settings classes check the keys.
 
     Args:
         arguments: words of the command line.
         schema: JSON Schema of the settings of the command.
-        groups: names of the configuration groups.
     """
     options = [
         at for at, argument in enumerate(arguments) if argument[:1] == "-" or (at and arguments[at - 1] in VALUED)
     ]
-    reader = _Reader(schema, groups, bool({"--multirun", "-m"} & {*arguments}))
+    reader = _Reader(schema, _groups(arguments), bool({"--multirun", "-m"} & {*arguments}))
     rest = [argument for at, argument in enumerate(arguments) if at not in options]
     overrides = [override for argument in rest for override in reader.overrides(argument)]
     read = [override for override in overrides if isinstance(override, str)]
     return [*map(arguments.__getitem__, options), *read], [one for one in overrides if isinstance(one, LateOverride)]
+
+
+def _groups(arguments: Sequence[str]) -> set[str]:
+    """Names of the configuration groups, in the package and in the user's folders."""
+    added = [Path(value) for option, value in pairwise(arguments) if option in ("--config-dir", "-cd")]
+    places = [resources.files(CONFIG_PACKAGE), *(folder for folder in added if folder.is_dir())]
+    return {entry.name for place in places for entry in place.iterdir() if entry.is_dir()}
 
 
 @dataclass(frozen=True)
@@ -105,11 +117,12 @@ class _Reader:
         key, equals, value = argument.removeprefix(mark).partition("=")
         if "/" in key or "@" in key or not (equals or mark == "~"):
             yield argument
-        elif key in self.groups and value[:1] not in ("{", "["):
-            kept = mark == "~" or ("," in value and not self.sweeps and not os.path.exists(value))
+        elif key in self.groups and value[:1] != "{":
+            kept = mark == "~" or value[:1] == "[" or ("," in value and not self.sweeps and not os.path.exists(value))
             yield argument if kept else f"{mark}{key}={self._swept(value, ('defaults', key))}"
         else:
-            yield from self._spread(mark, tuple(key.split(".")), value if equals else None)
+            path = tuple(key.split("."))
+            yield from self._spread(mark or "++" * (path[0] != "hydra"), path, value if equals else None)
 
     def _spread(self, mark: str, path: tuple[str, ...], value: str | None) -> Iterator[str | LateOverride]:
         if value is not None and _has_special_names(value):
@@ -121,8 +134,8 @@ class _Reader:
         if value == "{}":  # Hydra merges maps: null empties what others have set.
             yield from self._spread(mark, path, "null")
         argument = f"{mark}{'.'.join(path)}" + ("" if value is None else f"={value}")
-        late = not all(map(_KEY.fullmatch, path))
-        yield LateOverride(argument, path, None if mark == "~" else value) if late else argument
+        late = LateOverride(argument, path, None if mark == "~" else value)
+        yield argument if all(map(_KEY.fullmatch, path)) else late
 
     def _swept(self, value: str, path: tuple[str, ...]) -> str:
         """A value or, in a sweep, several, with quotes where texts need them."""

@@ -19,7 +19,7 @@ from warp_resphys.commands import CONFIG_PACKAGE
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.dynamics.trajectory import Trajectory
 from warp_resphys.io.progress import Progress
-from warp_resphys.launch import freed
+from warp_resphys.overrides import readable
 
 CPU: Final = torch.device("cpu")
 _SIZE: Final = 480  # of the yardstick's matrices
@@ -28,7 +28,7 @@ _SIZE: Final = 480  # of the yardstick's matrices
 def composed(name: str, overrides: Sequence[str]) -> Any:
     """Returns the values of a configuration, as the command line composes them."""
     with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
-        return OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)
+        return OmegaConf.to_container(compose(name, readable(overrides)[0]), resolve=True)
 
 
 def now(device: torch.device = CPU) -> float:

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from warp_resphys import cli
 from warp_resphys.io.settings import S, parse
-from warp_resphys.launch import freed
+from warp_resphys.overrides import readable
 
 
 class Outcome(NamedTuple):
@@ -63,7 +63,7 @@ def refusal(*arguments: object) -> str:
 def configuration(name: str, *overrides: str) -> dict:
     """A configuration of the package as plain data."""
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose(name, freed(overrides)), resolve=True)
+        return OmegaConf.to_container(compose(name, readable(overrides)[0]), resolve=True)
 
 
 def settings_of(settings: type[S], name: str, *overrides: str) -> S:

@@ -22,6 +22,8 @@ def test_the_motion_is_that_of_the_evaluation(finished):
     assert np.abs(motion.measured - motion.markers["simulation"]).max() > 1e-4
     np.testing.assert_allclose(motion.bound[:, 0], 0.1)
     assert len(motion_of(run, "150 g", ["resphys"], 0.05).times) == 6
+    # It was simulated, and the film does not call it measured.
+    assert [text for view in motion.film().views for text, _ in view.legend][-1] == "vertices of the simulated target"
 
 
 @pytest.mark.slow

@@ -38,6 +38,9 @@ BODY_LIGHT: Final = (0.72, 0.3)
 HEADROOM: Final = 0.12  # Space for the text above a film's view, over half its height.
 _LEAST_NEAR: Final = 0.03  # Least half height of the close-up, over the body's size.
 _MOST_NEAR: Final = 1.6  # Largest factor by which the other models' markers widen the close-up.
+MEASURED_MARKERS: Final = "measured markers"
+LABORATORY_MARKERS: Final = "markers of the simulated laboratory"
+TARGET_VERTICES: Final = "vertices of the simulated target"
 FILM_VIEW: Final = (560, 480)  # Size of each view [px].
 _PICTURE_VIEW: Final = (480, 408)
 _RADII: Final = {FILM_VIEW: 0.013, _PICTURE_VIEW: 0.02}  # Radius of a dot, over the height of a view.
@@ -102,6 +105,7 @@ class ComparedMotion:
     from_below: bool = False  # Whether the second view is from below, as for hanging bodies, rather than a close-up.
     target: FloatArray | None = None  # (T, N, 3) [m] of the vertices, where every one is observed.
     obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # Of the last model, at these times.
+    observed: str = MEASURED_MARKERS  # What `measured` shows: of a real body, or of a simulation in its place.
 
     @property
     def is_fast(self) -> bool:
@@ -141,7 +145,7 @@ class ComparedMotion:
         *others, last = (MODELS[model][0] for model in shown.positions)
         first, second = _views(shown, FILM_VIEW, HEADROOM)
         first = replace(first, legend=[*((name, _RINGS[0]) for name in others), (last, _RINGS[1])])
-        second = replace(second, legend=[("measured markers", MEASURED)])
+        second = replace(second, legend=[(self.observed, MEASURED)])
         texts = [f"{time:.2f} s" for time in shown.times]
         return RenderScene([first, second], FILM_VIEW, background="white", fps=fps, texts=texts)
 

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..learning.baselines import BASELINES
-from .bodies import ComparedMotion
+from .bodies import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion
 from .data import (
     MODELS,
     Film,
@@ -74,8 +74,20 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     whole = None if trials.labels else trials.target[row][frames]
     at_rest = trials.bound[points]
     around = data.obstacles_at(film.trial, times[frames])
+    observed = LABORATORY_MARKERS if "laboratory" in data.settings.targets else MEASURED_MARKERS
+    observed = observed if trials.labels else TARGET_VERTICES
     return ComparedMotion(
-        data.mesh, times[frames], target, bodies, seen, at_rest, trials.gravity, seen_from_below, whole, around
+        data.mesh,
+        times[frames],
+        target,
+        bodies,
+        seen,
+        at_rest,
+        trials.gravity,
+        seen_from_below,
+        whole,
+        around,
+        observed,
     )
 
 
@@ -93,9 +105,8 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
         pace = "four times slower than real time" if motion.is_fast else "in real time"
         caption = Markup(
-            "The trial {}, {}: {}. {} Dots: measured; rings: simulated. The film lies in "
-            "<code>figures/motion.mp4</code>."
-        ).format(name, pace, views, colours)
+            "The trial {}, {}: {}. {} Dots: {}; rings: simulated. The film lies in <code>figures/motion.mp4</code>."
+        ).format(name, pace, views, colours, motion.observed)
 
         def film(path: Path) -> Drawn:
             canvas.started["video"].result()

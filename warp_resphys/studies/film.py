@@ -17,7 +17,7 @@ from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
 from ..io.tables import show
 from ..learning.baselines import BASELINES
-from ..report.bodies import ComparedMotion
+from ..report.bodies import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion
 from ..report.control_section import compared_controllers
 from ..report.data import MODELS, at_times, shown_models
 from ..report.obstacles import ObstacleSurface
@@ -25,6 +25,7 @@ from ..report.render import DrawingError, RenderScene, hangs, write_film
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 
+_PLAYED: Final = {"simulate": TARGET_VERTICES, "laboratory": LABORATORY_MARKERS}  # by the stage that simulates them
 _MOST_VIEWS: Final = 3  # of controllers, side by side
 _MOST_MARKERS: Final = 6  # vertices of the tip that are shown where every vertex is observed
 _AT_THE_TIP: Final = 0.97  # distance of these from the fixed vertices, over the largest
@@ -126,7 +127,12 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     acting = {name: values[:, 0].double().cpu().numpy() for name, values in whole.inputs.items()}
     steps = np.clip(np.rint(times / robot.time_step).astype(int) - 1, 0, None)
     obstacles = obstacles.moved({q.name: acting[q.name][steps] for q in MOTION if q.name in acting})
-    return ComparedMotion(mesh, times, seen, positions, markers, bound, gravity, from_below, obstacles=obstacles)
+    shared = run / read_json(run / "stages" / "evaluate.json")["settings"]["shared"] / "stages"
+    simulated = (text for stage, text in _PLAYED.items() if (shared / f"{stage}.json").is_file())
+    observed = next(simulated, MEASURED_MARKERS)
+    return ComparedMotion(
+        mesh, times, seen, positions, markers, bound, gravity, from_below, obstacles=obstacles, observed=observed
+    )
 
 
 def _shown(robot: Robot, count: int) -> np.ndarray:

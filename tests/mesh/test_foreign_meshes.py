@@ -221,8 +221,9 @@ def test_cells_that_all_wind_the_other_way_are_turned_back(tmp_path, kind):
 
 @pytest.mark.parametrize("extension", ["vtk", "vtu"])
 def test_voxels_and_pixels_of_vtk(tmp_path, extension):
-    voxels = pyvista.ImageData(dimensions=(6, 3, 3), spacing=(0.01, 0.01, 0.01)).cast_to_unstructured_grid()
+    voxels = pyvista.ImageData(dimensions=(6, 3, 3), spacing=(0.01, 0.01, 0.01))
     pixel = pyvista.ImageData(dimensions=(2, 2, 1), spacing=(0.01, 0.01, 0.01)).cast_to_unstructured_grid()
-    voxels.merge(pixel).save(tmp_path / f"scan.{extension}")
-    mesh = read_mesh(tmp_path / f"scan.{extension}")
-    np.testing.assert_allclose(cell_volumes(mesh), np.full(20, 1e-6), rtol=1e-5)
+    voxels.save(tmp_path / "grid.vti")
+    voxels.cast_to_unstructured_grid().merge(pixel).save(tmp_path / f"scan.{extension}")
+    for name in ("grid.vti", f"scan.{extension}"):
+        np.testing.assert_allclose(cell_volumes(read_mesh(tmp_path / name)), np.full(20, 1e-6), rtol=1e-5)

@@ -23,6 +23,7 @@ from .abaqus_file import read_abaqus
 from .errors import DecodingError
 from .gmsh_file import read_gmsh
 from .mesh_blocks import Block, mesh_arrays_of
+from .vtk_file import read_vtk
 
 if TYPE_CHECKING:
     import h5py
@@ -31,6 +32,10 @@ Arrays = dict[str, NDArray[Any]]
 
 MEMORY = (2 << 30, 64)  # limit of the address space: bytes, plus bytes per byte of the file
 SECONDS = (10.0, 2e-6)  # limit of processor time: seconds, plus seconds per byte of the file
+MESH_READERS = {  # by extension; meshio reads the other formats
+    **{".msh": read_gmsh, ".inp": read_abaqus},
+    **dict.fromkeys((".vtk", ".vtu", ".vti", ".vtr", ".vts"), read_vtk),
+}
 _OUT_OF_TIME = -getattr(signal, "SIGXCPU", 0)
 _WAITING = 6  # limit of wall-clock time over that of processor time, for a busy machine
 
@@ -39,7 +44,7 @@ def decode(library: str, path: Path, *names: str) -> Arrays:
     """Runs `c3d_arrays`, `mesh_arrays` or `hdf5_arrays` in a subprocess, and returns the arrays.
 
     Args:
-        library: "ezc3d", "meshio" (and our own readers of meshes) or "h5py".
+        library: "ezc3d", "meshio", for all meshes, or "h5py".
         path: An existing file.
         names: Further arguments of `hdf5_arrays`.
 
@@ -148,15 +153,14 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
     """Reads points, volume cells, named surfaces and named regions (`mesh_blocks.mesh_arrays_of`).
 
     Args:
-        path: a file of gmsh, of Abaqus, or of another program, which meshio reads; its own errors are not caught.
+        path: a file with one of `MESH_READERS`, or one that meshio reads, whose own errors are not caught.
         file_format: meshio's name of the format; None for that of the file name extension.
 
     Raises:
         DecodingError: the file cannot be read.
     """
-    readers = {"gmsh": read_gmsh, ".msh": read_gmsh, "abaqus": read_abaqus, ".inp": read_abaqus}
-    own = readers.get(file_format or Path(path).suffix.lower())
-    if own is None:
+    suffix = {None: Path(path).suffix.lower(), "gmsh": ".msh", "abaqus": ".inp"}.get(file_format)
+    if (own := MESH_READERS.get(suffix or "")) is None:
         return mesh_arrays_of(*_read_by_meshio(path, file_format))
     try:
         return mesh_arrays_of(*own(path))
@@ -168,15 +172,12 @@ def _read_by_meshio(path: str, file_format: str | None) -> tuple[NDArray[np.floa
     """Returns points and blocks of a file; cell sets are groups."""
     import meshio
 
-    _know_voxels()
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
             content = meshio.read(path, file_format)
     except SystemExit as error:
         raise DecodingError(printed.getvalue()) from error
-    if "cannot handle" in printed.getvalue():  # cells that meshio leaves out
-        raise DecodingError(printed.getvalue())
     blocks = []
     for number, block in enumerate(content.cells):
         sets = {name: own[number] for name, own in content.cell_sets.items() if own[number] is not None}
@@ -184,23 +185,6 @@ def _read_by_meshio(path: str, file_format: str | None) -> tuple[NDArray[np.floa
         nodes = block.data if isinstance(block.data, np.ndarray) else np.empty((len(block), 0))
         blocks.append(Block(block.type, block.dim, nodes.astype(np.int64), groups))
     return np.asarray(content.points, dtype=np.float64), blocks
-
-
-def _know_voxels() -> None:
-    """Adds VTK's pixels and voxels to meshio: quadrilaterals and hexahedra with another order of corners."""
-    from meshio import _vtk_common
-    from meshio.vtk import _vtk_42
-
-    orders = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}
-    known = _vtk_common.vtk_to_meshio_order
-
-    def order(kind: int, dtype: Any = int) -> NDArray[Any] | None:
-        return np.array(orders[kind], dtype=dtype) if kind in orders else known(kind, dtype)
-
-    if 11 not in _vtk_common.vtk_to_meshio_type:
-        _vtk_common.vtk_to_meshio_type.update({8: "quad", 11: "hexahedron"})
-        _vtk_42.vtk_type_to_numnodes[[8, 11]] = 4, 8
-        _vtk_common.vtk_to_meshio_order = _vtk_42.vtk_to_meshio_order = order
 
 
 def _limit(memory: int, seconds: int) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..io.atomic import atomic_path
-from ..io.decoding import Arrays, decode, mesh_arrays
+from ..io.decoding import MESH_READERS, Arrays, decode, mesh_arrays
 from ..io.errors import DecodingError, MeshError, warn
 from .elements import ELEMENTS
 from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
@@ -170,7 +170,7 @@ def _read_file(path: Path) -> Arrays:
         stat = path.stat()
         return _decoded(path.absolute(), stat.st_ino, stat.st_size, stat.st_mtime_ns)
     except DecodingError as error:
-        if path.suffix.lower() in _NUMBERED:
+        if path.suffix.lower() in MESH_READERS:
             raise MeshError(f"{path}: {error}") from error
         raise MeshError(
             f"{path}: meshio cannot read this file ({error}); is it whole, and of its extension's format?"
@@ -181,12 +181,12 @@ def _read_file(path: Path) -> Arrays:
 def _decoded(path: Path, *_: int) -> Arrays:
     """Returns the arrays of a file, cached by its state: an experiment reads its mesh a dozen times, 0.3 s each."""
     arrays = decode("meshio", path)
-    for name in (f"solid/{kind}" for kind in _CELL_TYPES if f"solid/{kind}" in arrays):
-        cells = arrays[name]
-        mesh = Mesh(arrays["points"], cells)
-        if cells.min() >= 0 and cells.max() < len(mesh.vertices) and is_mirrored(mesh):
+    for element in ELEMENTS.values():
+        cells = arrays.get(f"solid/{element.file_type}", np.empty((0, 0)))
+        is_whole = cells.shape[1] == element.nodes and 0 <= cells.min() <= cells.max() < len(arrays["points"])
+        if is_whole and is_mirrored(Mesh(arrays["points"], cells)):
             warn(f"{path}: all {len(cells)} cells have a negative volume, so the order of their nodes is reversed")
-            arrays[name] = cells[:, mesh.element.mirrored]
+            arrays[f"solid/{element.file_type}"] = cells[:, element.mirrored]
     return arrays
 
 

@@ -31,7 +31,6 @@ from warp_resphys.report.data import (
     shown_models,
     tip_markers,
 )
-from warp_resphys.report.error_section import largest_filtered
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import (
     MINUS,
@@ -51,7 +50,6 @@ from warp_resphys.report.sections import (
     gain_text,
     horizon_table,
     published_beside,
-    published_growth,
     residual_table,
     rest_table,
     shapes_table,
@@ -82,13 +80,12 @@ MORE = {"sysid": summary(None, 1), "resphys": summary(1.5)}
 
 class TestErrors:
     def test_by_horizon(self):
-        metrics = {"horizons": {"10": MORE, "5": ERRORS}, "growth": {"sysid": None, "resphys": 0.5}}
+        metrics = {"horizons": {"10": MORE, "5": ERRORS}}
         table = horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
         assert table.columns == ["SysID", "ResPhys"]
         assert {row.head: row.cells for row in table.rows} == {
             "First 5 s": [Cell("2.00", "7.51 ± 3.63"), Cell("1.00", "5.79 ± 3.09")],
             "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50", "6.10 ± 3.22")],
-            "Growth": [Cell(NONE, "+0.8 %"), Cell("+50.0 %", "+5.4 %")],
         }
         (row,) = horizon_table({"horizons": {"5": ERRORS}}, {}).rows
         assert row.cells == [Cell("2.00"), Cell("1.00")]
@@ -333,14 +330,6 @@ def test_numbers_have_sensible_digits():
     assert error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
     shown = [duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
     assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]
-
-
-def test_published_growth_and_filtered_errors():
-    horizons = PUBLISHED_WINDOWS_MM["sopra_extrapolation"]
-    assert 100.0 * published_growth(horizons, "5", "10")["resphys"] == pytest.approx(5.4, abs=0.05)
-    assert largest_filtered({}) == ""
-    filtered = largest_filtered({"median_filtered": {"resphys": 1.5, "sysid": None}})
-    assert "reaches 1.50 mm (ResPhys)" in filtered.replace(NO_BREAK_SPACE, " ")
 
 
 def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():

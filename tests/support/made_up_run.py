@@ -11,7 +11,7 @@ from support.configured import settings
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.experiment.files import Dataset
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
-from warp_resphys.learning.metrics import marker_errors, mean_distance, median_filter, summarise, summarise_trajectories
+from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
 from warp_resphys.mesh.mesh import box_hexahedra
 
 GRAVITY = np.array([0.0, 0.02, -9.8])
@@ -298,17 +298,11 @@ def _arm_errors(simulated, measured, names, test, labels, scales, horizons):
         return _errors(own, measured[rows, steps], names[rows], labels)
 
     late = {"left": 2, "first_s": {"test_01": 1.2, "test_00": 0.84}}
-    means = {m: mean_distance(x[:test], measured[:test])[:, 1:].mean(0) for m, x in simulated.items()}
     content = part(0, test) | {
-        "median_filtered": {
-            m: median_filter(np.where(np.isinf(x), np.nan, x), ARM_STEP).max() for m, x in means.items()
-        },
         "range": {"simfree": late, "resphys": {"left": 0, "first_s": {}}},
     }
     if horizons:
         content["horizons"] = {f"{w:g}": part(0, test, round(w / ARM_STEP))["errors_mm"] for w in horizons}
-        first, *_, last = ({m: own["mean"] for m, own in each.items()} for each in content["horizons"].values())
-        content["growth"] = {m: None if last[m] is None else last[m] / first[m] - 1.0 for m in first}
     if scales:
         content["scales"] = {"1": content["errors_mm"]} | {
             f"{scale:g}": part(test * k, test * (k + 1))["errors_mm"] for k, scale in enumerate(scales, 1)

@@ -22,7 +22,6 @@ from ..learning.metrics import (
     PHASES,
     errors_per_marker,
     marker_errors,
-    median_filter,
     summarise,
     summarise_trajectories,
 )
@@ -43,7 +42,6 @@ IntArray = NDArray[np.int64]
 _FILM_FRAMES = 256  # maximum
 CHECKED_SECONDS, _CHECKED_POSES = 0.5, 3  # that are simulated with a finer mesh
 _WARM_UP = 20  # steps before computing times are measured
-_FILTERED_SECONDS = 4.0  # minimum duration of trials for the median filter over one second
 
 
 def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
@@ -208,7 +206,15 @@ def summary(
             model: {name: _mean_angle(x[:count, :, own], points[:count, :, own]) for name, own in bodies.items()}
             for model, x in simulated.items()
         }
-    content |= _over_time(settings, test, observed, errors) | _by_phase(dataset, names, test, observed)
+    if settings.horizons:
+        content["horizons"] = {
+            f"{seconds:g}": {
+                m: summarise(_errors(x[:, :frames], observed[:, :frames], [0] * count)) for m, x in test.items()
+            }
+            for seconds in settings.horizons
+            for frames in [round(seconds / step) + 1]
+        }
+    content |= _by_phase(dataset, names, test, observed)
     if left:
         content["range"] = {model: _range(rows[:count], names, step) for model, rows in left.items()}
     if len(groups) > 1:
@@ -250,31 +256,6 @@ def _reconstructed(context: StageContext, names: Sequence[str]) -> FloatArray:
         return read_array(file, "q")[[order.index(name) for name in names]]
 
 
-def _over_time(
-    settings: StageSettings,
-    test: Mapping[str, FloatArray],
-    observed: FloatArray,
-    errors: Mapping[str, Sequence[FloatArray]],
-) -> dict[str, Any]:
-    """Errors up to the horizons, their growth, and the largest median-filtered errors of long trials."""
-    step, horizons = settings.time_step, settings.horizons
-    content: dict[str, Any] = {}
-    if horizons:
-        first = [0] * len(observed)
-        content["horizons"] = {
-            f"{seconds:g}": {m: summarise(_errors(x[:, :frames], observed[:, :frames], first)) for m, x in test.items()}
-            for seconds in horizons
-            for frames in [round(seconds / step) + 1]
-        }
-    if len(horizons) > 1:
-        near, far = (content["horizons"][f"{seconds:g}"] for seconds in (horizons[0], horizons[-1]))
-        means = {model: (near[model]["mean"], far[model]["mean"]) for model in test}
-        content["growth"] = {m: None if None in pair else float(pair[1] / pair[0] - 1.0) for m, pair in means.items()}
-    if horizons and horizons[-1] >= _FILTERED_SECONDS:
-        content["median_filtered"] = {model: _largest_filtered(rows, step) for model, rows in errors.items()}
-    return content
-
-
 def _by_phase(
     dataset: Dataset, names: Sequence[str], test: Mapping[str, FloatArray], observed: FloatArray
 ) -> dict[str, Any]:
@@ -291,12 +272,6 @@ def _by_phase(
         if rows.any()
     }
     return {"phases": found} if found else {}
-
-
-def _largest_filtered(errors: Sequence[FloatArray], step: float) -> float | None:
-    """Largest error of any trial after a median filter over one second [mm]; None if a roll-out diverged."""
-    diverged = not all(np.isfinite(series).all() for series in errors)
-    return None if diverged else max(float(median_filter(series, step).max()) for series in errors)
 
 
 def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:

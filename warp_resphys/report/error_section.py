@@ -126,10 +126,7 @@ def _error_caption(data: RunReport, window: float | None) -> str:
     count = len(data.metrics["per_trajectory"])
     text = f"Mean over the {'visible markers' if data.sees_markers else 'vertices, against the target'}"
     if window is not None:
-        text += (
-            f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered. "
-        )
-        text += largest_filtered(data.metrics)
+        text += f" and {number_of(count, 'test trial')}, after a median filter of 1 s; the thin lines are not filtered."
     elif count > 1:
         parted = len(grouped_errors(data.metrics, data.settings)) > 1
         text += f": the line is the mean of the {'' if parted else f'{count} '}test trials, the band"
@@ -140,10 +137,3 @@ def _error_caption(data: RunReport, window: float | None) -> str:
     if any(summary["diverged"] for summary in data.metrics["errors_mm"].values()):
         text += " A line ends where the first roll-out has diverged."
     return unbroken(text)
-
-
-def largest_filtered(metrics: Mapping[str, Any]) -> str:
-    """Return a sentence on the largest filtered error of single trials, by model; empty if it is not known."""
-    largest = metrics.get("median_filtered", {})
-    parts = [f"{mm_text(largest[m])} ({MODELS[m][0]})" for m in MODELS if largest.get(m) is not None]
-    return f"In single trials the filtered error reaches {', '.join(parts)}." if parts else ""

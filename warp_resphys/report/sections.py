@@ -9,7 +9,7 @@ import numpy as np
 
 from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, PublishedError, published_errors
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
 from ..settings.run import RunSettings
 from .data import (
     MODELS,
@@ -35,7 +35,6 @@ from .page import (
     error_parts,
     in_a_row,
     number_text,
-    percent_text,
     published_parts,
     share_text,
     unbroken,
@@ -219,10 +218,10 @@ def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
-    """Return the errors over the first seconds of the roll-outs and their growth, with published ones below.
+    """Return the errors over the first seconds of the roll-outs, with published ones below.
 
     Args:
-        metrics: With `horizons` (a summary by seconds and model) and `growth`; None is returned without them.
+        metrics: With `horizons` (a summary by seconds and model); None is returned without them.
         published: Published errors by seconds and model.
     """
     horizons, rows = metrics.get("horizons", {}), {}
@@ -230,20 +229,8 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
         theirs = {model: " ".join(published_parts(error)) for model, error in published.get(horizon, {}).items()}
         errors = horizons[horizon]
         rows[f"First {float(horizon):g} s"] = {m: Cell(error_parts(e)[0], theirs.get(m, "")) for m, e in errors.items()}
-    if len(rows) > 1 and metrics.get("growth"):
-        ours = {m: NONE if growth is None else percent_text(growth, 1) for m, growth in metrics["growth"].items()}
-        shares = published_growth(published, min(horizons, key=float), max(horizons, key=float))
-        theirs = {m: percent_text(share, 1) for m, share in shares.items()}
-        rows["Growth"] = {m: Cell(ours.get(m, NONE), theirs.get(m, "")) for m in next(iter(rows.values()))}
-    note = "Growth of the mean error is from the shortest to the longest part of the same roll-outs."
-    note += " Small: published." if published else ""
+    note = "Small: published." if published else ""
     return model_table("Mean error [mm]", rows, metrics.get("errors_mm", {}), note) if rows else None
-
-
-def published_growth(published: Mapping[str, Mapping[str, PublishedError]], first: str, last: str) -> dict[str, float]:
-    """Return the relative growth of published errors from one length of the roll-outs [s] to another, by model."""
-    before, after = published.get(first, {}), published.get(last, {})
-    return {model: after[model].mean / before[model].mean - 1.0 for model in before if model in after}
 
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:

@@ -358,14 +358,3 @@ def test_rollers_draw_by_friction_alone(device):
         assert out.failed == 0
         assert not any(out.crossings.values())
         assert (out.end[Scene(case.bodies).vertex_slice("block"), 0].mean() > 0.02) == draws
-
-
-def test_both_programs_find_the_same_crossings():
-    """Two spikes pushed through one another step by step, by ipctk and by the project's own search."""
-    pytest.importorskip("ipctk", reason="compares with ipctk: pip install 'warp-resphys[test]'")
-    scene = Scene(CASES["spikes"].bodies)
-    positions, upper = torch.tensor(scene.mesh.vertices).repeat(20, 1, 1), scene.vertex_slice("upper")
-    positions[:, upper, :2] += torch.tensor([0.003, 0.001])
-    positions[:, upper, 2] -= torch.linspace(0.0, 0.1, 20)[:, None]
-    crossings, _ = crossings_of(scene.mesh, positions, 1e-4)
-    assert 0 < crossings["own"] == crossings["ipctk"] < 20

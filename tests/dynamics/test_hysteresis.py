@@ -17,13 +17,11 @@ from warp_resphys import (
     Simulator,
     SolverSettings,
     State,
-    bind_markers,
     box_hexahedra,
     select_vertices,
 )
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.library import ObservedMotion, identify
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients, pose
 
@@ -215,26 +213,6 @@ class TestGradients:
 
 def normal(seed, shape):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-@pytest.mark.slow
-def test_identification_recovers_the_slider_from_a_slow_cycle():
-    """Markers of a beam that is bent back and forth, so slowly that a Prony branch could not explain the loop."""
-    truth = replace(ELASTIC, poissons_ratio=0.3, stiffness_damping=5e-3, hysteresis=[(0.8, 0.01)])
-    markers = bind_markers(MESH, np.array([[0.04, 0.01, 0.022], [0.02, 0.01, 0.022]]), ["tip", "middle"])
-    phase = torch.linspace(0.0, 3.0 * math.pi, 37, dtype=torch.float64)[1:]
-    inputs = Inputs(phase.sin()[:, None, None, None] * pull(0.1).external_force)
-    laboratory, guess = (
-        Simulator(CLAMPED, m, 0.05, WEIGHTLESS, relative_tolerance=1e-8)
-        for m in (truth, replace(truth, hysteresis=[(0.3, 0.02)]))
-    )
-    observed = torch.stack([markers(q) for q in laboratory.rollout(laboratory.rest_state(), len(phase), inputs).q])
-    motion = ObservedMotion(observed, laboratory.rest_state(), inputs, observation=markers)
-    bounds = {"hysteresis_ratio_1": (0.05, 5.0), "hysteresis_strain_1": (1e-3, 0.2)}
-    result = identify(guess, motion, {**bounds, "youngs_modulus": (1e4, 1e5)}, {"youngs_modulus": 3e4})
-    assert result.parameters["hysteresis_ratio_1"] == pytest.approx(0.8, rel=1e-2)
-    assert result.parameters["hysteresis_strain_1"] == pytest.approx(0.01, rel=1e-2)
-    assert result.parameters["youngs_modulus"] == pytest.approx(2e4, rel=1e-2)
 
 
 @pytest.mark.parametrize(

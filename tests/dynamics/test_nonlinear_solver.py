@@ -5,17 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.catalogue import MATERIALS
-from warp_resphys.energies.launcher import struct_of, warp_view
+from warp_resphys.energies.launcher import struct_of
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.kernels import minimisation as kernels
-from warp_resphys.kernels.lbfgs import lbfgs_kernels
-from warp_resphys.kernels.line_search import MAX_HALVINGS, accept_kernel
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
@@ -282,71 +279,3 @@ def test_directions_equal_the_bfgs_formula():
             pairs[b].append((moved, g - here[b][1]))
             here[b] = (x, g)
     assert searches > 0
-
-
-class OneVertex:
-    """Kernel arrays of one environment with one vertex, after the evaluation of a trial.
-
-    The energy is far below the previous one, so that the trial is accepted.
-    """
-
-    def __init__(self, memory):
-        self.pairs, self.vectors = lbfgs_kernels(wp.float64).Pairs(), {}
-        self.progress, self.evaluation = kernels.SolverProgress(), kernels.Evaluation()
-        self.search, self.tolerances, pairs = kernels.LineSearch(), kernels.Tolerances(), self.pairs
-        for name, variable in kernels.SolverProgress.vars.items():
-            setattr(self.progress, name, wp.full(1, 1, dtype=variable.type.dtype, device="cpu"))
-        pairs.count, pairs.last = (wp.zeros(1, dtype=int, device="cpu") for _ in range(2))
-        pairs.s, pairs.y = (wp.zeros((1, memory, 1), dtype=wp.vec3d, device="cpu") for _ in range(2))
-        pairs.r = wp.zeros((1, memory, memory), dtype=wp.float64, device="cpu")
-        for name in ("energy", "size", "balance", "norm"):
-            setattr(self.evaluation, name, wp.full(1, -1e9, dtype=wp.float64, device="cpu"))
-        self.evaluation.residual, self.tolerances.max_iterations = self._vector("residual"), 1000
-        for name in kernels.LineSearch.vars:
-            setattr(self.search, name, self._vector(name))
-        self.clamped, self.history = wp.zeros(1, dtype=wp.bool, device="cpu"), kernels.History()
-        for name in ("stored", "newest", "order"):
-            setattr(self.history, name, wp.zeros(1, dtype=int, device="cpu"))
-        self.history.start = wp.zeros((1, 1), dtype=wp.vec3d, device="cpu")
-        self.history.correction = wp.zeros((1, 3, 1), dtype=wp.vec3d, device="cpu")
-
-    def _vector(self, name):
-        self.vectors[name] = torch.zeros(1, 1, 3, dtype=torch.float64)
-        return warp_view(self.vectors[name], wp.vec3d)
-
-    def accept(self):
-        self.progress.phase.fill_(kernels.LINE_SEARCH)
-        inertia = wp.zeros((1, 1), dtype=wp.float64, device="cpu")
-        inputs = [1, self.tolerances, inertia, self.evaluation, self.clamped, self.search]
-        inputs += [self.progress, self.pairs, self.history]
-        wp.launch_tiled(accept_kernel(wp.float64), dim=[1], inputs=inputs, block_dim=64, device="cpu")
-
-    def __getitem__(self, name):
-        return float(getattr(self.progress, name).numpy()[0])
-
-
-@pytest.mark.parametrize(
-    ("iterations", "factorisations", "clamped", "phase", "requested"),
-    [
-        (5, 0, False, kernels.NEED_DIRECTION, kernels.FACTOR),
-        (5, 1, False, kernels.NEED_DIRECTION, kernels.CLAMPED_FACTOR),
-        (5, 1, True, kernels.FAILED, 0),
-        (10, 0, False, kernels.FAILED, 0),
-    ],
-)
-@pytest.mark.parametrize("stalls", [0, 2])
-def test_a_failed_line_search(iterations, factorisations, clamped, phase, requested, stalls):
-    """A failed line search requests a factor, then a clamped one, within the iteration limit; rounding is checked."""
-    one = OneVertex(3)
-    one.tolerances.max_iterations = 10
-    start = {"iterations": iterations, "factorisations": factorisations, "stalls": stalls}
-    for name, value in {**start, "request": 0, "check_rounding": 0}.items():
-        getattr(one.progress, name).fill_(value)
-    one.progress.halvings.fill_(MAX_HALVINGS - 1)
-    one.progress.rounding.fill_(np.inf)
-    one.evaluation.energy.fill_(np.nan)
-    one.clamped.fill_(clamped)
-    one.accept()
-    assert (one["phase"], one["request"], one["stalls"]) == (phase, requested, stalls + 1)
-    assert one["check_rounding"] == (stalls + 1 >= kernels.STALLS_BEFORE_CHECK)
-    assert one["step"] == 0.0

@@ -10,25 +10,8 @@ import warp as wp
 from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra
 from warp_resphys.dynamics.tape import record_rollout
 from warp_resphys.io.errors import InputError
-from warp_resphys.studies.gradient_check import central_difference
 
 BATCH, STEPS = 2, 3
-
-
-@wp.kernel(module="test_tape")
-def push(strength: wp.array[wp.float64], force_out: wp.array3d[wp.vec3d]):
-    """A force whose strength the tape differentiates, along z at every vertex."""
-    t, b, i = wp.tid()
-    phase = wp.float64(t + 2 * b) + wp.float64(0.3) * wp.float64(i)
-    force_out[t, b, i] = wp.vec3d(wp.float64(0.0), wp.float64(0.0), strength[b] * wp.cos(phase))
-
-
-@wp.kernel(module="test_tape")
-def add_squares(q: wp.array3d[wp.vec3d], rest: wp.array2d[wp.vec3d], loss: wp.array[wp.float64]):
-    """Sum over all times of the squared displacement."""
-    t, b, i = wp.tid()
-    u = q[t, b, i] - rest[b, i]
-    wp.atomic_add(loss, 0, wp.dot(u, u))
 
 
 def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator:
@@ -95,50 +78,6 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
         got = wp.to_torch(value.grad)
         assert torch.linalg.norm(got - gradient) <= 1e-12 * torch.linalg.norm(gradient), name
         assert torch.linalg.norm(gradient) > 0.0, name
-
-
-def taped_loss(simulator: Simulator, strength: wp.array, modulus: wp.array) -> tuple[wp.Tape, wp.array]:
-    """The loss kernel of a roll-out under the force kernel, on a tape."""
-    state = simulator.rest_state(BATCH)
-    n, device = simulator.body.n_vertices, strength.device
-    q, v = array(state.q), array(state.v)
-    rest = array(state.q)
-    force = wp.zeros((STEPS, BATCH, n), dtype=wp.vec3d, device=device, requires_grad=True)
-    loss = wp.zeros(1, dtype=wp.float64, device=device, requires_grad=True)
-    with wp.Tape() as tape:
-        wp.launch(push, dim=force.shape, inputs=[strength], outputs=[force], device=device)
-        rollout = record_rollout(
-            tape, simulator, q, v, STEPS, inputs={"external_force": force}, parameters={"youngs_modulus": modulus}
-        )
-        wp.launch(add_squares, dim=rollout.q.shape, inputs=[rollout.q, rest], outputs=[loss], device=device)
-    return tape, loss
-
-
-@pytest.fixture
-def problem(device: str) -> tuple[Simulator, wp.array, wp.array]:
-    simulator = make_simulator(device)
-    strength = array(simulator.tensor([2e-2, -1e-2]), wp.float64)
-    return simulator, strength, array(simulator.tensor([1e5]), wp.float64)
-
-
-def test_mixed_tape_against_central_differences(problem: tuple[Simulator, wp.array, wp.array]) -> None:
-    simulator, strength, modulus = problem
-    tape, loss = taped_loss(simulator, strength, modulus)
-    tape.backward(loss)
-
-    def difference(value: wp.array, entry: int, change: float) -> float:
-        def along(step: float) -> float:
-            moved = value.numpy().copy()
-            moved[entry] += step * change
-            other = wp.array(moved, dtype=wp.float64, device=value.device, requires_grad=True)
-            given = [other if a is value else a for a in (strength, modulus)]
-            return float(taped_loss(simulator, *given)[1].numpy()[0])
-
-        return central_difference(along)[0] / change
-
-    for entry in range(BATCH):
-        assert strength.grad.numpy()[entry] == pytest.approx(difference(strength, entry, 1e-2), rel=1e-6)
-    assert modulus.grad.numpy()[0] == pytest.approx(difference(modulus, 0, 3e4), rel=1e-6)
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "bdf2"])

@@ -248,32 +248,6 @@ def test_gradients_of_an_oblique_impact(integrator, rigid, device):
     assert float((actual - (ahead - behind) / 2.0).abs().max()) < 1e-6 * least
 
 
-@pytest.mark.slow
-def test_gradients_of_a_body_that_rubs_on_itself():
-    """The ends of a clip are pressed together, and one of them is pulled along the other."""
-    mesh = clip()
-    ends = mesh.vertices[:, 0] > 0.029
-    upper, lower = ends & (mesh.vertices[:, 2] > 0.014), ends & (mesh.vertices[:, 2] < 0.014)
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[SurfaceContact(KAPPA, 0.3, slip_speed=1e-2)])
-    simulator = Simulator(body, SOFT, time_step=0.004, gravity=(0.0, 0.0, 0.0), solver=FINE)
-    weights = simulator.tensor(np.random.default_rng(4).normal(size=(len(mesh.vertices), 3)))
-
-    def pressed(given):
-        force = torch.zeros(1, len(mesh.vertices), 3, dtype=torch.float64)
-        force[0, upper] = given["force"] / upper.sum()
-        force[0, lower] = -given["force"] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) / lower.sum()
-        parameters = {"surface_friction": given["surface_friction"]}
-        return simulator.rollout(simulator.rest_state(), 14, Inputs(external_force=force), parameters)
-
-    values = {
-        "force": torch.tensor([0.0, 0.02, -0.06], dtype=torch.float64),
-        "surface_friction": torch.tensor([[0.3]], dtype=torch.float64),
-    }
-    check_slopes(
-        lambda given: 1e2 * (pressed(given).q[-1][0] * weights).sum(), values, {"force": 1e-7, "surface_friction": 1e-5}
-    )
-
-
 def test_regions_have_their_own_friction():
     """Two cubes on a slope: one slides, and the other one stands on a rough part of the plate."""
     plate = box_hexahedra((0.12, 0.06, 0.01), (8, 4, 1))

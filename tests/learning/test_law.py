@@ -52,24 +52,6 @@ def test_a_branch_between_two_times_of_the_grid_is_one_branch():
     assert found.residual < 0.01 * laws[()].residual
 
 
-def test_the_direction_of_a_family_of_fibres_is_found():
-    azimuth, elevation = 0.5, -0.35
-    fibre = {"fibre_azimuth_1": azimuth, "fibre_elevation_1": elevation, "fibre_tension_1": 60e3}
-    truth = {**NEO_HOOKEAN, **FIBRE, "fibre_toe_1": 0.02, **fibre}
-    laws = classes(truth, ("c20",), (), 1)
-    found = laws["fibres",]
-    axes = [axis(law["fibre_azimuth_1"], law["fibre_elevation_1"]) for law in (truth, found.constants)]
-    assert abs(float(axes[0] @ axes[1])) > math.cos(math.radians(15.0))
-    assert found.constants["fibre_tension_1"] == pytest.approx(60e3, rel=0.3)
-    assert found.constants["c10"] == pytest.approx(30e3, rel=0.1)
-    assert found.residual < 0.5 * laws[()].residual
-
-
-def axis(azimuth, elevation):
-    level = math.cos(elevation)
-    return np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
-
-
 def branch(time):
     return {"prony_modulus_1": 1e5, "prony_time_1": time}
 

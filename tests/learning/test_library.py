@@ -129,27 +129,3 @@ def test_invalid_motions_are_refused(robot):
         identify(robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match="does not train recurrent networks"):
         fit_force(robot, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
-
-
-def test_friction_and_height_of_a_floor_are_recovered():
-    """A block is thrown along a floor, which lies lower than the simulator has it."""
-    block = wr.box_hexahedra((0.03, 0.02, 0.02), (2, 1, 1))
-
-    def on_floor(height, friction):
-        floor = wr.HalfSpace(position=(0.0, 0.0, height))
-        body = wr.Body(block, energies=[wr.Contact({"floor": floor}, friction=friction, slip_speed=1e-2)])
-        return wr.Simulator(body, wr.Corotated(264e3, 0.45, stiffness_damping=3e-3), time_step=5e-3)
-
-    thrown = on_floor(-3e-3, 0.4)
-    start = thrown.rest_state()
-    start = dataclasses.replace(start, v=start.v + start.v.new_tensor([0.4, 0.0, 0.0]))
-    seen = thrown.rollout(start, 40).q
-    result = identify(
-        on_floor(-2e-3, 0.2),
-        ObservedMotion(seen, start=start),
-        {"contact_friction": wr.Bounds(0.0, 1.0), "obstacle_z": wr.Bounds(-4e-3, 1e-3)},
-    )
-    assert result.parameters["contact_friction"] == pytest.approx(0.4, rel=2e-3)
-    assert result.parameters["obstacle_z"] == pytest.approx(-1e-3, abs=2e-6)
-    assert not result.at_bounds
-    assert set(result.uncertainty.deviation) == {"contact_friction", "obstacle_z"}

@@ -15,7 +15,7 @@ from warp_resphys.mesh.arm_section import SOLID, section_grids, section_quadrila
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
 from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
-from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
+from warp_resphys.mesh.readers import read_mesh, read_surfaces
 
 SHIPPED = resources.files("warp_resphys") / "meshes"
 SHAPES = [
@@ -237,13 +237,3 @@ def test_shipped_arms_come_from_the_commands_beside_them(tmp_path):
         assert list(named) == list(surfaces)
         for key, faces in surfaces.items():
             np.testing.assert_array_equal(named[key], faces)
-
-
-def test_named_surfaces_survive_a_file(tmp_path):
-    mesh, surfaces = mesh_arm(ArmGeometry(), 0.01)
-    write_mesh(tmp_path / "arm.msh", mesh, surfaces)
-    read = read_surfaces(tmp_path / "arm.msh")
-    assert all(np.array_equal(read[name], faces) for name, faces in surfaces.items())
-    write_mesh(tmp_path / "arm.vtu", mesh, surfaces)
-    np.testing.assert_array_equal(read_mesh(tmp_path / "arm.vtu").cells, mesh.cells)
-    assert read_surfaces(tmp_path / "arm.vtu") == {}

@@ -3,16 +3,7 @@
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Simulator,
-    SolverSettings,
-    State,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.energies.potential import IncrementalPotential
 from warp_resphys.io.errors import ConvergenceError

@@ -4,15 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Gent,
-    MooneyRivlin,
-    Simulator,
-    SolverSettings,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Gent, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import check_gradients
 

@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    PointMass,
-    Simulator,
-    SolverSettings,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Inputs, PointMass, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies.strings import Strings
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.integrators import INTEGRATORS

@@ -5,15 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from warp_resphys import (
-    Body,
-    Mesh,
-    Simulator,
-    SolverSettings,
-    box_hexahedra,
-    box_tetrahedra,
-    quadratic,
-)
+from warp_resphys import Body, Mesh, Simulator, SolverSettings, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.fem.elements import discretise, physical_gradients
 from warp_resphys.io.errors import InputError

@@ -28,16 +28,8 @@ MARKERS = bind_markers(MESH, POINTS, ["a", "b"], kind="rigid", vertices=TIP)
 STEP = 0.01
 MATERIAL = Corotated(264e3, 0.45)
 LOADS = torch.tensor([[0.0], [0.05]], dtype=torch.float64)
-NETWORK = {
-    "kind": "reduced",
-    "position_modes": 2,
-    "velocity_modes": 2,
-    "force_modes": 2,
-    "blocks": 1,
-    "activation": "normalised_elu",
-    "layers": 0,
-    "width": 8,
-}
+MODES = {"position_modes": 2, "velocity_modes": 2, "force_modes": 2}
+NETWORK = NetworkSettings(**MODES, layers=0, width=8)
 CONFIG = InTheLoopSettings(epochs=4, penalty=1e-3, memory=5)
 
 
@@ -116,7 +108,7 @@ def network(seed=0, **changes):
     rest = simulator().rest_positions
     q, v, force = (1e-2 * torch.randn(12, *rest.shape, dtype=torch.float64) for _ in range(3))
     return build_model(
-        ResidualForce, NetworkSettings(**{**NETWORK, **changes}), rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)
+        ResidualForce, NETWORK.changed(**changes), rest, rest + q, v, force + 1e-2, LOADS.repeat(6, 1)
     ).double()
 
 
@@ -268,7 +260,7 @@ class TestWindows:
         torch.manual_seed(0)
         model = build_model(
             ResidualForce,
-            NetworkSettings(**NETWORK),
+            NETWORK,
             torch.as_tensor(MESH.vertices),
             windows.q.flatten(0, 1),
             windows.v.flatten(0, 1),

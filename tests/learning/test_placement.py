@@ -18,13 +18,7 @@ from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.nuisance import NuisanceFit
 from warp_resphys.learning.parameters import Bounds, Prior
-from warp_resphys.learning.placement import (
-    Accuracy,
-    DisplacedMarkers,
-    PlacedMarkers,
-    Placement,
-    placement_of,
-)
+from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement, placement_of
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.mesh.poses import twisted

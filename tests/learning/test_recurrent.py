@@ -10,33 +10,10 @@ from warp_resphys.learning.training import Samples, SequenceTrainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 from warp_resphys.stepping.state import State
 
-NETWORK = {
-    "kind": "reduced",
-    "position_modes": 1,
-    "velocity_modes": 0,
-    "force_modes": 1,
-    "blocks": 1,
-    "layers": 1,
-    "width": 16,
-    "activation": "silu",
-    "recurrent": 8,
-}
-TRAINER = {
-    "epochs": 150,
-    "batch_size": 8,
-    "learning_rate": 1e-2,
-    "schedule": "cosine",
-    "final_learning_rate": 1e-4,
-    "gamma": 1.0,
-    "step_epochs": 10,
-    "weight_decay": 0.0,
-    "noise": 0.0,
-    "linear_noise": 1e-3,
-    "scale_weight": 0.0,
-    "selection": "validation_loss",
-    "rollout_every": 1000,
-    "sequence": 10,
-}
+MODES = {"position_modes": 1, "velocity_modes": 0, "force_modes": 1}
+NETWORK = NetworkSettings(**MODES, layers=1, width=16, activation="silu", recurrent=8)
+TRAINER = {"epochs": 150, "batch_size": 8, "learning_rate": 1e-2, "final_learning_rate": 1e-4, "noise": 0.0}
+TRAINER |= {"selection": "validation_loss", "rollout_every": 1000, "sequence": 10}
 TRIALS, STEPS, LAG = 6, 40, 8.0
 REST = torch.zeros(2, 3, dtype=torch.float64)
 
@@ -56,21 +33,16 @@ def series(seed):
     return Samples(q, torch.zeros_like(q), (f,), None, (STEPS,) * TRIALS)
 
 
-def trained(recurrent):
+@pytest.fixture(scope="module")
+def model():
+    """A trained network, and motions that it has not seen."""
     torch.manual_seed(0)
     train, held_out = series(1), series(2)
-    model = build_model(
-        ResidualForce, NetworkSettings(**{**NETWORK, "recurrent": recurrent}), REST, train.q, train.v, train.outputs[0]
-    )
+    model = build_model(ResidualForce, NETWORK, REST, train.q, train.v, train.outputs[0])
     trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TrainerSettings(**TRAINER), 0)
     while not trainer.finished:
         trainer.run_epoch()
     return trainer.use_best(), held_out
-
-
-@pytest.fixture(scope="module")
-def model():
-    return trained(8)
 
 
 def rolled_out(model, samples):

@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Simulator,
-    SolverSettings,
-    State,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.networks import NextState, build_model
 from warp_resphys.learning.rollout import (

@@ -11,21 +11,8 @@ from warp_resphys.learning.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 NETWORK = NetworkSettings(kind="nodal", blocks=2, layers=1, width=16, activation="normalised_elu")
-CONFIG = {
-    "epochs": 6,
-    "batch_size": 16,
-    "learning_rate": 5e-3,
-    "schedule": "cosine",
-    "final_learning_rate": 1e-4,
-    "gamma": 0.5,
-    "step_epochs": 2,
-    "weight_decay": 1e-5,
-    "noise": 0.01,
-    "linear_noise": 0.01,
-    "scale_weight": 0.0,
-    "selection": "rollout",
-    "rollout_every": 2,
-}
+CONFIG = {"epochs": 6, "batch_size": 16, "learning_rate": 5e-3, "final_learning_rate": 1e-4, "gamma": 0.5}
+CONFIG |= {"step_epochs": 2, "weight_decay": 1e-5, "noise": 0.01, "linear_noise": 0.01, "rollout_every": 2}
 
 
 def samples(count, seed):

@@ -1,6 +1,7 @@
 """Trajectories as files and pictures, and batches of one without their axis."""
 
 import h5py
+import matplotlib.pyplot as plt
 import meshio
 import numpy as np
 import pytest
@@ -88,6 +89,16 @@ def test_obstacles_are_in_the_series_where_they_are_at_the_end_of_every_step(tmp
             half = turn.inv().apply(points - PLATE.position - [0.0, 0.0, step * way])
             size = 0.5 * np.array(PLATE.edges) + 2e-3 * (1 - environment)
             assert np.allclose(np.abs(half), size)
+
+
+def test_a_plot_without_choices_shows_the_vertex_that_moves_furthest_along_its_way(trajectory):
+    moved = (trajectory.q[:, 0] - trajectory.q[0, 0]).numpy()
+    furthest = np.linalg.norm(moved, axis=2).max(0).argmax()
+    axes = trajectory.plot()
+    (line,), axis = axes.lines, "xyz"[np.abs(moved[:, furthest]).max(0).argmax()]
+    assert axes.get_ylabel() == f"displacement along {axis} [mm]"
+    np.testing.assert_allclose(line.get_ydata(), 1e3 * moved[:, furthest, "xyz".index(axis)], atol=1e-9)
+    plt.close(axes.figure)
 
 
 @pytest.mark.parametrize(

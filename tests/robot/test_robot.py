@@ -9,6 +9,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -112,6 +113,16 @@ class TestRollouts:
             assert torch.equal(played(copies[number], 3 + number).q, expected)
         motion = copy.deepcopy(played(robot, 3))
         assert torch.equal(robot.step(motion.final).q, copies[0].step(pickle.loads(pickle.dumps(motion.final))).q)
+
+    def test_its_markers_are_plotted(self, robot):
+        motion = played(robot, 3)
+        axes = motion.plot("x")
+        assert [text.get_text() for text in axes.get_legend().get_texts()] == list(robot.labels)
+        moved = 1e3 * (motion.markers[:, 0, :, 0] - motion.markers[0, 0, :, 0]).numpy()
+        np.testing.assert_allclose(np.stack([line.get_ydata() for line in axes.lines], 1), moved)
+        with pytest.raises(InputError, match="environment is 1"):
+            motion.plot(environment=1)
+        plt.close(axes.figure)
 
     def test_a_settled_robot_stays_at_rest(self, robot):
         with torch.no_grad():

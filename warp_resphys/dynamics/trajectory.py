@@ -59,12 +59,15 @@ class Trajectory:
             create(file, "rest", self.body.vertices, "m")
         return Path(path)
 
-    def plot(self, vertices: ArrayLike, axis: str = "z", environment: int = 0, ax: Any = None) -> Any:
+    def plot(
+        self, vertices: ArrayLike | None = None, axis: str | None = None, environment: int = 0, ax: Any = None
+    ) -> Any:
         """Plots the mean displacement of some vertices from their rest positions over time.
 
         Args:
-            vertices: vertex numbers, for example from `select_vertices`, or a single number.
-            axis: ``x``, ``y`` or ``z``.
+            vertices: vertex numbers, for example from `select_vertices`, or a single number; by default the vertex that
+                moves furthest.
+            axis: ``x``, ``y`` or ``z``; by default the one along which they move furthest.
             environment: index of the environment.
             ax: matplotlib axes; a new figure if omitted.
 
@@ -74,19 +77,14 @@ class Trajectory:
         Raises:
             InputError: an unknown axis, vertex or environment.
         """
-        import matplotlib.pyplot as plt
-
         self._check(environment)
-        chosen, count = np.atleast_1d(np.asarray(vertices, dtype=np.int64)), self.body.n_vertices
-        if axis not in ("x", "y", "z"):
-            raise InputError(f"axis is {axis!r}: choose x, y or z.")
+        moved, count = _array(self.q[:, environment]) - self.body.vertices, self.body.n_vertices
+        if vertices is None:
+            vertices = furthest_moved(moved)
+        chosen = np.atleast_1d(np.asarray(vertices, dtype=np.int64))
         if not len(chosen) or chosen.min() < 0 or chosen.max() >= count:
             raise InputError(f"the vertices to plot must be one or more of 0 to {count - 1}.")
-        moved = (_array(self.q[:, environment]) - self.body.vertices)[:, chosen, "xyz".index(axis)].mean(1)
-        ax = plt.subplots(layout="constrained")[1] if ax is None else ax
-        ax.plot(self.times, 1e3 * moved)
-        ax.set(xlabel="time [s]", ylabel=f"displacement along {axis} [mm]")
-        return ax
+        return plot_displacements(self.times, moved[:, chosen].mean(1, keepdims=True), axis, ax)
 
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
@@ -110,6 +108,34 @@ class Trajectory:
     def _check(self, environment: int) -> None:
         if not 0 <= environment < self.q.shape[1]:
             raise InputError(f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0.")
+
+
+def furthest_moved(moved: NDArray[np.float64]) -> int:
+    """Returns the number of the vertex that moves furthest, from displacements (T, N, 3) [m]."""
+    return int(np.linalg.norm(moved, axis=2).max(axis=0).argmax())
+
+
+def plot_displacements(times: NDArray[np.float64], moved: NDArray[np.float64], axis: str | None, ax: Any) -> Any:
+    """Plots displacements (T, n, 3) [m] over times (T,) [s], and returns the axes.
+
+    Args:
+        times: times.
+        moved: displacements.
+        axis: ``x``, ``y`` or ``z``; None: the one with the largest displacement.
+        ax: matplotlib axes; None: a new figure.
+
+    Raises:
+        InputError: an unknown axis.
+    """
+    import matplotlib.pyplot as plt
+
+    axis = "xyz"[int(np.nanmax(np.abs(moved), axis=(0, 1)).argmax())] if axis is None else axis
+    if axis not in ("x", "y", "z"):
+        raise InputError(f"axis is {axis!r}: choose x, y or z.")
+    ax = plt.subplots(layout="constrained")[1] if ax is None else ax
+    ax.plot(times, 1e3 * moved[..., "xyz".index(axis)])
+    ax.set(xlabel="time [s]", ylabel=f"displacement along {axis} [mm]")
+    return ax
 
 
 def _array(values: torch.Tensor) -> NDArray[np.float64]:

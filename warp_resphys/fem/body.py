@@ -3,15 +3,18 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import scipy.sparse
+import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh
+from ..mesh.plotting import Picture
 from .coordinates import Coordinates, SymmetryPlane, rigid_weights
 from .elements import Discretisation, Points, discretise
 
@@ -197,6 +200,42 @@ class Body:
         parts += [f"rigid {name}" for name in self.rigid] + [type(energy).__name__ for energy in self.energies]
         parts += [f"{len(given)} {name}" for name in ("glued", "symmetry") if (given := getattr(self, name))]
         return f"Body({', '.join(parts)})"
+
+    def plot(
+        self,
+        state: Any = None,
+        environment: int = 0,
+        screenshot: str | Path | None = None,
+        plotter: Any = None,
+        **options: Any,
+    ) -> Any:
+        """Draws the body with pyvista, in a state or at rest, with dots at its fixed vertices (`Mesh.plot`).
+
+        Args:
+            state: a state of the simulator or of a robot, or positions (N, 3) or (B, N, 3) [m]; at rest if omitted.
+            environment: index of the environment.
+            screenshot: PNG file to draw off screen.
+            plotter: a ``pyvista.Plotter`` to which the body is only added.
+            options: of ``pyvista.Plotter.add_mesh``.
+
+        Returns:
+            The plotter.
+
+        Raises:
+            InputError: positions of another body, or an unknown environment.
+        """
+        q = self.vertices if state is None else torch.as_tensor(getattr(state, "q", state)).detach().cpu().numpy()
+        if q.shape[-2:] != self.vertices.shape or q.ndim > 3 or not 0 <= environment < (len(q) if q.ndim == 3 else 1):
+            raise InputError(
+                f"positions to draw have shape {q.shape}, and environment is {environment}: give {self.vertices.shape} "
+                "positions, or such an array for each environment."
+            )
+        at, picture = np.asarray(q[environment] if q.ndim == 3 else q, dtype=np.float64), Picture(screenshot, plotter)
+        for _, own, first in self.members:
+            mesh = own.mesh
+            picture.add(at[first:][: own.n_vertices], mesh.cells, mesh.element, mesh.regions, **options)
+        picture.add_points(at[self.fixed_vertices])
+        return picture.finished()
 
     @property
     def n_vertices(self) -> int:

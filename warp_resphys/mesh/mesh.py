@@ -5,15 +5,18 @@ Nodes are in VTK order. Lengths are in metres; `mesh.readers` converts other uni
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from ..io.errors import MeshError
 from .elements import BY_NODES, ELEMENTS, FACES, Element
+from .plotting import Picture
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -77,6 +80,34 @@ class Mesh:
     def kind(self) -> str:
         """Name of the cells' kind, such as "hexahedron"."""
         return self.element.name
+
+    def plot(
+        self,
+        positions: ArrayLike | None = None,
+        screenshot: str | Path | None = None,
+        plotter: Any = None,
+        **options: Any,
+    ) -> Any:
+        """Draws the cells with pyvista, regions in colours: in a window or a notebook, or off screen into a PNG file.
+
+        Args:
+            positions: (N, 3) of the vertices [m]; at rest if omitted.
+            screenshot: path of the file.
+            plotter: A ``pyvista.Plotter`` to which the mesh is only added.
+            options: Options of ``pyvista.Plotter.add_mesh``, such as ``color`` and ``opacity``.
+
+        Returns:
+            The plotter.
+
+        Raises:
+            MeshError: Positions of another shape.
+        """
+        points = self.vertices if positions is None else np.asarray(positions, dtype=np.float64)
+        if points.shape != self.vertices.shape:
+            raise MeshError(f"positions to draw have shape {points.shape}: give {self.vertices.shape}")
+        picture = Picture(screenshot, plotter)
+        picture.add(points, self.cells, self.element, self.regions, **options)
+        return picture.finished()
 
     def __repr__(self) -> str:
         """Sizes and regions."""

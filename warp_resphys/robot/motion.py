@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..dynamics.trajectory import furthest_moved, plot_displacements
 from ..energies.obstacles import ObstacleMotion
 from ..io.errors import InputError, number_of
 from ..learning.replay import sample
@@ -70,6 +72,30 @@ class Motion:
             return self.markers.expand(len(wanted), -1, -1, -1)
         step = float(self.times[1] - self.times[0])
         return sample(self.markers.transpose(0, 1), wanted.expand(self.markers.shape[1], -1), step).transpose(0, 1)
+
+    def plot(self, axis: str | None = None, environment: int = 0, ax: Any = None) -> Any:
+        """Plots the displacements of the markers, or of the vertex that moves furthest if all are observed, over time.
+
+        Args:
+            axis: ``x``, ``y`` or ``z``; by default the one along which they move furthest.
+            environment: number of the robot in the batch.
+            ax: matplotlib axes; a new figure if omitted.
+
+        Returns:
+            The axes.
+
+        Raises:
+            InputError: there is no such environment or axis.
+        """
+        self._check(environment)
+        markers = _array(self.markers, environment)
+        moved, labels = markers - markers[0], list(self.robot.labels)
+        if not labels:
+            moved = moved[:, [furthest_moved(moved)]]
+        ax = plot_displacements(self.times, moved, axis, ax)
+        if labels:
+            ax.legend(ax.lines[-len(labels) :], labels)
+        return ax
 
     def write_csv(self, path: str | Path, environment: int = 0, half_widths: bool = False) -> Path:
         """Writes a table of times, markers, and the commands of the step that led there, in SI units.

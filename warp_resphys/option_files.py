@@ -10,6 +10,7 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 from unittest import mock
@@ -21,8 +22,9 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import OmegaConf
 
-from .io.setting_errors import is_text
+from .io.setting_errors import Schema, is_text
 from .io.text import read_text
+from .settings.run import RunSettings
 
 _QUOTE: Final = "'"
 _REPLACE: Final = "_replace_"  # in a group of settings: it replaces that of the files below, which Hydra would merge
@@ -60,11 +62,14 @@ def names_are_texts() -> Iterator[None]:
         yield
 
 
+@cache
+def _schema() -> Schema:
+    return RunSettings.model_json_schema()
+
+
 def _with_quotes(text: str, package: tuple[str, ...], path: Path) -> io.StringIO:
     """The text of a YAML file with quotes around keys, and around values that are texts."""
-    from .settings.run import RunSettings
-
-    schema, places = RunSettings.model_json_schema(), set[tuple[int, int]]()
+    schema, places = _schema(), set[tuple[int, int]]()
 
     def visit(node: yaml.Node | None, path: tuple[str | int, ...]) -> None:
         if isinstance(node, yaml.MappingNode):

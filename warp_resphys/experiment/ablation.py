@@ -63,7 +63,7 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
     from ..report.ablation_page import ablation_table, verdict  # matplotlib
 
     rows = metrics["by_markers"]
-    show(ablation_table(rows), verdict(rows, metrics["uncorrected_mm"]), f"Report: {folder / REPORT}")
+    show(run.heading, ablation_table(rows), verdict(rows, metrics["uncorrected_mm"]), f"Report: {folder / REPORT}")
 
 
 def generate_motion(context: StageContext) -> None:

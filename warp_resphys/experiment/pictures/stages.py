@@ -396,4 +396,4 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     material = {name: v for name, v in identified["parameters"].items() if split_name(name)[0] not in _PLACED}
     rows = parameter_rows({**identified, "parameters": material}, {}, {})
     values = (f"{row.head}: {row.cells[1].text} {row.cells[1].beside}" for row in rows)
-    show(distance_table(results), *values, *picture_verdict(results), f"Report: {folder / REPORT}")
+    show(run.heading, distance_table(results), *values, *picture_verdict(results), f"Report: {folder / REPORT}")

@@ -206,15 +206,7 @@ def summary(
             model: {name: _mean_angle(x[:count, :, own], points[:count, :, own]) for name, own in bodies.items()}
             for model, x in simulated.items()
         }
-    if settings.horizons:
-        content["horizons"] = {
-            f"{seconds:g}": {
-                m: summarise(_errors(x[:, :frames], observed[:, :frames], [0] * count)) for m, x in test.items()
-            }
-            for seconds in settings.horizons
-            for frames in [round(seconds / step) + 1]
-        }
-    content |= _by_phase(dataset, names, test, observed)
+    content |= _by_horizon(settings, test, observed) | _by_phase(dataset, names, test, observed)
     if left:
         content["range"] = {model: _range(rows[:count], names, step) for model, rows in left.items()}
     if len(groups) > 1:
@@ -254,6 +246,17 @@ def _reconstructed(context: StageContext, names: Sequence[str]) -> FloatArray:
     with read_hdf5(context.run_dir / reconstruction_file("resphys"), "reconstruction") as file:
         order = [str(name) for name in file.attrs["names"]]
         return read_array(file, "q")[[order.index(name) for name in names]]
+
+
+def _by_horizon(settings: StageSettings, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
+    """Entry ``horizons``: errors of the first seconds of the roll-outs, by duration and model; empty without any."""
+    found = {}
+    for seconds in settings.horizons:
+        frames, first = slice(round(seconds / settings.time_step) + 1), [0] * len(observed)
+        found[f"{seconds:g}"] = {
+            m: summarise(_errors(x[:, frames], observed[:, frames], first)) for m, x in test.items()
+        }
+    return {"horizons": found} if found else {}
 
 
 def _by_phase(

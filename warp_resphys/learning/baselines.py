@@ -207,8 +207,9 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
     itself rolled out, with a degree of one. Coordinates that some trials do not show follow from the components.
     """
     seen = np.asarray(np.isfinite(trials.moved).any(1))  # (R, P)
-    if not (common := seen.all(0)).any():
-        return linear(trials.select(seen[:, seen.sum(0).argmax()]), asked)
+    if not (common := seen.all(0)).any():  # The trials that show the coordinate that most of them and the others show.
+        wanted = seen.sum(0) * (1.0 + len(seen) * np.isfinite(asked.first).any(0))
+        return linear(trials.select(seen[:, wanted.argmax()]), asked)
     begun = np.isfinite(np.concatenate([trials.first, asked.first])).all(0)
     shown = common & begun if trials.displaced.any() and (common & begun).any() else common
     moved = [_without_gaps(own) for own in trials.moved[..., shown]]

@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
-from unittest import mock
 
 import yaml
 from hydra._internal.core_plugins import file_config_source
@@ -58,8 +57,12 @@ class _OptionSource(file_config_source.FileConfigSource):
 def names_are_texts() -> Iterator[None]:
     """Lets Hydra read the files of folders as this module describes; its registry of sources is restored at the end."""
     Plugins.instance()  # registers Hydra's own sources
-    with mock.patch.dict(SourcesRegistry.instance().types, {_OptionSource.scheme(): _OptionSource}):
+    sources, scheme = SourcesRegistry.instance().types, _OptionSource.scheme()
+    before, sources[scheme] = sources[scheme], _OptionSource
+    try:
         yield
+    finally:
+        sources[scheme] = before
 
 
 @cache

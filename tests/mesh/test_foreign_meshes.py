@@ -10,6 +10,7 @@ from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.mesh import quadratic
 from warp_resphys.mesh.quality import cell_volumes
+from warp_resphys.mesh.readers import read_vertices
 
 BAR = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))  # 12 vertices, two cells of 1000 mm^3 along x
 LEFT = [101, 102, 104, 103]  # numbers of the nodes of its face at x = 0
@@ -64,6 +65,7 @@ def test_gmsh_cells_are_read_once_with_all_their_groups(tmp_path, version, named
     mesh = read_mesh(path, units="mm")
     np.testing.assert_allclose(mesh.vertices, BAR.vertices)
     np.testing.assert_array_equal(mesh.cells, BAR.cells)
+    assert len(read_vertices(path, units="mm")) == len(BAR.vertices) + 1
     assert {name: cells.tolist() for name, cells in mesh.regions.items()} == (
         {"all": [0, 1], "tip": [1]} if named else {}
     )

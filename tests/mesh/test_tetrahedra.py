@@ -63,7 +63,7 @@ def test_surfaces_within_are_chambers(tmp_path):
         ({"units": "inch"}, "a surface in inch filled to order 2"),
         ({"order": 3}, "orders 1 or 2"),
         ({"size": 0.0}, "the size of tetrahedra is 0.0"),
-        ({"units": "m"}, "the surface is 106 m across in m"),
+        ({"units": "m"}, "read with units=m, the diagonal of the bounding box is 106"),
     ],
 )
 def test_arguments_that_do_not_fit(tmp_path, changes, said):

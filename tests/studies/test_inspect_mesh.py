@@ -1,6 +1,5 @@
 import re
 
-import meshio
 import numpy as np
 import pytest
 import torch
@@ -16,7 +15,7 @@ from warp_resphys.mesh.arm import ArmGeometry, mesh_arm, name_surfaces
 from warp_resphys.mesh.cavities import open_cavities
 from warp_resphys.mesh.mesh import Mesh, boundary_faces, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
-from warp_resphys.mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
+from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
 from warp_resphys.studies.inspection import Inspection, inspect, inspect_mesh
 
 
@@ -112,18 +111,6 @@ class TestOpenCavities:
 
 
 class TestNamedSurfaces:
-    def test_cell_sets_of_other_formats_and_dropped_vertices(self, tmp_path):
-        box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
-        faces = boundary_faces(box)
-        left = faces[np.all(box.vertices[faces, 0] == 0.0, axis=1)]
-        points = np.concatenate([[[9.0, 9.0, 9.0]], box.vertices])  # the first one is in no cell
-        cells = [("hexahedron", box.cells + 1), ("quad", left[::-1, ::-1] + 1)]
-        sets = {"clamp": [np.empty(0, dtype=int), np.arange(len(left))]}
-        meshio.write(tmp_path / "box.inp", meshio.Mesh(points, cells, cell_sets=sets))
-        surfaces = read_surfaces(tmp_path / "box.inp", drop_unreferenced=True)
-        np.testing.assert_array_equal(surfaces["clamp"], left)
-        assert len(read_vertices(tmp_path / "box.inp")) == len(box.vertices) + 1
-
     def test_a_surface_within_the_body_is_left_out_or_refused(self, tmp_path, arm):
         mesh, surfaces = arm
         inside = mesh.cells[:1, [0, 1, 2, 3]]

@@ -156,7 +156,7 @@ def _read(path: Path, units: str, order: int, drop_unreferenced: bool) -> tuple[
             mesh = Mesh(mesh.vertices[used], places[mesh.cells], regions)
         check_mesh(mesh)
         mesh = Mesh(mesh.vertices * METRES[units], mesh.cells, regions)
-        _check_size(mesh, units)
+        check_size(mesh.vertices, units)
         return quadratic(mesh) if order == 2 and mesh.kind == mesh.element.linear else mesh, content, places
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
@@ -198,7 +198,8 @@ def _volume_cells(arrays: Arrays) -> IntArray:
             raise MeshError("the file has no cells; save a mesh of the volume")
         others = ", ".join(sorted({*arrays["types"].tolist()}))
         raise MeshError(
-            f"the file has no tetrahedra or hexahedra (only: {others}): mesh its inside by mesh=surface mesh.path=FILE"
+            f"the file has no tetrahedra or hexahedra (only: {others}): mesh the inside of an STL, OBJ or PLY file by "
+            "mesh=surface mesh.path=FILE"
         )
     if len(solids) > 1 or not solids.keys() <= {*_CELL_TYPES}:
         supported = f"{', '.join(_CELL_TYPES[:-1])} or {_CELL_TYPES[-1]}"
@@ -210,9 +211,9 @@ def _volume_cells(arrays: Arrays) -> IntArray:
     return cells
 
 
-def _check_size(mesh: Mesh, units: str) -> None:
-    """Raises MeshError if the size of the bounding box suggests wrong units."""
-    diagonal = float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+def check_size(vertices: FloatArray, units: str) -> None:
+    """Raises MeshError if the size of the bounding box of vertices (N, 3) [m] suggests wrong units."""
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SHORTEST_DIAGONAL <= diagonal <= LONGEST_DIAGONAL:
         others = " or ".join(f"units={unit}" for unit in METRES if unit != units)
         raise MeshError(

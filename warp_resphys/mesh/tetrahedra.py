@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from ..io.errors import MeshError
+from ..io.errors import MeshError, naming
 from ..io.progress import QUIET_SECONDS, Progress
 from .mesh import FloatArray, IntArray, Mesh, quadratic
 from .quality import cell_volumes
-from .readers import LONGEST_DIAGONAL, METRES, SHORTEST_DIAGONAL
+from .readers import METRES, check_size
 
 _TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's numbers of linear cells
 _ANGLES = (40.0, 30.0, 20.0)  # angles between triangles above which their edge is preserved, tried in turn [deg]
@@ -112,9 +112,8 @@ def fill_surface(path: str | os.PathLike[str], size: float, units: str = "m", or
         raise MeshError(f"the size of tetrahedra is {size}: it must be positive, in m.")
     vertices, shells = read_shells(path)
     vertices = METRES[units] * vertices
-    across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    if not SHORTEST_DIAGONAL <= across <= LONGEST_DIAGONAL:
-        raise MeshError(f"{path}: the surface is {across:.3g} m across in {units}: check mesh.units.")
+    with naming(f"{path}: "):
+        check_size(vertices, units)
     volumes = [_volume(vertices, shell) for shell in shells]
     outer = vertices[shells[int(np.argmax(volumes))]].reshape(-1, 3)
     for shell in shells:

@@ -2,10 +2,8 @@
 
 import benchmark
 import pytest
-import torch
 from benchmarks import measuring, peers, steps
 
-from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.files import read_json
 
 TINY = ("mesh.divisions=[2,1,1]", "--repeats=1", "--materials=0.45")
@@ -21,12 +19,6 @@ def measured(folder):
         return read_json(written)[words[0]]
 
     return run
-
-
-def arguments(*words):
-    """Arguments of a command line."""
-    known, known.settings = benchmark.command_line().parse_known_args(words)
-    return known
 
 
 def test_the_median_of_every_figure_over_turns():
@@ -57,23 +49,6 @@ def test_a_row_for_every_case(measured, capsys, device):
     (row,) = measured("batches", *TINY, "--steps=1", "--batches=3", f"--device={device}")[steps.STEPS]
     assert row["steps_per_s"] == pytest.approx(3e3 / row["plain_ms"])
     assert measured("batches", *TINY, "--steps=1", "--batches=1", "--floor")["command"].endswith("--floor")
-
-
-def test_a_beam_that_is_lifted_falls_on_the_floor():
-    settings = steps.run_settings(arguments("batches", *TINY), *steps.FLOOR)
-    simulator, _ = steps.task_of(settings, "quasi_newton", "0.45", 2, 2)
-    with torch.no_grad():
-        path = simulator.rollout(steps.loaded(simulator, 2, 40, sign=-1.0)[0], 40)
-    gaps = path.q[..., 2].flatten(1).amin(1) + 0.004
-    assert float(gaps[0]) > 1e-3 > float(gaps.min()) > 0.0
-
-
-def test_a_beam_hangs_under_a_weight_that_is_lighter_in_later_environments():
-    settings = steps.run_settings(arguments("step", *TINY))
-    simulator = build_simulator(settings, settings.simulation)
-    start, _ = steps.loaded(simulator, 2, 3)
-    sag = (start.q - simulator.static_equilibrium().q)[:, :, 2].amin(1)
-    assert float(sag[0]) < 1.2 * float(sag[1]) < 0.0
 
 
 def test_sizes(measured):

@@ -58,24 +58,6 @@ def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
     return Replay(sim, MARKERS, replace(blank, observed=markers)), release
 
 
-@pytest.mark.slow
-def test_ninety_per_cent_of_the_intervals_contain_the_truth():
-    """Of parameters identified from markers whose errors go on for a few frames."""
-    replay, release = replay_of(simulator(), TRUTH, frames=24)
-    clean, held, generator = replay.trials, [], torch.Generator().manual_seed(5)
-    for _ in range(40):
-        errors = torch.randn(clean.observed.shape, generator=generator, dtype=torch.float64)
-        for k in range(1, errors.shape[1]):
-            errors[:, k] = 0.8 * errors[:, k - 1] + 0.6 * errors[:, k]
-        motions = replace(clean, observed=clean.observed + 3e-4 * errors)
-        result = ParameterSearch(Misfit([(Replay(replay.simulator, MARKERS, motions), release)], RANGES)).run(
-            [TRUTH], 2
-        )
-        width = {name: 1.645 * result.uncertainty.deviation[name] for name in RANGES}
-        held += [abs(result.parameters[name] - TRUTH[name]) <= width[name] for name in RANGES]
-    assert 0.83 <= np.mean(held) <= 0.96
-
-
 def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
     bounds = {"youngs_modulus": Bounds(1e5, 1e6), "density": Bounds(800.0, 1500.0)}
     truth = {"youngs_modulus": 215e3, "density": 1070.0}

@@ -18,7 +18,7 @@ from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.nuisance import NuisanceFit
 from warp_resphys.learning.parameters import Bounds, Prior
-from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement, placement_of
+from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.mesh.poses import twisted
@@ -164,7 +164,7 @@ def test_the_modulus_is_recovered_from_misplaced_markers():
     off = (placed(q) - PlacedMarkers.of(bind(), ASKEW)(q)).norm(dim=-1)
     assert float(off.max()) < 2e-4  # where the recording shows them, though frame and offsets are not distinguishable
     deviation = result.uncertainty.deviation["youngs_modulus"]
-    assert deviation > 0.2 * abs(result.parameters["youngs_modulus"] - 215e3)
+    assert 0.2 * abs(result.parameters["youngs_modulus"] - 215e3) < deviation < 0.1 * 215e3
 
 
 def test_a_prior_determines_what_poses_do_not():
@@ -264,18 +264,6 @@ def gained():
     ), start
 
 
-@pytest.mark.slow
-def test_trials_have_their_own_gains():
-    pair, start = gained(), {name: 1.0 for name in OWN} | {"youngs_modulus": 4e5}
-    result = identifier(pair, OWN).run([start], 40)
-    found = [result.parameters[f"attached_mass_factor@w{i}"] for i in (1, 2, 3, 4)]
-    ratios = np.array(found) / np.mean(found) * np.mean(GAINS[1:])  # Their mean and the modulus are not separable.
-    np.testing.assert_allclose(ratios, GAINS[1:], atol=0.02)
-    naive = identifier(pair).run([{"youngs_modulus": 4e5}], 30)
-    assert result.loss < 0.5 * naive.loss
-    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.05)
-
-
 @pytest.mark.parametrize("sessions", [1, 2])
 def test_derivatives_by_the_values_of_trials_are_those_of_the_loss(sessions):
     replay, start = gained()
@@ -293,30 +281,6 @@ def test_derivatives_by_the_values_of_trials_are_those_of_the_loss(sessions):
         step = 1e-4 * np.eye(len(unit))[column]
         ends = [misfit.linearise(unit + sign * step, derivatives=False).loss for sign in (1.0, -1.0)]
         assert gradient[column] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=2e-4), column
-
-
-def test_every_session_has_its_placement():
-    """Between two sessions the markers move; in the second one, the body is placed elsewhere in the recordings."""
-    other = Placement(MOVED.flip(0), -ASKEW.shift, 0.5 * ASKEW.turn, CENTRE)
-    pairs = []
-    for session, placement in (("monday", ASKEW), ("friday", other)):
-        replay, start = posed(PlacedMarkers.of(bind(), placement), noise=1e-5)
-        names = tuple(f"{session}_{name}" for name in replay.trials.names)
-        pairs.append((Replay(SIM, bind(), replace(replay.trials, names=names, session=session)), start))
-    whole = ParameterSearch(Misfit(pairs, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist()))
-    result = whole.run([{"youngs_modulus": 4e5}], 30)
-    assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
-    assert list(result.placement["sessions"]) == ["monday", "friday"]
-    q = poses()[:2]
-    for session, placement in (("monday", ASKEW), ("friday", other)):
-        placed = PlacedMarkers.of(bind(), placement_of(result.placement, LABELS, session))
-        off = (placed(REST[None]) - PlacedMarkers.of(bind(), placement)(REST[None])).norm(dim=-1)
-        assert float(off.max()) < 3e-4
-    unknown = PlacedMarkers.of(bind(), placement_of(result.placement, LABELS, "sunday"))
-    assert torch.isfinite(unknown(q)).all()
-    one_session = [(Replay(SIM, bind(), replace(r.trials, session="")), start) for r, start in pairs]
-    mixed = ParameterSearch(Misfit(one_session, RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist()))
-    assert mixed.run([{"youngs_modulus": 4e5}], 30).loss > 10.0 * result.loss
 
 
 def test_a_value_of_a_trial_needs_a_common_one():
@@ -362,22 +326,3 @@ def test_a_trial_is_left_out_as_if_the_others_were_identified():
         )  # The others fit better without the one that is left out.
     assert np.linalg.norm(np.subtract(changes, expected)) < 0.05 * np.linalg.norm(expected)
     assert np.linalg.norm(np.subtract(moved, moves)) < 0.05 * np.linalg.norm(moves)
-
-
-@pytest.mark.slow
-def test_deviations_cover_the_effect_of_placements():
-    """Over drawn placements and noise, moduli scatter as much as they are said to."""
-    draw, outcome = np.random.default_rng(0), []
-    for seed in range(24):
-        askew = Placement(
-            *(
-                torch.as_tensor(scale * draw.normal(size=shape))
-                for scale, shape in ((2e-3, (4, 3)), (2e-3, 3), (0.03, 3))
-            ),
-            CENTRE,
-        )
-        pair = posed(PlacedMarkers.of(bind(), askew), noise=2e-4, seed=seed)
-        result = identifier(pair).run([{"youngs_modulus": 3e5}], 20)
-        off = result.parameters["youngs_modulus"] - 215e3
-        outcome.append(off / result.uncertainty.deviation["youngs_modulus"])
-    assert 0.6 < math.sqrt(np.mean(np.square(outcome))) < 1.5

@@ -15,7 +15,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
 from warp_resphys.pictures.clouds import Cloud
-from warp_resphys.pictures.misfit import PictureMisfit, values_of
+from warp_resphys.pictures.misfit import PictureMisfit
 from warp_resphys.pictures.outlines import ClosedSurface
 from warp_resphys.pictures.seen import Photo, SeenPose
 
@@ -180,31 +180,3 @@ def test_background_and_isolated_points_are_left_out():
     for wrong in (1e3 * body, 1e-3 * body):
         with pytest.raises(InputError, match=r"check the unit \(data.cloud.units of a scan"):
             Cloud(wrong).around(SCANNER, MESH, CLAMP, 100)
-
-
-def test_two_lenses_have_values_of_their_own(beam):
-    """Two depth cameras, of which one has a longer lens than is assumed."""
-    pose, q = beam
-    from_the_side = torch.tensor(
-        [[1.0, 0.0, 0.0, -0.05], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]], dtype=torch.float64
-    )
-    photos = []
-    for lens, looking, factor in (("left", ABOVE, 1.0), ("right", from_the_side, 1.05)):
-        camera = PlacedCamera(LENS, looking, CENTRE)
-        corrections = PlacedCamera.corrections({"focal_factor": factor})
-        cloud = Cloud.of_depth(depths(q, camera, corrections=corrections))
-        cloud = cloud.around(camera, MESH, CLAMP, 600)
-        photos.append(Photo(lens, camera, cloud=cloud, lens=lens))
-    own = replace(pose, photos=tuple(photos))
-    assert own.lenses == ("left", "right")
-    ranges = {**MODULUS, "focal_factor@left": Bounds(0.9, 1.1), "focal_factor@right": Bounds(0.9, 1.1)}
-    first = {"youngs_modulus": 2e5, "focal_factor@left": 1.0, "focal_factor@right": 1.0}
-    identified = wr.ParameterSearch(PictureMisfit([own], ranges)).run([first], 30).parameters
-    assert identified["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=0.02)
-    assert identified["focal_factor@left"] == pytest.approx(1.0, abs=5e-3)
-    assert identified["focal_factor@right"] == pytest.approx(1.05, abs=5e-3)
-    assert values_of(own, {"a": 1.0, "a@left": 2.0, "a@right": 3.0}, "left") == {"a": 2.0}
-    with pytest.raises(InputError, match="middle is neither a pose, a material nor a lens"):
-        PictureMisfit([own], {"focal_factor@middle": Bounds(0.9, 1.1)})
-    moved = own.before({"right": ABOVE})
-    assert torch.equal(moved.photos[0].camera.pose, moved.photos[1].camera.pose)

@@ -113,6 +113,7 @@ def test_values_belong_to_all_to_a_material_or_to_a_pose(seen):
     own = replace(seen, material="soft")
     values = {"a": 1.0, "a@soft": 2.0, "a@beam": 3.0, "b": 1.0, "b@soft": 2.0, "c@other": 5.0}
     assert values_of(own, values) == {"a": 3.0, "b": 2.0}
+    assert values_of(own, {"a": 1.0, "a@left": 2.0, "a@right": 3.0}, "left") == {"a": 2.0}
     with pytest.raises(InputError, match="nobody is neither a pose, a material nor a lens"):
         PictureMisfit([own], {"youngs_modulus@nobody": RANGES["youngs_modulus"]})
     with pytest.raises(InputError, match="no parameter 'colour' to identify: choose from"):

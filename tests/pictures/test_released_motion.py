@@ -11,7 +11,6 @@ import torch
 import warp_resphys as wr
 from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.clouds import Cloud
 from warp_resphys.pictures.misfit import PictureMisfit
@@ -132,25 +131,6 @@ def test_derivatives_are_those_of_differences(kind, tolerance):
         gradient.append((ends[0] - ends[1]) / 2e-3)
     gradient = np.array(gradient)
     assert misfit.linearise(unit).gradient == pytest.approx(gradient, rel=tolerance, abs=tolerance * gradient.max())
-
-
-def search(pose, ranges):
-    known = {name: value for name, value in TRUTH.items() if name not in ranges}
-    first = {name: {**FIRST, "youngs_modulus": 4e5}[name] for name in ranges}  # at first 1.8 times as fast
-    return ParameterSearch(PictureMisfit([pose], ranges, known)).run([first], 25, tolerance=1e-6)
-
-
-@pytest.mark.slow
-def test_stiffness_density_damping_and_release_come_back(seen):
-    """With a known force; where row times are ignored, the release is late by the rows of the body, 9 ms."""
-    ranges = {name: range_ for name, range_ in RANGES.items() if name != "release_force_3"}
-    result = search(seen, ranges)
-    for name, tolerance in {"youngs_modulus": 0.01, "density": 0.01, "stiffness_damping": 0.01}.items():
-        assert result.parameters[name] == pytest.approx(TRUTH[name], rel=tolerance)
-    assert result.parameters["release_delay"] == pytest.approx(TRUTH["release_delay"], abs=1e-4)
-    at_once = search(replace(seen, photos=tuple(replace(photo, row_time=0.0) for photo in seen.photos)), ranges)
-    assert at_once.loss > 10.0 * result.loss
-    assert TRUTH["release_delay"] - at_once.parameters["release_delay"] == pytest.approx(9e-3, abs=2e-3)
 
 
 def test_what_cannot_be_released_is_named(seen):

@@ -25,23 +25,6 @@ def test_a_motion_passes_with_every_solver_and_fails_beyond_its_bound(monkeypatc
     assert wrong == [name for name in names if "float32" not in name]
 
 
-def test_environments_of_a_motion_differ_and_each_is_what_it_is_alone():
-    simulator = check.actuated()
-    together = check.positions(simulator)
-    assert float((together[-1, 0] - together[-1, 2]).abs().max()) > 1e-3
-    alone = check.positions(simulator, slice(1, 2))
-    torch.testing.assert_close(alone[:, 0], together[:, 1], rtol=0.0, atol=1e-10)
-
-
-def test_a_beam_between_obstacles_slides_on_all_of_them():
-    simulator = check.between_obstacles(moves=False)
-    before, _ = simulator.step(simulator.rest_state())
-    after, _ = simulator.step(before)
-    forces = simulator.contacts(before, after)["obstacles"]
-    assert bool((forces.normal.norm(dim=-1).sum(1) > 0.0).all())
-    assert bool((forces.friction.norm(dim=-1).sum(1) > 1e-3 * forces.normal.norm(dim=-1).sum(1)).all())
-
-
 def test_a_wrong_gradient_or_an_error_is_a_failed_check(monkeypatch):
     def fails() -> float:
         raise InputError("no equilibrium")

@@ -5,7 +5,6 @@ Erleben             pairs of stiff bodies of a few tetrahedra, whose corners and
 mat                 both ends of a mat are turned against one another until it touches itself
 rollers             two turning cylinders draw a soft block between them
 funnel              a soft ball is forced through a funnel narrower than itself
-clip                the ends of a U are pressed on one another
 tentacle            a tendon curls a tentacle around a post and onto itself
 ==================  ==================================================================================================
 
@@ -27,7 +26,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from support.contact import SOFT, G, crossings_and_gap, solves
+from support.contact import G, crossings_and_gap, solves
 from warp_resphys import (
     Body,
     Contact,
@@ -49,7 +48,7 @@ from warp_resphys.energies.materials import Material
 from warp_resphys.energies.obstacles import Cylinder, HalfSpace
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.environments.grasp import ball_mesh
-from warp_resphys.mesh.rod import boxes_hexahedra, rod
+from warp_resphys.mesh.rod import rod
 
 FloatArray = NDArray[np.float64]
 _SIDE = 0.1  # of Erleben's bodies [m]
@@ -72,7 +71,6 @@ class Case:
         material: material of all bodies.
         gravity: (3,) [m/s^2].
         velocities: velocities (3,) at the start, by body [m/s].
-        force: (N, 3) external force on the vertices of all bodies, or None [N].
         drive: returns the positions (D, 3) of the fixed vertices [m] from those at rest and the share of the time.
         pull: largest tensions of the tendons of a body, by its name, which are reached at two thirds of the time [N].
     """
@@ -85,7 +83,6 @@ class Case:
     material: Material = _STONE
     gravity: Sequence[float] = (0.0, 0.0, -G)
     velocities: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    force: FloatArray | None = None
     drive: Callable[[FloatArray, float], FloatArray] | None = None
     pull: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
@@ -97,15 +94,14 @@ class Case:
 
     def inputs(self, simulator: Simulator) -> Inputs:
         """Returns the inputs of all steps."""
-        force = None if self.force is None else simulator.tensor(self.force)
         rise = simulator.tensor([min(1.5 * (k + 1) / self.steps, 1.0) for k in range(self.steps)])[:, None, None]
         pulled = {name: Inputs(tendon_tension=rise * simulator.tensor(most)) for name, most in self.pull.items()}
         own = Scene(self.bodies).inputs(pulled)
         if self.drive is None:
-            return own.replace(external_force=force)
+            return own
         rest = simulator.rest_positions[simulator.fixed].cpu().numpy()
         places = np.stack([self.drive(rest, (k + 1) / self.steps) for k in range(self.steps)])
-        return own.replace(external_force=force, fixed_positions=simulator.tensor(places[:, None]))
+        return own.replace(fixed_positions=simulator.tensor(places[:, None]))
 
 
 @dataclass(frozen=True)
@@ -278,20 +274,6 @@ def funnel() -> Case:
     return Case(bodies, contact, distance, 40, 1e-3, soft, (40.0 * G, 0.0, 0.0))
 
 
-def clip() -> Case:
-    """Returns the case of a U with legs of two lengths, whose ends are pressed on one another."""
-    bar, height, distance, press = 0.006, 0.028, 1e-3, 0.3
-    legs = {1.0: ((0.0, 0.0, 0.0), (0.03, bar, bar)), -1.0: ((0.0, 0.0, height - bar), (0.026, bar, height))}
-    mesh = boxes_hexahedra([*legs.values(), ((0.0, 0.0, 0.0), (bar, bar, height))], 0.003)
-    force = np.zeros_like(mesh.vertices)
-    for side, (low, high) in legs.items():
-        end = select_vertices(mesh, x=high[0], z=(low[2], high[2]))
-        force[end, 2] = side * press / len(end)
-    body = {"clip": Body(mesh, fixed=select_vertices(mesh, x=0.0))}
-    contact = SurfaceContact(1e5, 0.3, distance)
-    return Case(body, contact, distance, 40, 0.004, SOFT, (0.0, 0.0, 0.0), force=force)
-
-
 def tentacle() -> Case:
     """Returns the case of a tentacle that a tendon curls around a post, until its end lies on its upper part."""
     length, distance, slip_speed = 0.28, 5e-4, 2e-2
@@ -309,7 +291,7 @@ def tentacle() -> Case:
 
 CASES = {
     **erleben_cases(),
-    **{"mat": mat(), "rollers": rollers(), "funnel": funnel(), "clip": clip(), "tentacle": tentacle()},
+    **{"mat": mat(), "rollers": rollers(), "funnel": funnel(), "tentacle": tentacle()},
 }
 
 

@@ -8,6 +8,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
+from support.command_line import outcome
 from warp_resphys.data.base_motion import since_first
 from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.io.errors import DataFileError, InputError
@@ -126,6 +127,13 @@ def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
     np.testing.assert_allclose(read.positions[:, 3], arm, atol=2e-5)
     last = 10 * (np.floor(times * RATE / 10 + 1e-9))
     np.testing.assert_allclose(read.actuation, np.stack([1e2 * last, 0.5e-3 * last], 1))
+
+
+def test_a_bag_is_converted(folder):
+    written(folder / "trial", "mcap")
+    assert "seen" in outcome("convert", "trial/trial.mcap", "recording.bag={markers: {tip: /mocap/tip}}").out
+    tip = read_recording(folder / "recordings" / "trial.h5")
+    np.testing.assert_allclose(tip.positions[:, 0], place(0, TIMES), atol=2e-5)
 
 
 def test_a_pose_is_the_motion_of_the_base(tmp_path):

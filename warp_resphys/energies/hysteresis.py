@@ -21,7 +21,7 @@ A cycle of amplitude a > e along one direction of strain takes 8 mu g e (a - e) 
 elongation of an incompressible bar, and 0.71 times a small shear angle. Like a Prony branch, a slider acts on the whole
 strain, and its modulus is no part of the volume term.
 
-``tests/dynamics/test_hysteresis.py`` has closed forms, dissipation and gradients.
+``tests/dynamics/test_material_memory.py`` has closed forms, dissipation and gradients.
 
 W. D. Iwan: On a class of models for the yielding behavior of continuous and composite systems. Journal of Applied
 Mechanics 34, 612-617, 1967.

@@ -196,7 +196,9 @@ def learning_stages(
         bodies = [own for shape in run.shapes.values() for own in (shape, shape.target_body)]
         others = others.model_copy(update={"files": {**others.files, **files_read(run, *bodies)}})
         add("shapes", try_shapes, (SHAPES,), others)
-    reconstructed = split.train + split.validation + (() if run.markers is not None else split.test)
+    # For the published comparison, where all vertices are observed, test trials are reconstructed, too.
+    compared = split.test if run.markers is None and run.law is None else ()
+    reconstructed = split.train + split.validation + compared
     learned = []
     for model in [model for model in run.models if model in LEARNED and model != SIMFREE]:
         first, second = f"reconstruct_{model}", f"train_{model}"

@@ -75,7 +75,7 @@ class TestALawThatHelps:
 
     def test_it_is_better_than_identification_under_every_load(self, rubber):
         errors, trials = means(rubber), by_trial(rubber)
-        assert list(errors) == [*BASELINES, "simulation", "sysid", "law", "simfree", "resphys", "reconstruction"]
+        assert list(errors) == [*BASELINES, "simulation", "sysid", "law", "simfree", "resphys"]
         assert errors["sysid"] < errors["simulation"]
         assert errors["law"] < 0.05 * errors["sysid"]
         assert list(trials) == ["160 g", *OTHERS]
@@ -106,7 +106,7 @@ def test_a_law_that_does_not_help_is_not_used(tmp_path, short_stride):
     law, errors = read_json(folder / "law.json"), means(folder)
     assert not law["accepted"]
     assert law["validation"]["law"] > law["validation"]["below"]
-    assert list(errors) == [*BASELINES, "simulation", "sysid", "simfree", "resphys", "reconstruction"]
+    assert list(errors) == [*BASELINES, "simulation", "sysid", "simfree", "resphys"]
     assert errors["sysid"] < 1e-4 * errors["simulation"]
     experiment = finished_experiment(folder)
     assert experiment.sources("resphys") == ("identified", "sysid")

@@ -8,6 +8,7 @@ import torch
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
 from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.reconstruction import make_reconstructor
@@ -85,6 +86,20 @@ class TestGaussNewton:
         assert not result.force[:, BODY.fixed_vertices].any()
         replayed, _ = sim.step(on_device, Inputs(result.force))
         np.testing.assert_allclose(replayed.q.cpu(), observed[1], rtol=0, atol=1e-12)
+
+    def test_the_last_step_takes_no_new_hessian(self, monkeypatch):
+        """It is within the tolerance of the minimum that exact steps reach."""
+        updates, update = [0], Linearisation.update
+        monkeypatch.setattr(Linearisation, "update", lambda self, x: (updates.append(1), update(self, x)))
+        observed, start = observation(5)
+        found, counts = {}, []
+        for tolerance in (1e-10, 1e-14):
+            method = make_reconstructor(simulator(), "gauss_newton", 1e-8, tolerance, 20)
+            found[tolerance], _ = reconstruct(method, start, observed)
+            counts.append(sum(updates))
+        assert counts[0] == 5
+        np.testing.assert_allclose(found[1e-10], found[1e-14], rtol=0, atol=1e-10)
+        assert float((found[1e-10] - observed[1:]).abs().max()) > 1e-9
 
     def test_stationary_where_the_hessian_is_indefinite(self):
         _, start = observation()

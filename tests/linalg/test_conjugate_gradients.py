@@ -45,3 +45,8 @@ def test_it_stops_at_the_tolerance():
     assert len(calls) == 1
     conjugate_gradients(operator, torch.clone, right, tolerance=0.0, max_iterations=4)
     assert len(calls) == 5
+    largest = float(right.abs().max())
+    assert conjugate_gradients(operator, torch.clone, right, tolerance=0.0, shortest=largest).converged.all()
+    assert len(calls) == 5
+    conjugate_gradients(operator, exact, right, tolerance=0.0, shortest=1e-6)
+    assert len(calls) == 6

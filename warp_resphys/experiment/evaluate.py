@@ -182,7 +182,7 @@ def summary(
     observed = as_markers(points, dataset.labels)
     first = [first_frame(experiment, [name]) for name in every]
     models = {model: as_markers(values, dataset.labels) for model, values in simulated.items()}
-    if dataset.bound is None:
+    if dataset.bound is None and not settings.with_law:
         models["reconstruction"] = _reconstructed(context, names)
     test = {model: values[:count] for model, values in models.items()}
     errors = {model: _errors(x, observed, first) for model, x in test.items()}
@@ -193,11 +193,11 @@ def summary(
             {**row, "amplitude_mm": amplitudes[row["name"]]} for row in summarise_trajectories(tuple(names), errors)
         ],
     }
-    if dataset.bound is None:
+    if "reconstruction" in test:
         target = test["reconstruction"]
         against = {model: _errors(x, target, first) for model, x in test.items() if model != "reconstruction"}
         content["errors_vs_reconstruction_mm"] = {model: summarise(rows) for model, rows in against.items()}
-    else:
+    if dataset.bound is not None:
         seen = observed[:count]
         labels = owners(dataset.labels)
         content["per_marker"] = {model: errors_per_marker(x, seen, labels) for model, x in test.items()}

@@ -156,7 +156,8 @@ class _LawSearch(LawTrials):
         wanted, forms = self.settings.law, []
         times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
         zero = dict.fromkeys((*wanted.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
-        zero |= branches_of([0.0], [0.1]) | _family(0.0)
+        zero |= branches_of([0.0], [0.1]) if wanted.branches else {}
+        zero |= _family(0.0) if wanted.families else {}
         simulator, guess = self.simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         for names in (self.settings.split.train, self.settings.split.validation):

@@ -133,10 +133,10 @@ class LeastSquares(Reconstructor):
         first_guess: torch.Tensor | None = None,
     ) -> Reconstruction:
         acting, constants = inputs or Inputs(), self._constants
-        step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation, self._basis)
+        step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
-                problem = kind(*step)
+                problem = kind(*step, self._basis, self.tolerance)
                 result = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
                 if result.converged or number == len(self._problems):
                     break

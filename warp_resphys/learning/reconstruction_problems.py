@@ -12,10 +12,12 @@ from ..data.observation import WHOLE_STATE, Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
-from ..linalg.conjugate_gradients import conjugate_gradients
+from ..linalg.conjugate_gradients import LinearMap, conjugate_gradients
 from ..linalg.least_squares import Move, Point, Problem, ridge
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
+
+_SHORT = 0.1  # of the tolerance: length of a step of Gauss-Newton that needs no check
 
 
 @dataclass(eq=False)
@@ -33,6 +35,7 @@ class StepProblem(Problem):
     weight: float  # lambda [unit^2/N^2]
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     basis: torch.Tensor | None = None  # (3 N, modes) basis of the forces; None for any force on the free vertices
+    tolerance: float = 0.0  # of the distance of two iterates at the minimum [m]
 
     def __post_init__(self) -> None:
         """Linearises the step."""
@@ -72,8 +75,10 @@ class FullStateProblem(StepProblem):
         (I + w H^2) dx = -(x - x*) - w H g(x)
 
     by conjugate gradients, preconditioned with (I + sqrt(w) H)^2: for every eigenvalue h of H the quotient
-    (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations suffice for any w. Damping d is
-    relative to the matrix on the left: it shortens the step to dx / (1 + d). The search starts at x*.
+    (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations suffice for any w. The
+    preconditioned gradient is thus between a half of the step and the step: where it is far below the tolerance, with H
+    of the iterate before, it is the last step, without a new H. Damping d is relative to the matrix on the left: it
+    shortens the step to dx / (1 + d). The search starts at x*.
 
     Where x stands at a fraction e of the time step, |q+ - q*| is |x - x*| / e: w is lambda e^2.
     """
@@ -91,6 +96,7 @@ class FullStateProblem(StepProblem):
         super().__post_init__()
         self._target = self._step.hold(self.simulator.method.solution_for(self.state, self.observed))
         self._weight = self.weight * self._step.stage.end**2
+        self._inverse: LinearMap | None = None
 
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
@@ -109,19 +115,26 @@ class FullStateProblem(StepProblem):
     @override
     def linearise(self, point: Point) -> Move:
         step, weight, x, (force,) = self._step, self._weight, point.x, point.kept
+        short = _SHORT * self.tolerance
+        if self._inverse is not None:
+            last = self._inverse(self._target - x - weight * step.product(force))
+            if float(last.abs().max()) <= short:
+                return lambda damping: x + last / (1.0 + damping)[:, None, None]
         step.update(x)
         factor = step.shifted(math.sqrt(weight))
 
-        def preconditioner(r: torch.Tensor) -> torch.Tensor:
+        def inverse(r: torch.Tensor) -> torch.Tensor:
             right = r[:, step.free].reshape(len(r), -1, 1)
             solved = factor.solve(factor.solve(right)).reshape(len(r), -1, 3)
             return torch.zeros_like(r).index_copy(1, step.free, solved)
 
+        self._inverse = inverse
         change = conjugate_gradients(
             lambda d: d + weight * step.product(step.product(d)),
-            preconditioner,
+            inverse,
             self._target - x - weight * step.product(force),
             tolerance=1e-6,
+            shortest=0.5 * short,
         ).x
         return lambda damping: x + change / (1.0 + damping)[:, None, None]
 

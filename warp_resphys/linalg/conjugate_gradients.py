@@ -22,6 +22,7 @@ def conjugate_gradients(
     right: torch.Tensor,
     tolerance: float,
     max_iterations: int = 500,
+    shortest: float = 0.0,
 ) -> Iterate:
     """Solves a batch of symmetric positive definite systems.
 
@@ -34,6 +35,7 @@ def conjugate_gradients(
         right: (B, ...) right-hand sides.
         tolerance: relative, in the preconditioner's norm.
         max_iterations: limit after which the last iterate is returned.
+        shortest: largest entry of the preconditioned residual below which a system is solved as well.
     """
 
     def dot(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
@@ -50,7 +52,8 @@ def conjugate_gradients(
     indefinite = torch.zeros_like(rz, dtype=torch.bool)
     count = 0
     for count in range(max_iterations + 1):
-        active = (rz > goal) & ~indefinite
+        solved = (rz >= 0.0) & ((rz <= goal) | (z.abs().flatten(1).amax(1) <= shortest))
+        active = ~solved & ~indefinite
         if count == max_iterations or not bool(active.any()):
             break
         hd = operator(d)
@@ -66,4 +69,4 @@ def conjugate_gradients(
         new_rz = dot(r, z)
         d = z + (new_rz / rz.clamp_min(tiny)).view(column) * d
         rz = new_rz
-    return Iterate(x, (rz >= 0.0) & (rz <= goal) & ~indefinite, count)
+    return Iterate(x, solved & ~indefinite, count)

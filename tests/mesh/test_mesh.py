@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warp_resphys.io import decoding
+from warp_resphys.io.arrays import IntArray
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.mesh import (
-    IntArray,
     Mesh,
     boundary_faces,
     boundary_triangles,

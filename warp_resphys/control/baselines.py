@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from .polynomials import FloatArray
+from ..io.arrays import FloatArray
 
 _RANKS = (8, 12, 18, 24, 36)  # candidates; validation chooses one
 DELAYS: Final = 4  # D, frames of markers from which the state is computed

@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..io.arrays import FloatArray
 from ..settings.control import LimitsOfInputs
 from .baselines import DELAYS, LinearModel
 from .estimate import Estimator
 from .plan import Planner
-from .polynomials import FloatArray
 from .reduced import ReducedModel
 
 _SETTLES = 0.1  # gain per step of the disturbance observer of the linear model

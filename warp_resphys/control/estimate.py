@@ -8,7 +8,8 @@ has (offset-free control: Pannocchia and Rawlings, AIChE J. 49 (2003) 426).
 import numpy as np
 import scipy.linalg
 
-from .polynomials import FloatArray, Monomials
+from ..io.arrays import FloatArray
+from .polynomials import Monomials
 from .reduced import ReducedModel
 
 _RATE = 0.3  # unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre

@@ -15,12 +15,13 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.robot import Robot
 from ..settings.control import LimitsOfInputs
 from .baselines import LinearModel
 from .files import PlannedMotion
-from .polynomials import FloatArray, around
+from .polynomials import around
 from .reduced import ReducedModel
 from .sampling import OnProgress
 

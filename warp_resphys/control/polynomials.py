@@ -5,11 +5,8 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+from ..io.arrays import FloatArray, IntArray
 
 _SHARE_OF_POINTS: Final = 0.5  # largest number of coefficients, relative to the number of samples
 _HELD_OUT: Final = 5  # one of so many samples, for the choice of the order
@@ -98,7 +95,7 @@ class SquaredPolynomial(Polynomial):
 
 
 @cache
-def powers(variables: int, order: int) -> NDArray[np.int64]:
+def powers(variables: int, order: int) -> IntArray:
     """Exponents (F, n) of all monomials up to an order."""
     rows = []
     for degree in range(order + 1):

@@ -39,11 +39,10 @@ from numpy.typing import NDArray
 
 from ..data.input_response import InputResponse
 from ..energies.viscosity import relaxation
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import ConvergenceError
-from .polynomials import BoolArray, FloatArray, Monomials, Polynomial, SquaredPolynomial, around
+from .polynomials import Monomials, Polynomial, SquaredPolynomial, around
 from .reduced_force import ForceAlong, ReducedForce
-
-IntArray = NDArray[np.int64]
 
 _REST_TOLERANCE: Final = 1e-6  # of equilibria, relative to the coordinates' size; networks are in float32
 _ITERATIONS: Final = 50

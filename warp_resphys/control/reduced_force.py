@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from torch import nn
 
 from ..data.input_response import with_means
+from ..io.arrays import BoolArray, FloatArray
 from ..learning.networks import SkipMLP, StateMap
 from ..learning.rollout import Range
-from .polynomials import BoolArray, FloatArray, Monomials, Polynomial
+from .polynomials import Monomials, Polynomial
 
 Array = NDArray[Any]
 Layer = Callable[[Array], Array]

@@ -13,6 +13,7 @@ import scipy.linalg
 import torch
 from numpy.typing import ArrayLike
 
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, DataFileError
 from ..io.files import to_plain
 from ..io.progress import Progress
@@ -22,7 +23,7 @@ from ..robot.state import RobotState
 from ..settings.control import ReductionSettings
 from ..stepping.state import State
 from .files import read_reduced, reduced_file, write_reduced
-from .polynomials import FloatArray, Polynomial, SquaredPolynomial, best_order, solve_ridge
+from .polynomials import Polynomial, SquaredPolynomial, best_order, solve_ridge
 from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
 from .sampling import Motions, OnProgress, Source, Tangent, check_reducible, driven_input

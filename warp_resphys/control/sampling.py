@@ -14,6 +14,7 @@ from ..data.input_response import SLOPES, InputResponse, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.inputs import RobotInput
 from ..robot.robot import Robot
@@ -21,7 +22,6 @@ from ..robot.state import RobotState
 from ..settings.control import ReductionSettings
 from ..settings.trials import SequenceSettings
 from ..stepping.state import State
-from .polynomials import FloatArray
 
 OnProgress = Callable[[int], None]
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
 from ..experiment.parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
@@ -46,7 +47,6 @@ from .files import (
     write_reduced,
 )
 from .plan import follow, tracked_of
-from .polynomials import FloatArray
 from .reduction import reduce
 from .sampling import check_plannable, driven_input
 from .task import Task, motion_name, motions_of

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.robot import Robot
 from ..settings.control import FigureSettings
 from .baselines import LinearModel
 from .plan import Planner, tracked_of
-from .polynomials import FloatArray, around
+from .polynomials import around
 from .reduced import ReducedModel
 from .sampling import driven_input
 

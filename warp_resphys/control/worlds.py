@@ -14,6 +14,7 @@ from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import make_setup
 from ..experiment.simulate import substeps_of, target_settings
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.settings import parse
@@ -25,7 +26,6 @@ from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..settings.stages import LaboratoryStage, PlayedSettings
 from ..settings.trials import MarkerSettings
-from .polynomials import BoolArray, FloatArray, IntArray
 from .reduced import ReducedModel
 
 _FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria

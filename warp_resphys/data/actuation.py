@@ -3,13 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..settings.trials import SequenceSettings, WaveSettings
 from ..stepping.quantity import Quantity
-
-FloatArray = NDArray[np.float64]
 
 _JITTER = 1e-9  # of the variance, on the diagonal of a smooth covariance
 NO_INPUT = 0.01  # of the limit: zero error of a gauge, below which an input counts as none

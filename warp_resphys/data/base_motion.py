@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.text import read_rows
 from ..settings.trials import MotionSettings
-from .rigid import FloatArray, RigidTransform, kabsch
+from .rigid import RigidTransform, kabsch
 
 LARGEST_STEP = 0.2  # of the size of a body
 _MILLI = 1e3

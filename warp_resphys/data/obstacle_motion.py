@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ..energies.contact import MOTION, Contact
 from ..fem.body import Body
+from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..settings.trials import MotionSettings
 from .base_motion import followed, prescribed, rigid
 from .recordings.recording import Recording
-from .rigid import FloatArray
 
 
 def prescribed_all(

@@ -12,14 +12,13 @@ from math import comb
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import DataFileError, InputError, listed
-from .rigid import BoolArray, FloatArray, RigidTransform, fit, fitted, root_mean_square
-
-IntArray = NDArray[np.int64]
+from .rigid import RigidTransform, fit, fitted, root_mean_square
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried in the search for outliers.

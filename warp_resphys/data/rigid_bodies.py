@@ -19,10 +19,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, did_you_mean, listed
 from ..settings.trials import CORNERS
 from .recordings.recording import ARM, Recording
-from .rigid import FloatArray, RigidTransform, fit
+from .rigid import RigidTransform, fit
 
 _SIGNS = np.array([[1.0 if sign == "+" else -1.0 for sign in corner] for corner in CORNERS])
 

@@ -17,11 +17,11 @@ from typing import Final
 import numpy as np
 import scipy.sparse
 import torch
-from numpy.typing import NDArray
 
 from ..energies.placement import PlacedEnergy
 from ..energies.solid import Solid
 from ..fem.body import Body
+from ..io.arrays import FloatArray
 from ..io.errors import warn
 from ..mesh.elements import BY_NODES
 from .plausibility import mean_of
@@ -30,8 +30,6 @@ NOTICED: Final = 0.07  # change of the deflection
 CHECKED: Final = 4  # equilibria of a simulator, as the first one is often that of its weight alone
 _LEAST: Final = 1e-7  # strain, below which rounding dominates
 _INCOMPRESSIBLE: Final = 0.5  # Poisson's ratio of materials without this constant
-
-FloatArray = NDArray[np.float64]
 
 
 def warn_of_cells(

@@ -7,13 +7,11 @@ import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 import torch
-from numpy.typing import NDArray
 
 from ..energies.materials import VISCOUS
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from .simulator import Simulator
-
-FloatArray = NDArray[np.float64]
 
 _DENSE = 600  # largest number of unknowns for a dense eigensolver
 _MORE = 6  # modes beyond the count, so that no cluster is cut: a free body has six rigid-body modes
@@ -108,7 +106,7 @@ def _inverse(root: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
 
 def _about_rest(
     simulator: Simulator,
-) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, NDArray[np.int64]]:
+) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, IntArray]:
     """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] at rest, and the F free vertices."""
     simulator = replace(simulator, dtype=torch.float64)  # The lowest eigenvalues are below the rounding of float32.
     rest = simulator.rest_state()

@@ -11,9 +11,10 @@ import numpy as np
 import scipy.ndimage
 import torch
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from typing_extensions import override
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..kernels import obstacles as kernels
 from ..kernels.modules import shareable
@@ -29,8 +30,6 @@ Vector = tuple[float, float, float]
 # it, and a third above, from the coefficients of the node before, itself and the one behind.
 _VALUES = np.array([[2.0, 4.0, 0.0], [1.0, 4.0, 1.0], [0.0, 4.0, 2.0]]) / 6.0
 _SLOPES = np.array([[-5.0, 4.0, 1.0], [-3.0, 0.0, 3.0], [-1.0, -4.0, 5.0]]) / 6.0
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 _CORNERS: Final = 64  # of a circle
 _PLATE: Final = (1.5, 0.02)  # edge and thickness of the plate that stands for a half-space, over the body's size
 
@@ -76,7 +75,7 @@ class Obstacle:
         return (0.0, 0.0, 0.0)
 
     @property
-    def turn(self) -> NDArray[np.float64]:
+    def turn(self) -> FloatArray:
         """(3, 3) rotation from its axes to those of the world."""
         z = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
         x = np.eye(3)[int(np.argmin(np.abs(z)))]
@@ -163,7 +162,7 @@ class DistanceGrid(Obstacle):
     kind: ClassVar[int] = int(kernels.GRID)
     vectors: ClassVar[tuple[str, ...]] = (*Obstacle.vectors, "low")
     lengths: ClassVar[tuple[str, ...]] = ("spacing",)
-    distances: NDArray[np.float64]  # (I, J, K) [m]
+    distances: FloatArray  # (I, J, K) [m]
     spacing: float  # of the nodes [m]
     low: Vector  # place of the first node in the axes of the obstacle [m]
 
@@ -189,7 +188,7 @@ class DistanceGrid(Obstacle):
         return float(self.distances[inner].min())
 
     @cached_property
-    def coefficients(self) -> NDArray[np.float64]:
+    def coefficients(self) -> FloatArray:
         """(I, J, K) coefficients of the B-splines [m]."""
         return np.asarray(scipy.ndimage.spline_filter(self.distances, 3, output=np.float64, mode="mirror"))
 
@@ -269,7 +268,7 @@ class DistanceGrid(Obstacle):
         return cls.of_surface(METRES[units] * vertices, np.concatenate(shells), spacing, margin, **pose)
 
 
-def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLike) -> NDArray[np.float64]:
+def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLike) -> FloatArray:
     """Returns the distances (P,) of places (P, 3) from a closed surface, negative inside of it, in float32 [m].
 
     Args:

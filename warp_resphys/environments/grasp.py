@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..control.polynomials import BoolArray, FloatArray, IntArray
 from ..control.worlds import World
 from ..energies.contact import Contact
 from ..energies.obstacles import HalfSpace
 from ..energies.surfaces import SurfaceContact
 from ..fem.body import Body, Rigid
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..mesh.mesh import Mesh, boundary_triangles, box_hexahedra
 from ..report.obstacles import ObstacleSurface
 from ..robot.inputs import BASE

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.plan import tracked_of
-from ..control.polynomials import FloatArray
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.inputs import BASE
 from ..robot.loading import load

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray, IntArray
 from ..report.bodies import BODIES, BODY_LIGHT, obstacle_layers, sharp_edges
 from ..report.obstacles import ObstacleSurface
-from ..report.render import INK, FloatArray, Layer, Pixels, Renderer, RenderScene, View, chain, frame_of, view_axes
+from ..report.render import INK, Layer, Pixels, Renderer, RenderScene, View, chain, frame_of, view_axes
 
 _SIZE: Final = (480, 480)  # px
 _TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # azimuth and elevation of the camera
@@ -43,7 +43,7 @@ class Camera:
 
     def pictures(
         self,
-        triangles: NDArray[np.int64],
+        triangles: IntArray,
         vertices: FloatArray,
         markers: FloatArray,
         goals: Sequence[FloatArray],

@@ -9,7 +9,8 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..control.polynomials import FloatArray, Polynomial, around
+from ..control.polynomials import Polynomial, around
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..linalg.threads import threads_for
 from .tasks import GoalTask, Reach

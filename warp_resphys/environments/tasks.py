@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..control.polynomials import FloatArray
 from ..control.task import Path
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 
 PREVIEW: Final = (0, 2, 5)  # actions ahead of the goals that are observed
@@ -64,15 +63,15 @@ class RobotTask(ABC):
         """Begins a new episode of a robot."""
 
     @abstractmethod
-    def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def observed(self, points: FloatArray, number: IntArray) -> FloatArray:
         """Observed values (B, width) for points (B, 3) [m] after so many actions (B,)."""
 
     @abstractmethod
-    def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def reward(self, points: FloatArray, number: IntArray) -> FloatArray:
         """Rewards (B,), at most one."""
 
     @abstractmethod
-    def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def errors_mm(self, points: FloatArray, number: IntArray) -> FloatArray:
         """Distances (B,) of the points from their goals [mm]."""
 
     @abstractmethod
@@ -91,13 +90,13 @@ class GoalTask(RobotTask):
         self.size, self.width, self.reach = reach.size, 3 * len(PREVIEW), reach
 
     @override
-    def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def observed(self, points: FloatArray, number: IntArray) -> FloatArray:
         ahead = np.minimum(number[:, None] + np.array(PREVIEW) + 1, self.goals.shape[1] - 1)
         wanted = self.goals[np.arange(len(points))[:, None], ahead]
         return np.asarray(((wanted - points[:, None]) / self.size).reshape(len(points), -1))
 
     @override
-    def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def errors_mm(self, points: FloatArray, number: IntArray) -> FloatArray:
         now = self.goals[np.arange(len(number)), np.minimum(number, self.goals.shape[1] - 1)]
         return np.asarray(1e3 * np.linalg.norm(points - now, axis=1))
 
@@ -106,7 +105,7 @@ class GoalTask(RobotTask):
         return self.goals[row, min(number, self.goals.shape[1] - 1) :]
 
     @override
-    def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def reward(self, points: FloatArray, number: IntArray) -> FloatArray:
         return np.asarray(1.0 - 1e-3 * self.errors_mm(points, number) / self.size)
 
 
@@ -170,15 +169,15 @@ class SwingTask(RobotTask):
         return np.asarray((points - self._rest) @ self._up / self.size)
 
     @override
-    def observed(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def observed(self, points: FloatArray, number: IntArray) -> FloatArray:
         return self._height(points)[:, None]
 
     @override
-    def reward(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def reward(self, points: FloatArray, number: IntArray) -> FloatArray:
         return np.clip(self._height(points), 0.0, 1.0)
 
     @override
-    def errors_mm(self, points: FloatArray, number: NDArray[np.int64]) -> FloatArray:
+    def errors_mm(self, points: FloatArray, number: IntArray) -> FloatArray:
         return np.asarray(1e3 * self.size * (1.0 - self._height(points)))
 
     @override

@@ -10,8 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..control.polynomials import FloatArray
 from ..control.worlds import World
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from .picture import Camera
 from .tasks import RobotTask
@@ -135,7 +135,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._begin(chosen)
         return self._observed(), {}
 
-    def _begin(self, chosen: NDArray[np.bool_]) -> None:
+    def _begin(self, chosen: BoolArray) -> None:
         assert self._random is not None
         self.world.begin(chosen)
         for row in np.flatnonzero(chosen):
@@ -147,7 +147,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         seen = self._cameras(chosen)
         self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
 
-    def _cameras(self, chosen: NDArray[np.bool_]) -> FloatArray:
+    def _cameras(self, chosen: BoolArray) -> FloatArray:
         """Observed markers (B, M, 3) [m], with noise for the chosen robots."""
         assert self._random is not None
         markers = self.world.markers().copy()
@@ -209,7 +209,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     @override
     def step(
         self, actions: NDArray[np.float32]
-    ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    ) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Makes an action of each robot.
 
         Args:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..data.marker_view import MarkerView
 from ..data.markers import BoundMarkers, JoinedMarkers, Markers, bind_markers, follow_vertices
@@ -24,6 +24,7 @@ from ..energies.catalogue import make_material
 from ..energies.materials import Material
 from ..fem.body import Body, Glue, Rigid
 from ..fem.coordinates import SymmetryPlane
+from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError, naming
 from ..io.machine import find_device
@@ -48,8 +49,6 @@ from ..settings.mesh import (
 )
 from ..settings.trials import BindingSettings, MarkerSettings, RigidBodySettings
 from .actuators import build_actuators
-
-FloatArray = NDArray[np.float64]
 
 
 def choose_device(name: str) -> torch.device:
@@ -289,7 +288,7 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
     return JoinedMarkers.of(parts, rows)
 
 
-def mounted_on(settings: RigidBodySettings, mesh: Mesh) -> NDArray[np.int64]:
+def mounted_on(settings: RigidBodySettings, mesh: Mesh) -> IntArray:
     """Returns the vertices of the part or the plate that a rigid body is mounted on.
 
     Raises:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import ConvergenceError, InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
@@ -35,9 +36,6 @@ from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
 from .without_physics import without_physics
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _FILM_FRAMES = 256  # maximum
 CHECKED_SECONDS, _CHECKED_POSES = 0.5, 3  # that are simulated with a finer mesh

@@ -14,6 +14,7 @@ from ..data.obstacle_motion import contact_inputs
 from ..data.trials import Trials
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json
 from ..learning.intervals import time_since_change
@@ -23,8 +24,6 @@ from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
 from .actuators import DRIVING_QUANTITIES
-
-FloatArray = NDArray[np.float64]
 
 DATASET: Final = "dataset.h5"
 SCALED_DATASET: Final = "dataset_scaled.h5"
@@ -140,7 +139,7 @@ class Dataset:
         return self.sessions[self.names.index(name)] if self.sessions else ""
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def present(self) -> BoolArray:
         """(R, M) whether a trial has a marker, i.e. whether any of its frames shows the marker."""
         seen = np.asarray(np.isfinite(self.observed).all(axis=-1))
         return np.asarray(seen.any(axis=1))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..data.actuation import draw_inputs, wave_inputs
@@ -20,6 +19,7 @@ from ..data.recordings.recording import ARM, Recording
 from ..data.rigid import RigidTransform
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.stages import StageContext
@@ -35,8 +35,6 @@ from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from .recordings.reading import vertical
 from .simulate import distributed, played, substeps_of, target_settings, true_motions
-
-FloatArray = NDArray[np.float64]
 
 _LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
 _LARGEST_MOUNTING = 0.02  # m, of each coordinate of a rigid body from the centre of what carries it

@@ -8,13 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..data.observation import WHOLE_STATE
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import unit_of
 from ..energies.materials import MASS_DAMPING
 from ..fem.elements import principal_stretches
+from ..io.arrays import FloatArray
 from ..learning.law import VISCOSITIES
 from ..learning.parameters import Bounds, Prior
 from ..learning.replay import Replay, Start
@@ -35,7 +35,6 @@ _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: s
 _CLEARLY, _CLOSER = 0.5, 0.95
 _SIGNIFICANT: Final = 2.0  # standard errors
 
-FloatArray = NDArray[np.float64]
 Replays = Sequence[tuple[Replay, Start]]
 
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
 from ..learning.metrics import marker_errors, summarise
@@ -21,8 +21,6 @@ from ..learning.rollout import LearnedPredictor, Range, Rollout
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment
 from .files import GIVEN, weights_file
-
-FloatArray = NDArray[np.float64]
 
 SIMFREE: Final = "simfree"
 POSE_STEPS = 200  # after which the roll-out of a network without simulator is taken to be at rest

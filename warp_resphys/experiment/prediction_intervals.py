@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..data.rigid_bodies import as_markers
+from ..io.arrays import FloatArray
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage
@@ -18,7 +18,6 @@ from .models import SIMFREE
 from .sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
 from .without_physics import without_physics
 
-FloatArray = NDArray[np.float64]
 Linear = Mapping[str, Mapping[str, Sensitivity]]  # derivatives by model and trial
 
 INTERVAL_MODELS = ("sysid", "law", "simfree", "resphys")  # models with prediction intervals, beside the baselines

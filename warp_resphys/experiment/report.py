@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..data.rigid_bodies import as_markers, owners
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.body import Body
 from ..fem.elements import principal_stretches, share_outside
+from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
@@ -64,8 +64,6 @@ from .files import (
     since_change,
     training_file,
 )
-
-FloatArray = NDArray[np.float64]
 
 
 def make_report(context: StageContext) -> None:

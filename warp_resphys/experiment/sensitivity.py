@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
 from ..data.rigid_bodies import as_markers, owners
 from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, listed
 from ..io.progress import Progress
 from ..learning.metrics import mean_distance
@@ -30,7 +30,6 @@ from .experiment import Experiment
 
 log = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
 
 _DIFFERENCE = 1e-3  # of a parameter, over its standard deviation, or over the typical size of an input's response
 

@@ -23,6 +23,7 @@ from ..data.markers import MarkerMap
 from ..data.observation import WHOLE_STATE, Observation
 from ..data.obstacle_motion import contact_inputs, prescribed_all
 from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.fan_out import ALONE
 from ..io.stages import StageContext
@@ -46,8 +47,6 @@ from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET, GIVEN, Dataset
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
-
-FloatArray = NDArray[np.float64]
 
 _LARGEST_DISTANCE = 0.2  # of a vertex from the cell of the other mesh that it is extrapolated from, over its diagonal
 
@@ -301,7 +300,7 @@ def weights(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: 
     return distributed(simulator, face, simulator.tensor(forces))
 
 
-def distributed(simulator: Simulator, vertices: NDArray[np.int64], forces: torch.Tensor) -> torch.Tensor:
+def distributed(simulator: Simulator, vertices: IntArray, forces: torch.Tensor) -> torch.Tensor:
     """(B, N, 3) nodal forces [N] that distribute total forces (B, 3) equally over vertices."""
     nodal = simulator.rest_positions.new_zeros(len(forces), simulator.body.n_vertices, 3)
     nodal[:, torch.as_tensor(vertices, device=nodal.device)] = forces[:, None] / len(vertices)

@@ -6,16 +6,14 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..data.trials import Trials
+from ..io.arrays import BoolArray, FloatArray
 from ..learning.baselines import BASELINES, REST, PlainTrials, at_rest, predictions
 from ..learning.release import least_delays
 from ..learning.replay import sample
 from .experiment import Experiment, at_steps
 from .files import GIVEN, RESTING, Dataset, driving
-
-FloatArray = NDArray[np.float64]
 
 _SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest
 
@@ -96,7 +94,7 @@ def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray
     """(R, T, M, 3) predicted motions with the delay that the first frames of each trial show [m]."""
     dataset, settings = experiment.dataset, experiment.settings.release
     rows = dataset.rows(names)
-    shown: NDArray[np.bool_] = np.asarray(np.isfinite(predicted).all(axis=(2, 3)))
+    shown: BoolArray = np.asarray(np.isfinite(predicted).all(axis=(2, 3)))
     last = np.maximum.accumulate(np.where(shown, np.arange(shown.shape[1]), 0), axis=1)  # held after the prediction
     series = torch.from_numpy(np.take_along_axis(predicted, last[..., None, None], 1))
     times, observed = torch.from_numpy(dataset.times[rows]), torch.from_numpy(dataset.observed[rows])

@@ -16,13 +16,11 @@ from typing import TypeVar
 import numpy as np
 import scipy.sparse
 import torch
-from numpy.typing import NDArray
 
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from .elements import Points
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 P = TypeVar("P", bound=Points)
 _ROUNDING = 1e-9  # weights up to this size are zero but for rounding
 _FLAT = 1e-3  # smallest height of the tetrahedron that controls a rigid part, over the part's size
@@ -49,12 +47,12 @@ class SymmetryPlane:
             raise InputError(f"a symmetry plane has the normal {self.normal}: give three finite numbers, not all zero.")
         object.__setattr__(self, "normal", tuple((normal / np.linalg.norm(normal)).tolist()))
 
-    def contains(self, vertices: FloatArray) -> NDArray[np.bool_]:
+    def contains(self, vertices: FloatArray) -> BoolArray:
         """Returns (N,) whether vertices (N, 3) [m] lie in the plane."""
         return np.asarray(np.abs(vertices @ np.asarray(self.normal) - self.offset) <= self.tolerance)
 
 
-def tangential_projections(normals: FloatArray, touched: NDArray[np.bool_]) -> FloatArray:
+def tangential_projections(normals: FloatArray, touched: BoolArray) -> FloatArray:
     """Returns the projections (R, 3, 3) onto the directions along all planes that contain a vertex.
 
     Args:
@@ -322,7 +320,7 @@ def control_vertices(
     return np.sort(candidates[chosen])
 
 
-def _corner_sets(inside: Sequence[NDArray[np.bool_]], count: int) -> list[NDArray[np.bool_]]:
+def _corner_sets(inside: Sequence[BoolArray], count: int) -> list[BoolArray]:
     """Returns the candidates (count,) of each of the four control vertices, from those inside each symmetry plane."""
     match inside:
         case []:

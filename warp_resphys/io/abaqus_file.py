@@ -11,13 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import FloatArray, IntArray
 from .errors import DecodingError
-from .mesh_blocks import Block, IntArray, rows_of
+from .mesh_blocks import Block, rows_of
 from .text import decoded
 
-FloatArray = NDArray[np.float64]
 Member = tuple[str, IntArray | str]  # instance or "" for the set's own scope; numbers of elements or name of a set
 
 _SOLID, _FACE = re.compile(r"C3D(\d+)(?!\d|V)"), re.compile(r"(?:D?S|STRI|M3D|R3D|SFM3D|CPS|CPE|CAX)([34689])")

@@ -9,13 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import FloatArray, IntArray
 from .errors import DecodingError
-from .mesh_blocks import Block, IntArray, rows_of
+from .mesh_blocks import Block, rows_of
 from .text import decoded
 
-FloatArray = NDArray[np.float64]
 Names = Mapping[tuple[int, int], str]  # of physical groups by dimension and number
 
 _KINDS = {  # meshio's name, dimension and number of nodes by gmsh's number of a kind

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import FloatArray, IntArray
 from .errors import DecodingError
 
-IntArray = NDArray[np.int64]
 _CORNERS = {"triangle": 3, "triangle6": 3, "quad": 4, "quad8": 4, "quad9": 4}  # of the faces that can have a name
 
 
@@ -21,7 +21,7 @@ class Block(NamedTuple):
     groups: Mapping[str, IntArray]  # cells of the block, (n,), by the name of a group
 
 
-def mesh_arrays_of(points: NDArray[np.float64], blocks: Sequence[Block]) -> dict[str, NDArray[Any]]:
+def mesh_arrays_of(points: FloatArray, blocks: Sequence[Block]) -> dict[str, NDArray[Any]]:
     """Sorts blocks into volume cells, named surfaces and named regions.
 
     Returns:

@@ -13,10 +13,10 @@ from typing import Final
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-FloatArray = NDArray[np.float64]
+from ..io.arrays import BoolArray, FloatArray, IntArray
+
 Kernel = Callable[[FloatArray, FloatArray], FloatArray]
 
 REST: Final = "rest"
@@ -51,7 +51,7 @@ class PlainTrials:
     inputs: FloatArray
     known: FloatArray
 
-    def select(self, rows: NDArray[np.bool_]) -> "PlainTrials":
+    def select(self, rows: BoolArray) -> "PlainTrials":
         """Returns some of the trials."""
         return PlainTrials(self.values[rows], self.origin[rows], self.first[rows], self.inputs[rows], self.known[rows])
 
@@ -278,7 +278,7 @@ def _degrees(trials: PlainTrials) -> list[int]:
     return [1, *(degree for degree in few if 1 < degree < len(trials.values) and count)]
 
 
-def _acting(trials: PlainTrials) -> NDArray[np.int64]:
+def _acting(trials: PlainTrials) -> IntArray:
     """(A,) columns of inputs and loads that act in any trial."""
     return np.flatnonzero(np.concatenate([trials.inputs.any((0, 1)), trials.known.any(0)]))
 

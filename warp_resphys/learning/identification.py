@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError
 from ..linalg.least_squares import Point, UnitBox, minimise
 from .parameters import Bounds
-from .uncertainty import FloatArray, LinearMisfit, Uncertainty, redundancy, uncertainty_of
+from .uncertainty import LinearMisfit, Uncertainty, redundancy, uncertainty_of
 
 Report = Callable[[int, float, Mapping[str, float]], None]
 Attempt = dict[str, Any]

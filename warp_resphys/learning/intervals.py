@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
-FloatArray = NDArray[np.float64]
+from ..io.arrays import BoolArray, FloatArray
 
 LEVEL: Final = 0.9
 TIMES: Final = (0.1, 0.5)  # s after a change of the inputs: between just after, soon after and long after it
@@ -48,7 +48,7 @@ class Predicted:
     spread: FloatArray | None = None
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """(T, M) whether a marker was seen."""
         return np.asarray(np.isfinite(self.observed).all(-1))
 

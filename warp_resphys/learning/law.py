@@ -26,17 +26,16 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 import torch
-from numpy.typing import NDArray
 
 from ..dynamics.simulator import Simulator
 from ..energies.hysteresis import PLASTIC_STRAIN
 from ..energies.solid import VISCOUS_STRAIN
 from ..energies.tendon_friction import SEGMENT_TENSION
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 
-FloatArray = NDArray[np.float64]
 Candidate = Mapping[str, float]  # values of parameters that give one unit of a coefficient, the others being zero
 
 MODULUS: Final = ("c10", "bulk_1")  # of the smallest class, a neo-Hookean solid
@@ -226,7 +225,7 @@ class _Columns:
         self.candidates += candidates
         return list(range(first, len(self.candidates)))
 
-    def fit(self, indices: Sequence[int]) -> tuple[NDArray[np.float64], float]:
+    def fit(self, indices: Sequence[int]) -> tuple[FloatArray, float]:
         """Returns the coefficients, and the residual of the held-out motions, or of the training motions."""
         found = self._normal[0].fit(indices)
         return found, self._normal[-1].residual(indices, found)
@@ -278,19 +277,19 @@ def _families(columns: _Columns, base: Sequence[int], most: int) -> list[int]:
     return families
 
 
-def _fibres(direction: NDArray[np.float64]) -> dict[str, float]:
+def _fibres(direction: FloatArray) -> dict[str, float]:
     x, y, z = direction / np.linalg.norm(direction)
     angles = {"fibre_azimuth_1": math.atan2(y, x), "fibre_elevation_1": math.asin(min(max(z, -1.0), 1.0))}
     return {"fibre_tension_1": UNIT, **angles}
 
 
-def _half_sphere() -> list[NDArray[np.float64]]:
+def _half_sphere() -> list[FloatArray]:
     """Returns the axes and diagonals of a cube, 13 directions."""
     steps = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3)).reshape(3, -1).T
     return [d for d in steps if tuple(d) > (0.0, 0.0, 0.0)]
 
 
-def _around(azimuth: float, elevation: float) -> list[NDArray[np.float64]]:
+def _around(azimuth: float, elevation: float) -> list[FloatArray]:
     """Returns eight directions around one."""
     axis = np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]

@@ -19,6 +19,7 @@ from typing_extensions import override
 
 from ..data.markers import Markers
 from ..data.trials import Trials
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.state import State
 from .identification import BoundedMisfit
@@ -26,7 +27,7 @@ from .nuisance import NuisanceFit, Nuisances
 from .parameters import Bounds, check_names, split_name
 from .placement import Accuracy, DisplacedMarkers
 from .replay import Replay, Start, exact
-from .uncertainty import FloatArray, LinearMisfit, LinearSystem, LinearTrial, Uncertainty, left_out, uncertainty_of
+from .uncertainty import LinearMisfit, LinearSystem, LinearTrial, Uncertainty, left_out, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range

@@ -13,15 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..data.markers import Markers
 from ..data.observation import Observation
-
-FloatArray = NDArray[np.float64]
+from ..io.arrays import FloatArray
 
 _DIRECTIONS = 3
 

@@ -20,12 +20,10 @@ from dataclasses import dataclass, field, replace
 from itertools import takewhile
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray
 from .nuisance import Nuisances
 from .parameters import Bounds
-
-FloatArray = NDArray[np.float64]
 
 _UNIFORM = 12.0  # reciprocal variance of a parameter in its range, as a fraction of it
 

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from ..io.arrays import IntArray
 from ..io.errors import MeshError
 from .arm_section import SOLID, ComplexArray, Section, section_grids, section_quadrilaterals
 from .chambers import find_chambers
-from .mesh import IntArray, Mesh, boundary_faces, check_mesh
+from .mesh import Mesh, boundary_faces, check_mesh
 from .tetrahedra import tetrahedra_by_gmsh
 
 _PROFILES = ("half_disc", "disc", "sector")

@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import MeshError
 
 ComplexArray = NDArray[np.complex128]
-IntArray = NDArray[np.int64]
 Edge = tuple[str, str]  # names of the ends, in alphabetical order if used as a key
 Divisions = Mapping[Edge, int]
 Corner = tuple[str, bool, int]  # name, whether it is mirrored at the middle of its chamber, and index of the wedge
@@ -37,7 +37,7 @@ class Piece(NamedTuple):
     end: complex
     centre: complex | None  # centre of a circular arc of less than 180 degrees; None for a straight line
 
-    def points(self, t: NDArray[np.float64]) -> ComplexArray:
+    def points(self, t: FloatArray) -> ComplexArray:
         """Returns the points at fractions (T,) of the length."""
         if self.centre is None:
             return np.asarray(self.start + (self.end - self.start) * t, dtype=np.complex128)
@@ -45,7 +45,7 @@ class Piece(NamedTuple):
         spoke = self.start - self.centre
         return np.asarray(self.centre + spoke * ((self.end - self.centre) / spoke) ** t, dtype=np.complex128)
 
-    def moves(self, t: NDArray[np.float64], first: complex, last: complex, share: float = 1.0) -> ComplexArray:
+    def moves(self, t: FloatArray, first: complex, last: complex, share: float = 1.0) -> ComplexArray:
         """Returns displacements of these points: interpolated on a line, a share of the radius outwards on an arc."""
         if self.centre is None:
             return np.asarray(first * (1.0 - t) + last * t, dtype=np.complex128)
@@ -306,7 +306,7 @@ class Section:
         wedge = np.concatenate([half[:0:-1].conj(), half[:-1]])
         return np.asarray((turns[:, None] * wedge).ravel(), dtype=np.complex128)
 
-    def line(self, first: Corner, last: Corner, t: NDArray[np.float64], growth: Growth) -> ComplexArray:
+    def line(self, first: Corner, last: Corner, t: FloatArray, growth: Growth) -> ComplexArray:
         """Returns the points at fractions (T,) of the line between two neighbouring corners, after the growth."""
         start, end = (self._placed(self.points[corner[0]], corner) for corner in (first, last))
         by_start, by_end = (self._placed(growth.of(c[0]) * self.motion(c[0]), c) for c in (first, last))

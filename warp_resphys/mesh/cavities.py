@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from ..io.arrays import FloatArray
 from ..io.kernel_cache import ensure_kernel_cache
 from ..kernels.modules import shareable
 from ..kernels.triangles import blocked
 from .chambers import find_chambers
-from .mesh import FloatArray, Mesh, boundary_triangles, connected_parts
+from .mesh import Mesh, boundary_triangles, connected_parts
 
 _DIRECTIONS = 24  # rays per triangle, over the hemisphere of its normal
 _HIDDEN = 0.2  # fraction of unobstructed rays below which a triangle is inside a cavity

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from ..io.arrays import FloatArray, IntArray
+
+Array = FloatArray
 Rule = tuple[Array, Array]  # points (Q, d) and weights (Q,)
 
 

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from .elements import Array, Element
-from .mesh import FloatArray, IntArray, Mesh
+from .mesh import Mesh
 
 _ITERATIONS = 20
 _CANDIDATES = 12  # smallest number of cells searched for a point

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 import scipy.sparse.csgraph
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import MeshError
 from .elements import BY_NODES, ELEMENTS, FACES, Element
 from .plotting import Picture
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Extent = float | Sequence[float]  # a coordinate, or a range of coordinates
 
 LARGEST_COORDINATE = 1e50  # in any unit; products of three coordinates must be finite
@@ -311,7 +310,7 @@ class Place:
     def _spans(self) -> dict[str, tuple[float, float]]:
         return {axis: (float(np.min(at)), float(np.max(at))) for axis, at in self._given.items()}
 
-    def holds(self, points: FloatArray) -> NDArray[np.bool_]:
+    def holds(self, points: FloatArray) -> BoolArray:
         """Returns (N,) whether points (N, 3) [m] lie in the place."""
         inside = np.ones(len(points), dtype=bool)
         for axis, (first, last) in self._spans().items():
@@ -428,7 +427,7 @@ def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray, FloatArray]
     return volumes, smallest * weights.sum(), largest * weights.sum()
 
 
-def _refuse(broken: NDArray[np.bool_], nouns: str, problem: str) -> None:
+def _refuse(broken: BoolArray, nouns: str, problem: str) -> None:
     """Raises MeshError with the first few indices and their number if any flag is set."""
     numbers = np.flatnonzero(broken)
     if len(numbers):

@@ -9,14 +9,12 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_text
 from .mesh import Mesh, boundary_triangles, surface_vertices
-
-FloatArray = NDArray[np.float64]
 
 _USD = (".usd", ".usda", ".usdc")
 _MARKER_SHARE = 0.02  # diameter of a marker, over the body's size
@@ -34,7 +32,7 @@ class MovingSurface:
 
     name: str
     points: FloatArray
-    triangles: NDArray[np.int64]
+    triangles: IntArray
 
 
 def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray) -> dict[str, FloatArray]:
@@ -104,7 +102,7 @@ def _write_series(
     path: Path,
     times: FloatArray,
     points: FloatArray,
-    cells: tuple[str, NDArray[np.int64]],
+    cells: tuple[str, IntArray],
     fields: Iterator[dict[str, Any]],
 ) -> None:
     """Writes one file per time, then the collection that lists them."""

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from ..io.arrays import FloatArray
 from .elements import ELEMENTS
-from .mesh import FloatArray, Mesh
+from .mesh import Mesh
 
 
 def scaled_jacobian(mesh: Mesh) -> FloatArray:

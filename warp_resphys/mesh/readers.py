@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..io.decoding import MESH_READERS, Arrays, decode, mesh_arrays
 from ..io.errors import DecodingError, MeshError, warn
 from .elements import ELEMENTS
-from .mesh import FloatArray, IntArray, Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
+from .mesh import Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
 SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # plausible diagonals of a body [m]

@@ -13,9 +13,10 @@ import numpy as np
 import scipy.integrate
 from numpy.typing import ArrayLike
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import MeshError
 from .elements import BY_NODES, FACES, gauss_box
-from .mesh import FloatArray, IntArray, Mesh, box_hexahedra, connected_parts, quadratic
+from .mesh import Mesh, box_hexahedra, connected_parts, quadratic
 
 _TIE = 1e-6  # tolerance in the choice of the axis most perpendicular to the tangent
 _CORE = 0.55  # half diagonal of the middle square, over the radius

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
-from .mesh import FloatArray, IntArray, Mesh, boundary_triangles
+from .mesh import Mesh, boundary_triangles
 
 _TIE = 1e-9  # difference up to which triangles are equally close, over the diagonal of the mesh
 _CANDIDATES = 16  # triangles that are tried first for a point

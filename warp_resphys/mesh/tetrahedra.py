@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import MeshError, naming
 from ..io.progress import QUIET_SECONDS, Progress
-from .mesh import FloatArray, IntArray, Mesh, quadratic
+from .mesh import Mesh, quadratic
 from .quality import cell_volumes
 from .readers import METRES, check_size
 

@@ -20,10 +20,11 @@ import torch
 from scipy.spatial import cKDTree
 
 from ..data.camera import PlacedCamera
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_of, closest_points
-from .outlines import FloatArray, IntArray, Mask
+from .outlines import Mask
 
 _STRAY: Final = 1.0  # % of the points that may lie far away in a direction, when their extent is measured
 _LEAST: Final = 20  # points on a body

@@ -23,10 +23,11 @@ from scipy.spatial import cKDTree
 from typing_extensions import override
 
 from ..data.camera import CORRECTIONS, PlacedCamera
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.identification import BoundedMisfit
 from ..learning.parameters import Bounds, split_name
-from ..learning.uncertainty import FloatArray, Linearised, LinearMisfit
+from ..learning.uncertainty import Linearised, LinearMisfit
 from .motion import RELEASE_DELAY
 from .seen import Photo, SeenPose, Shape
 

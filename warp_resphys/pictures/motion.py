@@ -26,11 +26,11 @@ from ..data.camera import jacobians
 from ..data.observation import WHOLE_STATE
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
+from ..io.arrays import IntArray
 from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
 from ..learning.replay import Replay, Start, sample
 from ..stepping.inputs import Inputs
-from .outlines import IntArray
 
 RELEASE_DELAY: Final = "release_delay"  # s
 RELEASE_FORCES: Final = ("release_force_1", "release_force_2", "release_force_3")  # N

@@ -16,15 +16,13 @@ import numpy as np
 import scipy.ndimage
 import shapely
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh, boundary_triangles
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-Mask = NDArray[np.bool_]
+Mask = BoolArray
 
 _SMOOTH = 1.0  # px, of a mask before its contour is drawn: a contour of pixels is a staircase
 _PIXEL = 1.0  # px

@@ -24,14 +24,14 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from pydantic import ConfigDict, Strict
 
 from ..data.camera import PlacedCamera
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_arrays
 from ..io.settings import Count, Many, Positive, Settings, Some, Word, parse
 from ..io.text import read_rows, read_text
 from ..settings.pictures import ColourSettings
 
-FloatArray = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = BoolArray
 
 _LEAST_MOVING = 3  # frames after a release, from which its motion is seen
 _SPECKS = 2  # px, of an opening that removes them
@@ -116,7 +116,7 @@ class SceneFile:
 
     path: Path
     frames: tuple[Frame, ...]
-    clamps: tuple[NDArray[np.int64], ...]  # vertices in each
+    clamps: tuple[IntArray, ...]  # vertices in each
     scan_pose: FloatArray  # (4, 4) world_to_cloud
 
 

@@ -12,13 +12,14 @@ import torch
 from ..data.camera import CORRECTIONS, PLACES, PlacedCamera
 from ..data.observation import Observation
 from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
 from .clouds import Cloud
 from .motion import OF_RELEASE, ReleasedForce, at_own_times
-from .outlines import ClosedSurface, FloatArray, IntArray, Outline, Silhouette, visibility, within
+from .outlines import ClosedSurface, Outline, Silhouette, visibility, within
 
 CLAMP_TURN: Final = "clamp_turn"  # rad
 CLAMP_SHIFT: Final = "clamp_shift"  # m

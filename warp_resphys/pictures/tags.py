@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..data.camera import Lens
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..settings.pictures import TagSettings
-
-FloatArray = NDArray[np.float64]
 
 _CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])  # in the order of OpenCV
 

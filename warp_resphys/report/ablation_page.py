@@ -8,8 +8,9 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from ..io.arrays import FloatArray
 from ..settings.run import RunSettings
-from .figures import TONES, FloatArray, new_figure, use_logarithm
+from .figures import TONES, new_figure, use_logarithm
 from .page import (
     NO_BREAK_SPACE,
     Cell,

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from ..io.arrays import FloatArray, IntArray
 from ..learning.metrics import mean_distance
 from ..mesh.mesh import Mesh, boundary_faces, boundary_triangles
 from ..mesh.surface import closest_points
@@ -15,8 +16,6 @@ from .render import (
     INK,
     MEASURED,
     OUTLINE,
-    FloatArray,
-    IntArray,
     Layer,
     RenderScene,
     View,

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
@@ -26,8 +27,6 @@ from .render import (
     CLAMPED,
     INK,
     MEASURED,
-    FloatArray,
-    IntArray,
     Layer,
     Renderer,
     RenderScene,

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
 from ..learning.intervals import Intervals
-from .data import Driven, FloatArray, RunReport, TrialResults, best_and_worst, drawn_markers, shown_markers
+from .data import Driven, RunReport, TrialResults, best_and_worst, drawn_markers, shown_markers
 from .page import Canvas, Drawn, Part, mm_text, unbroken
 
 if TYPE_CHECKING:

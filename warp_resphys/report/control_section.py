@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ..io.arrays import FloatArray
 from ..settings.control import ControlSettings
-from .data import MODELS, FloatArray, FollowedPath, RunReport
+from .data import MODELS, FollowedPath, RunReport
 from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text, percent_text
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray, IntArray
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PublishedError, mean_distance, published_errors
 from ..mesh.chambers import Chamber
@@ -17,9 +17,6 @@ from ..settings.run import RunSettings
 from ..settings.trials import ReleaseFromLoad
 from ..stepping.quantity import Quantity
 from .obstacles import ObstacleSurface
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # In the order of the tables: name and description.
 MODELS: Final[Mapping[str, tuple[str, str]]] = {

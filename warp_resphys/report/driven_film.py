@@ -6,10 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from ..io.arrays import FloatArray, IntArray
 from .bodies import BODIES, BODY_LIGHT, FILM_VIEW, HEADROOM, sharp_edges
 from .control_section import controller_name
 from .figures import TONES
-from .render import INK, FloatArray, IntArray, Layer, RenderScene, View, chain, frame_of, height_of, pace, path_axes
+from .render import INK, Layer, RenderScene, View, chain, frame_of, height_of, pace, path_axes
 
 _DRAWING: Final = 0.6  # Longer side of the enlarged drawing, over that of the body.
 _GAP: Final = 0.15  # Distance of the drawing from the body, over the same.

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from ..io.arrays import FloatArray
 from ..io.errors import listed, number_of
 from ..learning.metrics import median_filter
-from .data import MODELS, FloatArray, RunReport, grouped_errors
+from .data import MODELS, RunReport, grouped_errors
 from .page import Canvas, Part, Text, largest_text, mm_text, unbroken
 from .sections import model_table, numbers
 

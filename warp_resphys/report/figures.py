@@ -17,12 +17,10 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
 from .data import MODELS
-
-FloatArray = NDArray[np.float64]
 
 
 class Tone(NamedTuple):

@@ -6,10 +6,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..io.arrays import FloatArray
 from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
-from .data import FloatArray, RunReport
+from .data import RunReport
 from .identification_section import Wording, identified_cell, parameter_wording
 from .page import (
     NONE,

@@ -11,7 +11,7 @@ from ..data.rigid import RigidTransform
 from ..energies.contact import GROWTH, MOTION, SHIFT, TURN, Contact
 from ..energies.obstacles import surface_of
 from ..fem.body import Body
-from .render import FloatArray, IntArray
+from ..io.arrays import FloatArray, IntArray
 
 OBSTACLE: Final = "#b9b2a6"  # Colour of obstacles: a warm grey beside the blue of bodies.
 OBSTACLE_LIGHT: Final = (0.62, 0.42)

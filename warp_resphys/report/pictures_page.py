@@ -12,12 +12,13 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray
 from ..io.errors import listed
 from ..io.files import read_array, read_hdf5
 from ..learning.parameters import TILTS
 from ..pictures.seen import NEUTRAL
 from ..settings.run import RunSettings
-from .figures import TONES, FloatArray
+from .figures import TONES
 from .identification_section import parameter_rows
 from .page import (
     NONE,

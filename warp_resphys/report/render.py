@@ -23,13 +23,12 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..io.errors import ResphysError
 from ..io.progress import Progress
 from ..mesh.mesh import Mesh
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Pixels = NDArray[np.uint8]
 
 _LOG = logging.getLogger(__name__)

@@ -12,7 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from .render import INK, OUTLINE, TOWARDS_LIGHT, FloatArray, Layer, Pixels, RenderScene
+from ..io.arrays import FloatArray
+from .render import INK, OUTLINE, TOWARDS_LIGHT, Layer, Pixels, RenderScene
 
 _FAR: Final = 20.0  # Distance of the eye, in half heights of the view.
 _PEELS: Final = 12  # Sorted layers of translucent surfaces.

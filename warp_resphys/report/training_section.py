@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from .data import MODELS, FloatArray, RunReport
+from ..io.arrays import FloatArray
+from .data import MODELS, RunReport
 from .page import Canvas, Part, Text, number_text
 
 if TYPE_CHECKING:

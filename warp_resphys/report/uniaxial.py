@@ -13,12 +13,11 @@ from typing import Final, NamedTuple
 import numpy as np
 import scipy.optimize
 import torch
-from numpy.typing import NDArray
 
 from ..energies.catalogue import make_material
+from ..io.arrays import FloatArray
 from ..settings.body import MaterialSettings
 
-FloatArray = NDArray[np.float64]
 ALONG: Final = (1.0, 0.0, 0.0)  # Direction of fibres, in axes of which the first is that of the load.
 ACROSS: Final = (0.0, 1.0, 0.0)
 

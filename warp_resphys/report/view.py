@@ -15,10 +15,11 @@ from markupsafe import Markup
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from ..io.arrays import FloatArray
 from ..learning.metrics import mean_distance
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from .bodies import ComparedMotion, face_edges, sharp_edges, without_diverged
-from .data import MODELS, FloatArray
+from .data import MODELS
 from .figures import TONES
 from .obstacles import OBSTACLE
 from .page import ViewInSpace

@@ -7,18 +7,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..dynamics.trajectory import furthest_moved, plot_displacements
 from ..energies.obstacles import ObstacleMotion
+from ..io.arrays import FloatArray
 from ..io.errors import InputError, number_of
 from ..learning.replay import sample
 from ..mesh.motion_files import MovingSurface, input_columns, write_csv, write_usd, write_vtk
 from .description import Description
 from .inputs import RobotInput
 from .state import RobotState
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, repr=False)

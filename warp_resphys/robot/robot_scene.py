@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..dynamics.simulator import Simulator
@@ -14,6 +14,7 @@ from ..energies.materials import Material
 from ..energies.surfaces import SurfaceContact
 from ..fem.body import Body
 from ..fem.scene import Scene
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..learning.parameters import constants_of
 from ..stepping.inputs import Inputs
@@ -22,7 +23,6 @@ from .inputs import Given
 from .robot import Robot
 from .state import RobotState
 
-FloatArray = NDArray[np.float64]
 _SAME_GRAVITY: Final = 1e-3  # [m/s^2]
 
 

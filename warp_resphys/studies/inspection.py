@@ -14,22 +14,14 @@ from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
 from ..experiment.build import build_mesh
 from ..fem.body import Body
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.settings import Many, Positive, Word, setting
 from ..io.tables import aligned
 from ..mesh.arm import name_surfaces
 from ..mesh.cavities import open_cavities
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import (
-    FloatArray,
-    IntArray,
-    Mesh,
-    Place,
-    boundary_triangles,
-    connected_parts,
-    quadratic,
-    select_vertices,
-)
+from ..mesh.mesh import Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
 from ..mesh.quality import cell_volumes, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..mesh.tetrahedra import SURFACE_SUFFIXES

@@ -5,12 +5,12 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..data.markers import Markers
 from ..data.rigid import RigidTransform, kabsch
 from ..energies.contact import MOTION, Contact
 from ..experiment.build import bound_markers, marker_view_of
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.mesh import surface_vertices
 from ..robot.inputs import BASE
@@ -19,7 +19,6 @@ from ..robot.robot import Robot
 from ..robot.state import RobotState
 from ..stepping.quantity import Quantity
 
-FloatArray = NDArray[np.float64]
 MATERIAL: Final = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
 _ROUNDING: Final = 1e-9  # Of times [s].
 _PATCH: Final = 0.06  # Radius of the surface patch that is grabbed, over the size of the body.

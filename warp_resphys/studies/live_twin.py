@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..robot.loading import recorded_trial, trial_names
@@ -19,7 +19,6 @@ from ..twin.scores import Forecast
 from ..twin.stream import Alignment, Listener, Packet, recorded_packets
 from ..twin.twin import JUMPS, Estimate, Twin
 
-FloatArray = NDArray[np.float64]
 _REMEMBERED: Final = 2000  # computing times
 _SHARE: Final = 4.0  # time between two predictions, over what one takes
 _LOST: Final = 5  # jumps of the whole body that hint at another frame or unit

@@ -12,7 +12,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.quality import (
@@ -33,8 +32,6 @@ from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, se
 from ..io.tables import aligned
 from ..report.figures import STYLE, TONES, new_figure, save_png
 from ..settings.trials import BagSettings, TableSettings
-
-FloatArray = NDArray[np.float64]
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.
 MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")

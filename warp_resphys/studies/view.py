@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError
 from ..io.settings import Count, Positive, Settings, Word, setting
 from ..io.tables import show
@@ -33,7 +34,6 @@ from .live_twin import LiveTwin, TwinSettings
 if TYPE_CHECKING:
     import viser
 
-FloatArray = NDArray[np.float64]
 _RATE: Final = 30.0  # Pictures a second, at most.
 _STATUS_EVERY: Final = 0.25  # [s]
 _HAND: Final = "hand"

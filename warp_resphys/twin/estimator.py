@@ -18,7 +18,7 @@ from typing import ClassVar, Final, Generic, TypeVar
 import numpy as np
 
 from ..control.estimate import conditioned
-from ..control.polynomials import BoolArray, FloatArray
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from ..robot.inputs import Given
 from ..robot.robot import Robot

@@ -15,10 +15,10 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
-from ..control.polynomials import FloatArray
 from ..energies.contact import Contact
 from ..energies.strings import PAYLOAD
 from ..energies.surfaces import SurfaceContact
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError, listed
 from ..learning.parameters import check_names, identifiable_parameters
 from ..robot.inputs import Given

@@ -7,9 +7,10 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..control.polynomials import FloatArray, Monomials
+from ..control.polynomials import Monomials
 from ..control.reduced import ReducedState
 from ..control.reduction import reduced_of
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.rollout import DIVERGENCE_DISTANCE
 from ..robot.inputs import Given, InputReader

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from ..control.polynomials import FloatArray
 from ..data.rigid_bodies import as_markers
+from ..io.arrays import FloatArray
 from ..robot.state import RobotState
 
 REMEMBERED: Final = 400  # predictions

@@ -13,10 +13,9 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 import torch
-from numpy.typing import NDArray
 
-from ..control.polynomials import FloatArray
 from ..energies.materials import VISCOUS
+from ..io.arrays import FloatArray, IntArray
 from ..robot.inputs import FORCE, Given, InputReader
 from ..robot.robot import Robot
 from ..robot.state import RobotState
@@ -146,7 +145,7 @@ def shifted(
 
 def _vibrations(
     robot: Robot, state: RobotState, inputs: Mapping[str, Given], modes: int
-) -> tuple[FloatArray, FloatArray, scipy.sparse.csc_array, NDArray[np.int64]]:
+) -> tuple[FloatArray, FloatArray, scipy.sparse.csc_array, IntArray]:
     """Eigenvalues (r,) [1/s^2], vectors (3 F, r), mass (3 F, 3 F) of the slowest vibrations; free vertices."""
     still = replace(state, body=State(state.q, torch.zeros_like(state.v), memory=state.body.memory))
     hessian, mass, free = robot.linearised(still, **inputs)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ..control.polynomials import FloatArray
+from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..robot.inputs import Given, InputReader
 from ..robot.robot import Robot

@@ -20,9 +20,10 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, ResphysError, did_you_mean
 from ...settings.trials import BagSettings
-from .recording import SI_PER_ACTUATION_UNIT, FloatArray, RawRecording
+from .recording import SI_PER_ACTUATION_UNIT, RawRecording
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
 _GAP = 2.5  # frames: a marker without messages for longer is not seen

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ...io.arrays import FloatArray, IntArray
 from ...io.errors import DataFileError
 from ...io.text import Rows, number
-from .recording import FloatArray, RawRecording
+from .recording import RawRecording
 
 log = logging.getLogger(__name__)
 
@@ -210,9 +210,7 @@ def is_data(row: Sequence[str]) -> bool:
     return len(row) >= 3 and begins and 2 * sum(number(cell) is not None for cell in filled) > len(filled)
 
 
-def _frames(
-    stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path
-) -> tuple[NDArray[np.int64], float | None]:
+def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -> tuple[IntArray, float | None]:
     """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
     known = np.abs(stamps) <= _LARGEST_STAMP
     steps = np.diff(np.where(known, stamps, np.nan))

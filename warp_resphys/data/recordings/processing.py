@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from ...io.arrays import FloatArray, IntArray
 from ...io.errors import DataFileError, InputError, listed
 from ..base_motion import at_times
-from .recording import FloatArray, Recording, bridged, runs
+from .recording import Recording, bridged, runs
 
 _FIRST_SECONDS = 0.2  # [s] latest start of a stretch after that of the first one
 _WHOLE = 1e-6  # Relative tolerance for a whole ratio of rates
@@ -289,7 +289,7 @@ def valve_opening(recording: Recording, followed: Sequence[str]) -> float:
     return float(np.clip(line[1], max(time[last] - _BEFORE / recording.rate, time[0]), time[last + 1]))
 
 
-def _root_line(time: FloatArray | NDArray[np.int64], travelled: FloatArray) -> tuple[float, float] | None:
+def _root_line(time: FloatArray | IntArray, travelled: FloatArray) -> tuple[float, float] | None:
     """Slope and zero of a line through the square roots of distances (T,) [m]; None where these do not grow.
 
     A body that starts from rest first moves by s = a (t - t0)^2 / 2, so that the zero is t0.

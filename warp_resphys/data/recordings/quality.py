@@ -9,9 +9,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.spatial.distance import cdist
 
+from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed, number_of
 from .processing import Release
-from .recording import FloatArray, Recording, bridged, runs
+from .recording import Recording, bridged, runs
 
 LEAST_JUMP = 2e-4  # [m]
 _MILLI = 1e3

@@ -8,21 +8,14 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ...io.arrays import FloatArray
 from ...io.decoding import Arrays, decode
 from ...io.errors import DataFileError, DecodingError, InputError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from ...io.text import decoded
 from ...settings.trials import BagSettings, TableSettings
 from .bag import SUFFIXES, is_bag, read_raw_bag, topics_of
-from .recording import (
-    SI_PER_ACTUATION_UNIT,
-    FloatArray,
-    RawRecording,
-    Recording,
-    hide_zeros,
-    to_recording,
-    without_subject,
-)
+from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, hide_zeros, to_recording, without_subject
 from .text import read_raw_text
 
 _KIND = "recording"

@@ -16,19 +16,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, did_you_mean, listed
 from ...io.text import Rows, number, read_rows
 from ...settings.trials import TableSettings
 from .columns import AXES, QUATERNION, Layout, Place, Turn, is_data, quaternions
-from .recording import (
-    METRES_PER_UNIT,
-    SI_PER_ACTUATION_UNIT,
-    FloatArray,
-    RawRecording,
-    hide_zeros,
-    length_unit,
-    without_subject,
-)
+from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, RawRecording, hide_zeros, length_unit, without_subject
 
 log = logging.getLogger(__name__)
 

@@ -4,11 +4,11 @@ import numpy as np
 import scipy.ndimage
 import shapely
 import torch
-from numpy.typing import NDArray
 from PIL import Image
 
 from ...data.camera import PlacedCamera
 from ...data.markers import bind_markers
+from ...io.arrays import BoolArray, FloatArray
 from ...io.atomic import atomic_path
 from ...io.files import write_json
 from ...io.stages import StageContext
@@ -18,8 +18,6 @@ from ...settings.pictures import PictureData, PoseSettings, SimulatedCamera
 from ...settings.stages import StageSettings
 from ..build import build_body, build_simulator
 from .seen_poses import read_lenses, released_force, scene_file
-
-FloatArray = NDArray[np.float64]
 
 _BODY, _BEHIND = (46, 96, 140), (24, 24, 26)  # red, green and blue of the pictures
 _THIN = 1e-9  # px^2, of a triangle that is seen from the side
@@ -117,9 +115,7 @@ def depth_image(corners: FloatArray, depths: FloatArray, size: tuple[int, int]) 
     return np.divide(1.0, closeness, out=np.zeros_like(closeness), where=closeness > 0.0)
 
 
-def noisy_mask(
-    region: shapely.Geometry, size: tuple[int, int], noise: float, random: np.random.Generator
-) -> NDArray[np.bool_]:
+def noisy_mask(region: shapely.Geometry, size: tuple[int, int], noise: float, random: np.random.Generator) -> BoolArray:
     """Returns a mask (H, W) of a region [px] whose border is moved across itself by correlated noise [px]."""
     area = shapely.Polygon()
     for part in shapely.get_parts(region):

@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...data.actuation import NO_INPUT
 from ...data.base_motion import at_times, check_steps
@@ -19,6 +18,7 @@ from ...data.recordings.processing import smooth
 from ...data.recordings.quality import quality
 from ...data.rigid import root_mean_square
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
+from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, number_of
 from ...io.files import write_json
 from ...io.stages import StageContext
@@ -31,7 +31,6 @@ from .reading import vertical
 
 log = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
 
 _LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
 _SHOWN = 6  # driven trials whose quality and registration are reported

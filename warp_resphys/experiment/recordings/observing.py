@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...data.actuation import NO_INPUT, check_inputs
 from ...data.base_motion import followed, in_frame, prescribed, rigid
@@ -17,6 +16,7 @@ from ...data.recordings.quality import check_base, check_motion
 from ...data.recordings.recording import Recording
 from ...data.registration import Registration, register_markers
 from ...data.rigid_bodies import corners_of, owners
+from ...io.arrays import BoolArray, FloatArray
 from ...io.errors import DataFileError, listed
 from ...settings.trials import MotionSettings, Trial
 from ..actuators import Drive
@@ -25,7 +25,6 @@ from .reading import POSE_SECONDS, Reader, central_places
 
 log = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
 
 _LEAST_RATE = 40.0  # Hz; the release is estimated from the first tenth of a second, i.e. at least four frames
 _MILLI = 1e3
@@ -277,7 +276,7 @@ class Observer(Reader):
         observed = Observed(*fields, shows_places=unloaded)
         return observed if static else self._with_motions(observed, recording)
 
-    def _is_at_rest(self, driven: FloatArray) -> NDArray[np.bool_]:
+    def _is_at_rest(self, driven: FloatArray) -> BoolArray:
         """(T,) whether inputs (T, C) are zero up to the noise of a gauge."""
         return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * (self.data.input_limit or np.inf))
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...data.marker_view import MarkerView
 from ...data.obstacle_motion import recorded
@@ -14,6 +13,7 @@ from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording
 from ...data.registration import assign, axes_rotation
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
+from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed
 from ...io.stages import StageContext
 from ...settings.stages import StageSettings
@@ -25,7 +25,6 @@ from ..files import STATIC, payload_inputs
 
 log = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
 
 POSE_SECONDS = 0.2  # at the end of a recording, from which a static pose is read
 _HELD_SECONDS = 0.1  # at the beginning of a recording, while a body is held

@@ -48,11 +48,8 @@ def vector(*values):
 
 def measured(obstacle, x):
     """Distances (P,) and normals (P, 3) of positions (P, 3)."""
-    return (value[0, :, 0] for value in ObstacleSet((obstacle,), D, CPU).distances(x[None], pose_of(obstacle)))
-
-
-def pose_of(obstacle):
-    return Pose(vector(obstacle.position)[None], torch.as_tensor(obstacle.turn)[None, None], torch.zeros(1, 1).double())
+    pose = Pose(vector(obstacle.position)[None], torch.as_tensor(obstacle.turn)[None, None], vector([0.0]))
+    return (value[0, :, 0] for value in ObstacleSet((obstacle,), D, CPU).distances(x[None], pose))
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -38,12 +38,6 @@ def exact(spacing=2e-3, **pose):
     )
 
 
-def around(seed=0, count=200):
-    ways = np.random.default_rng(seed).normal(size=(1, count, 3))
-    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
-    return torch.as_tensor(ways * (RADIUS + np.linspace(1e-4, 2e-3, count)[:, None]))
-
-
 def measured(grid, x):
     pose = Pose(torch.zeros(1, 1, 3).double(), torch.eye(3).double()[None, None], torch.zeros(1, 1).double())
     d, n = ObstacleSet((grid,), 1e-3, CPU).distances(x, pose)
@@ -51,7 +45,9 @@ def measured(grid, x):
 
 
 def test_interpolated_distances_converge_with_the_fourth_power_of_the_spacing():
-    x, errors = around(), []
+    ways, errors = np.random.default_rng(0).normal(size=(1, 200, 3)), []
+    ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
+    x = torch.as_tensor(ways * (RADIUS + np.linspace(1e-4, 2e-3, 200)[:, None]))
     for spacing in (4e-3, 2e-3):
         d, n = measured(exact(spacing), x)
         radius = x.norm(dim=-1)
@@ -74,12 +70,8 @@ def test_outside_of_the_grid_its_distance_is_added_to_the_least_one_at_its_bound
 
 
 def ring(**pose):
-    surface = torus()
+    surface = trimesh.creation.torus(RING, TUBE, major_sections=48, minor_sections=24)
     return DistanceGrid.of_surface(surface.vertices, surface.faces, 1e-3, **pose)
-
-
-def torus():
-    return trimesh.creation.torus(RING, TUBE, major_sections=48, minor_sections=24)
 
 
 def test_no_slope_is_larger_than_the_bound_of_slopes():
@@ -168,7 +160,6 @@ def test_gradients_of_a_block_that_slides_over_a_ring():
         ({"distances": np.zeros((4, 4, 4))}, "8 nodes or more"),
         ({"distances": -np.ones((9, 9, 9))}, "end outside of the shape"),
         ({"spacing": 0.0}, "spacing"),
-        ({"low": (0.0, 0.0)}, "DistanceGrid.low is .* three finite numbers"),
         ({"low": (0.0, math.nan, 0.0)}, "DistanceGrid.low is .* three finite numbers"),
     ],
 )

@@ -95,10 +95,6 @@ def reference_unimodular(f):
     return u * np.exp([best[0], best[1], -best.sum()]) @ vt
 
 
-def cofactor(f):
-    return np.stack([np.cross(f[1], f[2]), np.cross(f[2], f[0]), np.cross(f[0], f[1])])
-
-
 def reference_energy(f, model):
     if model == "corotated":
         _, s, _ = signed_svd(f)
@@ -106,7 +102,8 @@ def reference_energy(f, model):
     j = np.linalg.det(f)
     if model == "mooney_rivlin":  # with c10 = c01
         first = (f**2).sum() - 3 - 2 * (j - 1) + (j - 1) ** 2
-        return SHAPE * (first + (cofactor(f) ** 2).sum() - 3 - 4 * (j - 1)) + VOLUME / 2 * (j - 1) ** 2
+        cofactor = np.stack([np.cross(f[1], f[2]), np.cross(f[2], f[0]), np.cross(f[0], f[1])])
+        return SHAPE * (first + (cofactor**2).sum() - 3 - 4 * (j - 1)) + VOLUME / 2 * (j - 1) ** 2
     return SHAPE * (((f**2).sum() - 3) / 2 - (j - 1) + (j - 1) ** 2 / 2) + VOLUME / 2 * (j - 1) ** 2
 
 

@@ -31,16 +31,12 @@ ALONG = (2.0, 0.0, 0.0)  # of any length
 TIGHT = SolverSettings("newton", relative_tolerance=1e-11)
 
 
-def centres(mesh):
-    return mesh.vertices[mesh.cells].mean(axis=1)
-
-
 def whole(mesh):
     return Muscle(np.arange(len(mesh.cells)), ALONG)
 
 
 def upper(mesh):
-    return Muscle(np.flatnonzero(centres(mesh)[:, 2] > SIZE[2] / 2), ALONG, "upper")
+    return Muscle(np.flatnonzero(mesh.vertices[mesh.cells].mean(axis=1)[:, 2] > SIZE[2] / 2), ALONG, "upper")
 
 
 def simulator(*muscles, mesh=BEAM, ratio=0.0, solver=TIGHT, **more):

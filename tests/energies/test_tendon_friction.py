@@ -59,10 +59,6 @@ def test_the_tension_of_a_hard_body_is_the_play_of_a_capstan():
         np.testing.assert_allclose(segments(state), [*at, 1.0, 1.0], rtol=1e-4)
 
 
-def contraction(*metres):
-    return Inputs(tendon_contraction=torch.tensor([metres], dtype=torch.float64))
-
-
 def test_at_rest_the_tension_falls_by_the_angles_of_the_pose():
     """The forces on the vertices of the solution are those of segments with Euler's tensions."""
     pull, entry = 5.0, 0.7
@@ -85,7 +81,7 @@ def test_at_rest_the_tension_falls_by_the_angles_of_the_pose():
     np.testing.assert_allclose(split.static_equilibrium(tension(*tensions)).q, q, atol=5e-6)
 
 
-@pytest.mark.parametrize(("acting", "forgets"), [(tension(2.0), True), (contraction(6e-3), False)])
+@pytest.mark.parametrize(("acting", "forgets"), [(tension(2.0), True), (Inputs(tendon_contraction=6e-3), False)])
 def test_a_step_from_rest_holds_the_pose(acting, forgets):
     """Also where an environment is reset, whose memory is zero."""
     s = simulator(STRAIGHT, entry_angle=0.3, stiffness=400.0)

@@ -148,14 +148,11 @@ def posed(observe, noise=0.0, seed=0, truth=TRUTH):
 ACCURACY = Accuracy(2e-3, 2e-3, 0.03)
 
 
-def identifier(pair, bounds=RANGES, accuracy=ACCURACY):
-    return ParameterSearch(Misfit([pair], bounds, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist()))
-
-
 def test_the_modulus_is_recovered_from_misplaced_markers():
     pair = posed(PlacedMarkers.of(bind(), ASKEW), noise=1e-5)
     naive = ParameterSearch(Misfit([pair], RANGES)).run([{"youngs_modulus": 4e5}], 30)
-    result = identifier(pair).run([{"youngs_modulus": 4e5}], 30)
+    search = ParameterSearch(Misfit([pair], RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist()))
+    result = search.run([{"youngs_modulus": 4e5}], 30)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
     assert abs(naive.parameters["youngs_modulus"] - 215e3) > 3.0 * abs(result.parameters["youngs_modulus"] - 215e3)
     assert result.placement["offsets"].keys() == set(LABELS)

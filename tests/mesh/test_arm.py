@@ -1,3 +1,4 @@
+import itertools
 import re
 import sys
 from importlib import resources
@@ -34,15 +35,11 @@ def volume(mesh, faces):
     return np.linalg.det(mesh.vertices[face_triangles(faces)]).sum() / 6.0
 
 
-def frustum(first, last, length):
-    """Volume between two similar sections of these areas."""
-    return length / 3.0 * (first + last + np.sqrt(first * last))
-
-
 def sopra_chambers():
     """Volumes of its chambers: half discs of radii 14 to 9.5 mm and 9.5 to 6.5 mm, 120 mm long."""
     areas = [pi / 2.0 * r**2 for r in (0.014, 0.0095, 0.0065)]
-    return [frustum(areas[i], areas[i + 1], 0.120) for i in (0, 0, 0, 1, 1, 1)]
+    frusta = [0.120 / 3.0 * (a + b + np.sqrt(a * b)) for a, b in itertools.pairwise(areas)]
+    return np.repeat(frusta, 3)
 
 
 def sopra_silicone():

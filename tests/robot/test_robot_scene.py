@@ -103,29 +103,41 @@ def test_gradient_of_a_push_through_contact():
     assert float(slope) == pytest.approx(expected, rel=1e-5)
 
 
-def test_what_does_not_fit_is_refused(finished):
+@pytest.mark.parametrize(
+    ("robots", "more", "message"),
+    [
+        ({"one": AWAY, "two": (0.0, 0.5, 0.0, np.pi, 0.0, 0.0)}, (), "gravity of one is"),
+        ({"one": "abc"}, (), "pose of one is 'abc'"),
+        ({"one": (0.0, 0.0, 0.1)}, (), "pose of one is"),
+        ({"one": AWAY}, ({"one": (Body(box_hexahedra()), Corotated())},), "a robot and an object"),
+        ({}, (), "no robot"),
+        (
+            {"one": AWAY, "two": AWAY},
+            ({}, CONTACT),
+            r"surfaces cross at rest: an edge at vertex \d+ in 'one' .* in 'two'",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(robots, more, message):
     robot = beam()
-    with pytest.raises(InputError, match="gravity of one is"):
-        RobotScene({"one": (robot, AWAY), "two": (robot, (0.0, 0.5, 0.0, np.pi, 0.0, 0.0))})
-    with pytest.raises(InputError, match="pose of one is 'abc'"):
-        RobotScene({"one": (robot, "abc")})
-    with pytest.raises(InputError, match="give a robot and its pose"):
-        RobotScene({"one": robot})
-    with pytest.raises(InputError, match="a robot and an object"):
-        RobotScene({"one": (robot, AWAY)}, {"one": (Body(box_hexahedra()), Corotated())})
-    with pytest.raises(InputError, match="no robot"):
-        RobotScene({})
-    with pytest.raises(InputError, match="pose of one is"):
-        RobotScene({"one": (robot, (0.0, 0.0, 0.1))})
-    with pytest.raises(InputError, match="only a network"):
-        RobotScene({"one": (warp_resphys.load(finished[0], "simfree"), AWAY)})
-    with pytest.raises(InputError, match="one time step and integrator, these have one 10 ms and bdf2, two 5 ms"):
-        RobotScene({"one": (robot, AWAY), "two": (beam("time_step=0.005"), POSE)})
-    scene = RobotScene({"one": (robot, AWAY)})
+    with pytest.raises(InputError, match=message):
+        RobotScene({name: (robot, pose) for name, pose in robots.items()}, *more)
+
+
+def test_robots_that_do_not_fit_are_refused(finished):
+    robot = beam()
+    for robots, message in (
+        ({"one": robot}, "give a robot and its pose"),
+        ({"one": (warp_resphys.load(finished[0], "simfree"), AWAY)}, "only a network"),
+        (
+            {"one": (robot, AWAY), "two": (beam("time_step=0.005"), POSE)},
+            "one time step and integrator, these have one 10 ms and bdf2, two 5 ms",
+        ),
+    ):
+        with pytest.raises(InputError, match=message):
+            RobotScene(robots)
     with pytest.raises(InputError, match="no robot 'hand' in the scene: it has one"):
-        scene.begin(inputs={"hand": {}})
-    with pytest.raises(InputError, match=r"surfaces cross at rest: an edge at vertex \d+ in 'one' .* in 'two'"):
-        RobotScene({"one": (robot, AWAY), "two": (robot, AWAY)}, {}, CONTACT)
+        RobotScene({"one": (robot, AWAY)}).begin(inputs={"hand": {}})
 
 
 LAW = {"c10": 30e3, "ogden_3": 20e3, "bulk_1": 4e6, "prony_modulus_1": 1e4, "prony_time_1": 0.05, "density": 1000.0}

@@ -24,6 +24,7 @@ from ..fem.body import Body
 from ..io.arrays import FloatArray
 from ..io.errors import warn
 from ..mesh.elements import BY_NODES
+from ..mesh.quality import is_one_cell_thick
 from .plausibility import mean_of
 
 NOTICED: Final = 0.07  # change of the deflection
@@ -60,16 +61,16 @@ def warn_of_cells(
         energies = sum(regions.values(), np.zeros(4))
         if not energies[0] > _LEAST**2 * energies[3]:
             continue
-        change, worst = _change(energies), max(regions, key=lambda key: float(regions[key][1]))
-        if abs(change) < NOTICED:
+        if abs(change := _change(energies)) < NOTICED:
             continue
         kind = "tetrahedra" if own.mesh.element.is_simplex else "hexahedra"
-        by = f"at least {change:.0%} more" if change > 0.0 else f"about {-change:.0%} less"
-        where = f", mostly due to its region {worst!r}" if worst and change > 0.0 else ""
+        by = f"at least {100.0 * change:.0f} % more" if change > 0.0 else f"about {-100.0 * change:.0f} % less"
+        thin = [region for region in regions if region and is_one_cell_thick(own.mesh, own.mesh.region(region))]
+        where = f", with its region {thin[0]!r} of one cell through the thickness" if thin else ""
         warn(
-            f"the linear {kind} of {f'the body {name!r}' if name else 'the body'} are too coarse for its equilibrium: "
-            f"with finer or quadratic ones it would deform by {by.replace('%', ' %')}{where} (estimated from jumps of "
-            "the strain between cells); take smaller cells, or quadratic(mesh), which is mesh.order=2 in a "
+            f"the linear {kind} of {f'the body {name!r}' if name else 'the body'}{where} are too coarse for its "
+            f"equilibrium: with finer or quadratic ones it would deform by {by} (estimated from jumps "
+            "of the strain between cells); take smaller cells, or quadratic(mesh), which is mesh.order=2 in a "
             "configuration."
         )
         warned = True

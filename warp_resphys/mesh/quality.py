@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ..io.arrays import FloatArray
+from ..io.arrays import FloatArray, IntArray
 from .elements import ELEMENTS
-from .mesh import Mesh
+from .mesh import Mesh, boundary_faces
 
 
 def scaled_jacobian(mesh: Mesh) -> FloatArray:
@@ -32,3 +32,9 @@ def cell_volumes(mesh: Mesh) -> FloatArray:
     points, weights = mesh.element.rule
     jacobians = np.einsum("qki,mkj->mqij", mesh.element.shape(points)[1], mesh.vertices[mesh.cells])
     return np.asarray(np.linalg.det(jacobians) @ weights)
+
+
+def is_one_cell_thick(mesh: Mesh, cells: IntArray) -> bool:
+    """Returns whether every vertex of some cells is on their surface."""
+    surface = boundary_faces(Mesh(mesh.vertices, mesh.cells[cells]))
+    return len(np.unique(surface)) == len(np.unique(mesh.cells[cells]))

@@ -22,7 +22,7 @@ from ..mesh.arm import name_surfaces
 from ..mesh.cavities import open_cavities
 from ..mesh.chambers import find_chambers
 from ..mesh.mesh import Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
-from ..mesh.quality import cell_volumes, scaled_jacobian
+from ..mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..mesh.tetrahedra import SURFACE_SUFFIXES
 from ..report.body_picture import MeshSummary, draw_mesh
@@ -134,7 +134,7 @@ def inspect_mesh(
     rows.append(("open cavities", _cavities(mesh)))
     if not mesh.element.parents:
         rows.append(("quadratic cells", _quadratic_cells(mesh, place)))
-        if thin := [name for name, cells in mesh.regions.items() if _is_one_cell_thick(mesh, cells)]:
+        if thin := [name for name, cells in mesh.regions.items() if is_one_cell_thick(mesh, cells)]:
             rows.append(("one cell thick", f"{', '.join(thin)}: if stiffer than the rest, take quadratic cells"))
     if file is not None:
         if isinstance(settings, GeneratedArm):
@@ -185,13 +185,6 @@ def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
 def _spans_area(points: FloatArray) -> bool:
     """Whether three points of (n, 3) are not in a line, by which a body that is held there cannot turn."""
     return len(points) > 2 and bool(np.linalg.svd(points - points.mean(axis=0))[1][1] > 1e-9)
-
-
-def _is_one_cell_thick(mesh: Mesh, cells: IntArray) -> bool:
-    """Whether every vertex of a region is on its surface."""
-    return len(np.unique(boundary_triangles(Mesh(mesh.vertices, mesh.cells[cells])))) == len(
-        np.unique(mesh.cells[cells])
-    )
 
 
 def _cavities(mesh: Mesh) -> str:

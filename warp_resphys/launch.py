@@ -97,6 +97,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             raise
 
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # It tells of its list of fonts.
     before = sys.argv
     format_warning = warnings.formatwarning
     raise_exceptions = logging.raiseExceptions

@@ -4,13 +4,13 @@ The configuration determines the stages. The settings of a stage are exactly wha
 """
 
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-import warp as wp
 
 from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
@@ -62,6 +62,7 @@ from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
+from .io.kernel_cache import start_quietly
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
 from .io.tables import show
 from .learning.metrics import summarise_folds
@@ -79,6 +80,8 @@ log = logging.getLogger(__name__)
 _SHORT = 60  # characters of advice beside which the path of the report is printed
 
 Work = Callable[[StageContext], None]
+
+_MOST_THREADS = 4  # that share the trials of a batch, as Python's part of a step runs in one at a time
 
 
 def files_read(run: RunSettings, *bodies: BodySettings | None) -> dict[str, str]:
@@ -271,7 +274,8 @@ def prepare(run: RunSettings) -> None:
     Raises:
         InputError: values that do not match the mesh or the trials.
     """
-    wp.config.log_level = wp.LOG_WARNING
+    start_quietly()
+    os.environ.setdefault("WARP_RESPHYS_THREADS", str(min(torch.get_num_threads(), _MOST_THREADS)))
     if run.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are too small for several threads (linalg/threads.py).
     if run.pictures is None:

@@ -11,7 +11,7 @@ from rich.console import Console
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import write_json
 from warp_resphys.io.memory import peak_memory_gib
-from warp_resphys.io.progress import Progress
+from warp_resphys.io.progress import Progress, one_line
 from warp_resphys.io.stages import (
     Stage,
     StageContext,
@@ -84,7 +84,12 @@ class TestSkipping:
         assert seconds.keys() == experiment.settings.keys()
         assert experiment.run() == []
         assert experiment.seconds == seconds
-        assert [r.message for r in caplog.records[-3:]] == [f"{name}: up to date" for name in experiment.settings]
+        lines = [r.message.split() for r in caplog.records]
+        assert lines == [
+            ["generate", "0", "s"],
+            ["Training", "the", "force", "0", "s"],
+            ["Writing", "the", "report", "0", "s"],
+        ]
         record = json.loads((experiment.run_dir / "stages" / "train.json").read_text())
         assert record["settings"] == {"epochs": 5}
         assert record["versions"]["h5py"]
@@ -218,9 +223,9 @@ class TestProgress:
                 clock[0] += 0.5
                 bar.advance(loss=0.0012345, rate="slow")
         assert stream.getvalue().splitlines() == [
-            "train: 60/100 epochs, 2 epochs/s, 0:20 left, loss 0.00123, rate slow",
-            "train: 80/100 epochs, 2 epochs/s, 0:10 left, loss 0.00123, rate slow",
-            "train: 100/100 epochs, 2 epochs/s, in 0:30, loss 0.00123, rate slow",
+            "Training the force: 60/100 epochs, 0:20 left, loss 0.00123, rate slow",
+            "Training the force: 80/100 epochs, 0:10 left, loss 0.00123, rate slow",
+            "Training the force: 100/100 epochs, in 30 s, loss 0.00123, rate slow",
         ]
 
     def test_the_time_left_does_not_count_a_slow_start(self, clock):
@@ -231,9 +236,21 @@ class TestProgress:
                 clock[0] += 60.0 if number == 0 else 1.0
                 bar.advance()
         lines = stream.getvalue().splitlines()
-        assert lines[0] == "evaluate: 1/101 frames, 1:00 each, 1:40:00 left"
-        assert lines[1] == "evaluate: 11/101 frames, 1 frames/s, 1:30 left"
-        assert lines[-1] == "evaluate: 41/101 frames, 1 frames/s, 1:00 left"
+        assert lines[0] == "Simulating the test trials: 1/101 frames"
+        assert lines[1] == "Simulating the test trials: 11/101 frames, 1:30 left"
+        assert lines[-1] == "Simulating the test trials: 41/101 frames, 1:00 left"
+
+    @pytest.mark.parametrize("terminal", [True, False])
+    def test_a_stage_ends_with_one_line_for_its_loops(self, clock, terminal):
+        stream = io.StringIO()
+        console = Console(file=stream, force_terminal=terminal, width=120)
+        with one_line("reconstruct_resphys") as line:
+            for unit in ("frames", "evaluations at most"):
+                with Progress("reconstruct_resphys", 1650, unit, console=console) as bar:
+                    clock[0] += 2.5
+                    bar.advance(1650)
+            assert " ".join(line(5.0).split()) == "Reconstructing the missing forces 1,650 frames 5 s"
+        assert ("1650/1650 frames" in stream.getvalue()) is terminal
 
     @pytest.mark.parametrize("terminal", [True, False])
     def test_mostly_short_work_is_quiet_until_it_takes_long(self, clock, terminal):
@@ -246,7 +263,7 @@ class TestProgress:
                     bar.advance()
             assert ("equilibrium" in stream.getvalue()) is shown
         if not terminal:
-            assert stream.getvalue() == "equilibrium: 3/9 iterations at most, 1.5 s each, in 0:04\n"
+            assert stream.getvalue() == "equilibrium: iteration 3 (limit 9), in 4 s\n"
 
     @pytest.mark.parametrize(("terminal", "most"), [(True, 201), (False, 2)], ids=["terminal", "log"])
     def test_most_calls_only_count(self, clock, terminal, most):

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import warp as wp
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
 from .errors import InputError, ResphysError, ResphysWarning
+from .kernel_cache import start_quietly
 from .progress import be_quiet
 
 log = logging.getLogger(__name__)
@@ -139,15 +139,8 @@ def _begin_work() -> None:
     """Prepares a worker process: one thread of torch, and no warnings that the parent process has shown."""
     warnings.simplefilter("ignore", ResphysWarning)
     torch.set_num_threads(1)
-    wp.config.log_level = wp.LOG_WARNING
-    shown = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)  # Its library writes them itself.
-        wp.init()
-    finally:
-        os.dup2(shown, 2)
-        os.close(shown)
+    os.environ["WARP_RESPHYS_THREADS"] = "1"
+    start_quietly()
 
 
 @contextmanager

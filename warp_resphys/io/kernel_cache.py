@@ -7,9 +7,26 @@ import sys
 import tempfile
 from pathlib import Path
 
+import torch
 import warp as wp
 
 from .errors import InputError
+
+
+def start_quietly() -> None:
+    """Initialises Warp without a message of its library on a machine without an NVIDIA driver."""
+    wp.config.log_level = wp.LOG_WARNING
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    shown = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)  # The library writes to it itself.
+        wp.init()
+    finally:
+        os.dup2(shown, 2)
+        os.close(shown)
 
 
 def ensure_kernel_cache() -> None:

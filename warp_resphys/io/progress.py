@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
+from typing import Any, Final
 
 from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn
@@ -14,9 +17,52 @@ from rich.progress import Progress as Bars
 QUIET_SECONDS = 2.0  # for ``after`` of work that is mostly short
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 10.0
+_SURE_CALLS, _SURE_SECONDS = 8, 20.0  # of which one is done before an estimate is shown
 _AT_MOST = " at most"  # of units of work that may end early
 _shown = True
 _running: list[Progress] = []  # innermost last; a terminal has room for one bar
+_done: list[str] = []  # work of the loops of a stage that is running, which ends with one line for all of them
+_in_stage = False
+_TITLES: Final = {  # of stages, by the first word of their names, and of single ones
+    "simulate": "Simulating the trials",
+    "laboratory": "Simulating the recordings",
+    "import": "Reading the recordings",
+    "identify": "Identifying the parameters",
+    "identify_law": "Identifying the law of the material",
+    "shapes": "Simulating other bodies",
+    "reconstruct": "Reconstructing the missing forces",
+    "train": "Training the force",
+    "train_simfree": "Training a network without a simulator",
+    "evaluate": "Simulating the test trials",
+    "time": "Timing the models",
+    "mesh_check": "Estimating the error of the mesh",
+    "reduce": "Fitting the reduced model",
+    "plan": "Planning the motions",
+    "baselines": "Fitting the controllers",
+    "drive": "Driving the robot",
+    "report": "Writing the report",
+}
+
+
+def title_of(stage: str) -> str:
+    """Returns what a stage does, in words; a name that is no stage unchanged."""
+    return _TITLES.get(stage) or _TITLES.get(stage.partition("_")[0], stage)
+
+
+@contextmanager
+def one_line(stage: str) -> Iterator[Callable[[float], str]]:
+    """Shows the loops of a stage without lines at their ends; the yielded function makes that of the stage.
+
+    Args:
+        stage: its name.
+    """
+    global _in_stage
+    before, _in_stage = _in_stage, True
+    _done.clear()
+    try:
+        yield lambda seconds: f"{title_of(stage):<42}{(_done or [''])[-1]:<16}{duration(seconds)}".rstrip()
+    finally:
+        _in_stage = before
 
 
 def be_quiet() -> None:
@@ -32,7 +78,7 @@ class Progress:
     a terminal (log files, continuous integration), it prints a line at most every ten seconds, and one at the end.
 
     Args:
-        description: Name of the computation.
+        description: Name of the computation, or of the stage.
         total: Total number of units.
         unit: Name of the units, in the plural.
         start_at: Number of units done by an interrupted run; they do not count for the rate.
@@ -52,7 +98,8 @@ class Progress:
     ) -> None:
         self._after, self._ended = after, False
         self.description, self.total, self.unit, self.done = description, total, unit, start_at
-        self._start_at, self._shown = start_at, -1
+        self._title = title_of(description)
+        self._start_at, self._shown, self._calls = start_at, -1, 0
         self.console = Console(stderr=True, quiet=not _shown) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
@@ -74,9 +121,10 @@ class Progress:
 
     def _start_bar(self) -> None:
         columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[status]}")
-        self._bars = Bars(*columns, console=self.console, refresh_per_second=5, redirect_stdout=sys.stdout.isatty())
+        options: dict[str, Any] = {"refresh_per_second": 5, "redirect_stdout": sys.stdout.isatty()}
+        self._bars = Bars(*columns, console=self.console, transient=_in_stage, **options)
         self._bars.start()
-        self._task = self._bars.add_task(self.description, total=self.total, completed=self.done, status=self.status())
+        self._task = self._bars.add_task(self._title, total=self.total, completed=self.done, status=self.status())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -85,7 +133,9 @@ class Progress:
         now, self._ended = time.perf_counter(), kind is None and self.unit.endswith(_AT_MOST)
         _running.remove(self)
         waited = not self._after or (self._next < math.inf and now >= self._start + self._after)
-        if self._bars is not None or (waited and self.done != self._shown):
+        if not self._after and len(_running) == 0 and not self.unit.endswith(_AT_MOST):
+            _done.append(f"{self.total:,} {self.unit}")
+        if self._bars is not None or (waited and self.done != self._shown and not _in_stage):
             self._show(now)
         if self._bars is not None:
             self._bars.stop()
@@ -93,6 +143,7 @@ class Progress:
     def advance(self, count: int = 1, **fields: object) -> None:
         """Counts further units; `fields` are named values to show, such as a loss."""
         self.done += count
+        self._calls += 1
         if fields:
             self._fields = fields
         now, new = time.perf_counter(), self.done - self._start_at
@@ -102,19 +153,21 @@ class Progress:
             self._show(now)
 
     def status(self) -> str:
-        """Count, rate, remaining time and latest values in one line.
+        """Count, remaining time and latest values in one line.
 
-        The rate is that of the later units, as the first ones wait for kernels to be compiled or processes to start.
+        The time left follows from the later units, as the first ones wait for kernels to be compiled or processes to
+        start; it is not shown before some of them are done, nor for work that may end early.
         """
         now, new = time.perf_counter(), self.done - self._start_at
-        elapsed, (since, before) = now - self._start, self._marks[0]
-        parts = [f"{self.done}/{self.total} {self.unit}"]
-        if new > before and now > since:
-            rate = (new - before) / (now - since)
-            duration = f"{1 / rate:.3g} s" if rate > 1 / 60 else clock(1 / rate)
-            parts.append(f"{rate:.3g} {self.unit.removesuffix(_AT_MOST)}/s" if rate >= 1 else f"{duration} each")
-            left = (self.total - self.done) / rate
-            parts.append(f"{clock(left)} left" if left > 0 and not self._ended else f"in {clock(elapsed)}")
+        since, before = self._marks[0]
+        at_most = self.unit.endswith(_AT_MOST)
+        unit = self.unit.removesuffix(_AT_MOST)
+        parts = [f"{unit.removesuffix('s')} {self.done} (limit {self.total})"] if at_most else []
+        parts = parts or [f"{self.done}/{self.total} {unit}"]
+        if self._ended or self.done >= self.total:
+            parts.append(f"in {duration(now - self._start)}")
+        elif new > before > 0 and (self._calls >= _SURE_CALLS or now > since + _SURE_SECONDS) and not at_most:
+            parts.append(f"{clock((self.total - self.done) * (now - since) / (new - before))} left")
         for name, value in self._fields.items():
             parts.append(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}")
         return ", ".join(parts)
@@ -127,8 +180,13 @@ class Progress:
             self._bars.update(self._task, completed=self.done, status=self.status())
             self._next = now + _BAR_SECONDS
         else:
-            self.console.print(f"{self.description}: {self.status()}", markup=False, highlight=False, soft_wrap=True)
+            self.console.print(f"{self._title}: {self.status()}", markup=False, highlight=False, soft_wrap=True)
             self._next = now + _LINE_SECONDS
+
+
+def duration(seconds: float) -> str:
+    """Formats a duration as "5 s", or as minutes:seconds from a minute on."""
+    return f"{max(seconds, 0.0):.0f} s" if seconds < 59.5 else clock(seconds)
 
 
 def clock(seconds: float) -> str:

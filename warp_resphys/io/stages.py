@@ -27,6 +27,7 @@ from .classes import check_packages
 from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, read_json, to_plain, write_json
 from .memory import peak_memory_gib
+from .progress import one_line
 from .settings import packages_of
 
 log = logging.getLogger(__name__)
@@ -102,9 +103,8 @@ def run_stages(
         for stage, context in _contexts(stages, Path(run_dir)):
             try:
                 took, state = _earlier(stage, context)
-                if state:
-                    expected = state in (_VALID, _CHANGED)
-                    log.log(logging.INFO if expected else logging.WARNING, "%s: %s", stage.name, state)
+                if state not in ("", _VALID, _CHANGED):
+                    log.warning("%s: %s", stage.name, state)
                 seconds[stage.name] = _run_stage(stage, context) if took is None else took
             except KeyboardInterrupt as error:
                 kept = f"finished and kept: {', '.join(seconds)}; " if seconds else ""
@@ -150,18 +150,18 @@ def _run_stage(stage: Stage, context: StageContext) -> float:
     interrupted = _record(context.run_dir, stage.name).with_suffix(".interrupted.json")
     before = read_json(interrupted) if interrupted.is_file() else {}
     seconds = float(before["seconds"]) if before.get("fingerprint") == context.fingerprint else 0.0
-    log.info("%s: %s", stage.name, f"resumed after {seconds:.0f} s" if seconds else "started")
     start = time.perf_counter() - seconds
     try:
-        stage.function(context)
-        seconds = time.perf_counter() - start
-        _write_record(stage, context, seconds)
+        with one_line(stage.name) as line:
+            stage.function(context)
+            seconds = time.perf_counter() - start
+            _write_record(stage, context, seconds)
+            log.info("%s", line(seconds))
     except (Exception, KeyboardInterrupt):
         with suppress(DataFileError):  # A full disk must not hide the error itself.
             write_json(interrupted, {"fingerprint": context.fingerprint, "seconds": time.perf_counter() - start})
         raise
     interrupted.unlink(missing_ok=True)
-    log.info("%s: done in %.1f s", stage.name, seconds)
     return seconds
 
 

@@ -278,7 +278,7 @@ def write_page(
         settings=list(flatten(run.plain())),
     )
     write_text(path, page)
-    _LOG.info("report written: %s", path)
+    _LOG.debug("report written: %s", path)
 
 
 def _times(metrics: Mapping[str, Any]) -> Iterator[Part]:

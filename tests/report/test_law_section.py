@@ -12,9 +12,8 @@ from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
 from warp_resphys.energies.materials import ConvexMaterial
 from warp_resphys.io.files import read_json, write_json
-from warp_resphys.report.data import grouped_errors
 from warp_resphys.report.law_section import drawn_stretches, law_text, not_needed_text, outside_text, wording
-from warp_resphys.report.page import number_text, percent_text
+from warp_resphys.report.page import number_text
 from warp_resphys.report.run_page import range_texts
 from warp_resphys.report.uniaxial import ACROSS, ALONG, small_strain, small_strain_of, uniaxial_stress
 from warp_resphys.settings.body import MaterialSettings
@@ -109,21 +108,8 @@ def test_terms_that_the_law_does_not_have_are_named():
     assert wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
 
 
-def test_errors_by_load_and_multiples():
-    rows = [("50 g", 1.0, 0.01), ("70 g", 3.0, 0.03), ("up", 2.0, 80.0), ("twist", 2.0, 120.0)]
-    metrics = {
-        "per_trajectory": [{"name": n, "errors_mm": {"law": a, "simfree": b}} for n, a, b in rows],
-        "errors_mm": {"law": {}},
-        "range": {"resphys": {"first_s": {"up": 0.0}}},
-    }
-    plain = vertex_settings()
-    data = plain.data.changed(others={name: {"weight_g": 1.0} for name in ("up", "twist")})
-    assert grouped_errors(metrics, plain.changed(data=data, test_titles=("weights", "others"))) == {
-        "weights": {"law": [1.0, 3.0], "simfree": [0.01, 0.03]},
-        "others": {"law": [2.0, 2.0], "simfree": [80.0, 120.0]},
-    }
-    assert [*grouped_errors(metrics, plain)] == ["4 test trials"]
-    assert percent_text(49.0) == "50 times"
+def test_where_the_force_fades_out_the_law_remains():
+    metrics = {"errors_mm": {"law": {}}, "range": {"resphys": {"first_s": {"up": 0.0}}}}
     (left,) = range_texts(metrics, ["50 g", "up"])
     assert left.endswith("from the start (up). There the learned force fades out, and the law remains.")
 

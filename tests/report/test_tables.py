@@ -70,6 +70,13 @@ def test_units_in_brackets_reach_the_terminal(summary):
     assert words.count("[mm]") == 2
 
 
+def test_a_table_that_is_too_wide_wraps_its_heads_alone():
+    table = PageTable("A long head over short rows", ["one column"], [Row("r" * 60, [Cell("4.3e-07")], "best of all")])
+    console = Console(width=80, file=StringIO())
+    console.print(table)
+    assert f"{'r' * 60}  4.3e-07  best of" in console.file.getvalue()
+
+
 def summary(mean, diverged=0):
     return {"mean": mean, "std": None if mean is None else 0.1, "trajectories": 3, "diverged": diverged}
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..io.arrays import FloatArray
 from ..settings.control import ControlSettings
 from .data import MODELS, FollowedPath, RunReport
-from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text, percent_text
+from .page import NONE, Canvas, Cell, Items, PageTable, Part, Row, Text, mm_text, number_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -138,7 +138,7 @@ def _facts(metrics: Mapping[str, Any]) -> list[str]:
         window, whole = mm_text(reduced["window_error_mm"]), mm_text(reduced["whole_error_mm"])
         facts.append(
             f"{MODELS[model][0]} in {reduced['modes']} modes: over {reduced['window_s']:g} s, {window} from the full "
-            f"model, {percent_text(reduced['window_relative'], 1)} of its motion; over whole motions, {whole}."
+            f"model, {100.0 * reduced['window_relative']:.1f} % of its motion; over whole motions, {whole}."
         )
     for model, motions in metrics["planned_mm"].items():  # By motion: errors before and after each correction.
         first, last = fmean(errors[0] for errors in motions.values()), fmean(map(min, motions.values()))

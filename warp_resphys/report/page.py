@@ -34,7 +34,6 @@ _LOG = logging.getLogger(__name__)
 NO_BREAK_SPACE = "\u00a0"
 NONE = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
-MOST_PERCENT = 10.0  # Relative change above which a multiple is written in place of a percentage.
 _TIMED = {  # Models whose computing times are shown.
     "simulation": "Uncorrected simulator",
     "target": "Simulation with the true parameters",
@@ -361,14 +360,6 @@ def data_address(content: bytes, kind: str) -> str:
 def significant(value: float, digits: int = 2) -> str:
     """Return a number with some significant digits, without an exponent."""
     return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0}f}"
-
-
-def percent_text(ratio: float, decimals: int = 0) -> str:
-    """Return a relative change as a percentage with its sign; one above 1000 % as a multiple, such as "12 times"."""
-    if ratio > MOST_PERCENT:
-        return f"{1.0 + ratio:,.0f} times"
-    text = f"{100.0 * ratio:+.{decimals}f}"
-    return f"{text.replace('-', MINUS) if float(text) else '0'} %"
 
 
 def share_text(share: float) -> str:

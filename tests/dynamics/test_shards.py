@@ -86,7 +86,6 @@ def test_threads_change_nothing(motion, monkeypatch, count, linear_solver):
         results.append((trajectory.q, report.iterations, report.relative_residual, *gradients))
     shards = [own.potential for _, own in sim.workspace(SIZE).shards]
     assert not any(potential.positions.requires_grad for potential in shards)
-    torch.testing.assert_close(sim.workspace(SIZE).gather().positions, results[0][0][1].detach())
     for one, several in zip(*results, strict=True):
         torch.testing.assert_close(several, one, rtol=1e-12, atol=1e-14)
 

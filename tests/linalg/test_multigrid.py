@@ -40,7 +40,7 @@ def system(simulator, stretch=1.0, device="cpu"):
     """The solver of a step's Hessian where the body is stretched at constant volume, and its values."""
     simulator.step(simulator.rest_state())
     workspace = simulator.workspace(1)
-    potential, pattern = workspace.gather(), workspace.pattern
+    potential, pattern = workspace.potential, workspace.pattern
     potential.positions.copy_(simulator.rest_positions * simulator.tensor([stretch, stretch**-0.5, stretch**-0.5]))
     solver = MultigridSolver(
         pattern.rows, pattern.cols, len(pattern.free), 3, torch.device(device), torch.float64, pattern.positions

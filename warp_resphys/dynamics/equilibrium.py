@@ -77,19 +77,6 @@ class Workspace:
         """Returns (B,) whether positions are those at the end of the last time step; None before the first step."""
         return None if self._last is None else (q.detach() == self._last).flatten(1).all(1)
 
-    def gather(self) -> IncrementalPotential:
-        """Returns the potential of the whole batch, with the last terms and positions of the shards."""
-        whole = self.potential
-        for rows, shard in self.shards:
-            part = shard.potential
-            pairs: list[tuple[Any, Any]] = [(whole.positions, part.positions)]
-            pairs += [(getattr(whole.terms, n), getattr(part.terms, n)) for n in ("target", "inertia", "force")]
-            pairs += [(whole.terms.values[name], value) for name, value in part.terms.values.items()]
-            for target, source in pairs:
-                if target is not None and source is not None:
-                    target[rows] = source
-        return whole
-
     def cached(self, key: Hashable, make: Callable[[], T]) -> T:
         """Returns an object of this batch, made at the first use of its key, for use outside of inference mode too."""
         if key not in self._cache:

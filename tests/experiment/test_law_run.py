@@ -116,6 +116,22 @@ def test_a_law_that_does_not_help_is_not_used(tmp_path, short_stride):
     assert robot.description.learned.range_.missed is None
 
 
+@pytest.mark.slow
+def test_the_demo_corrects_within_and_beyond_its_training_loads(tmp_path):
+    """Law, force and what has no simulator, under a weight between those of the training and in a twist [mm]."""
+    errors = by_trial(run_without_report(tmp_path, "budget=quick"))
+    within, beyond = errors["70 g"], errors["twist 90°"]
+    for own, law, force in ((within, 2.4e-4, 2.2e-5), (beyond, 4.3e-4, 3.5e-4)):
+        assert own["simulation"] == pytest.approx(1.0, rel=0.05)
+        assert own["law"] == pytest.approx(law, rel=0.3)
+        assert own["resphys"] == pytest.approx(force, rel=0.5)
+        assert own["resphys"] < own["law"]
+    assert within["regression"] < 1e-4
+    assert within["simfree"] < 0.02
+    assert beyond["regression"] == pytest.approx(0.154, rel=0.01)
+    assert beyond["simfree"] > 0.5
+
+
 def test_a_silicone_is_named_in_place_of_a_file():
     check(composed("experiment=beam_oscillation", "law=dragon_skin_10"))
 

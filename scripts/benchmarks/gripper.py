@@ -18,7 +18,7 @@ from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.energies.surfaces import SurfaceContact
 from warp_resphys.energies.tendons import Tendons
-from warp_resphys.environments.grasp import ball_mesh
+from warp_resphys.environments.making import ball_mesh
 from warp_resphys.experiment.build import choose_device
 from warp_resphys.fem.body import Body
 from warp_resphys.fem.scene import Scene

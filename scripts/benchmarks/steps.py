@@ -13,7 +13,7 @@ import torch
 from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.experiment.build import build_body, build_simulator, choose_device, finer
-from warp_resphys.io.memory import peak_memory_gib
+from warp_resphys.io.machine import peak_memory_gib
 from warp_resphys.io.settings import parse
 from warp_resphys.linalg.threads import threads_for
 from warp_resphys.settings.run import RunSettings

@@ -13,7 +13,7 @@ import warp_resphys
 from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
 from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import sampling
-from warp_resphys.control.estimate import Estimator
+from warp_resphys.control.controllers import Estimator
 from warp_resphys.control.files import plans_file, read_plan, read_reduced, reduced_file
 from warp_resphys.control.polynomials import SquaredPolynomial
 from warp_resphys.control.reduction import reduce

@@ -28,7 +28,7 @@ from warp_resphys import (
 )
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
-from warp_resphys.environments.grasp import ball_mesh
+from warp_resphys.environments.making import ball_mesh
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels import surfaces as kernels
 from warp_resphys.mesh.mesh import join, select_cells

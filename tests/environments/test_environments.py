@@ -10,11 +10,10 @@ from gymnasium.vector import AutoresetMode
 
 import warp_resphys
 from warp_resphys.control.worlds import World
-from warp_resphys.data.rigid import kabsch
+from warp_resphys.data.registration import kabsch
 from warp_resphys.environments.making import TASKS, make_vector
-from warp_resphys.environments.picture import Camera
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
-from warp_resphys.environments.vector import ActionMapping, RobotVectorEnv
+from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv
 from warp_resphys.io.errors import InputError
 from warp_resphys.report.obstacles import ObstacleSurface
 from warp_resphys.robot.robot import Robot

@@ -11,8 +11,8 @@ from support.configured import settings
 from support.main_job import run_without_report
 from support.played_run import check_robots
 from warp_resphys import Body
-from warp_resphys.data.base_motion import prescribed, rigid
-from warp_resphys.data.obstacle_motion import contact_inputs, recorded
+from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
+from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import Box, HalfSpace, Sphere
@@ -189,24 +189,24 @@ class TestMotions:
     def test_a_marker_shows_a_translation_and_a_rigid_body_a_turn(self):
         poses = prescribed(swing(start=0.1, ramp=0.1), np.arange(100) / 100.0)
         places = np.array([0.3, 0.1, -0.2]) + ARM * np.eye(4, 3, -1)
-        whole = recorded(shown(poses, places, labels=("ball", "ball +x", "ball +y", "ball +z")), "ball", 0.05)
+        whole = obstacle_motion(shown(poses, places, labels=("ball", "ball +x", "ball +y", "ball +z")), "ball", 0.05)
         np.testing.assert_allclose(whole, poses, atol=2e-6)
-        alone = recorded(shown(poses, places[:1]), "ball", 0.05)
+        alone = obstacle_motion(shown(poses, places[:1]), "ball", 0.05)
         np.testing.assert_allclose(alone[:, :3] + places[0], shown(poses, places[:1]).positions[:, 0], atol=2e-6)
         assert not alone[:, 3:].any()
 
     def test_a_marker_that_does_not_show_its_obstacle_is_refused(self):
         recording = shown(np.zeros((50, 6)), np.zeros((1, 3)))
         with pytest.raises(DataFileError, match="no marker or rigid body 'bar', which shows the motion of this"):
-            recorded(recording, "bar", 0.05)
+            obstacle_motion(recording, "bar", 0.05)
         recording.positions[:10, 0] = np.nan
-        assert not recorded(recording, "ball", 0.2).any()
+        assert not obstacle_motion(recording, "ball", 0.2).any()
         with pytest.raises(DataFileError, match=r"'ball' is not seen in the first 0\.05 s"):
-            recorded(recording, "ball", 0.05)
+            obstacle_motion(recording, "ball", 0.05)
         recording.positions[:40:2, 0] = recording.positions[10:, 0] = np.nan
         recording.positions[3, 0] = 0.0
         with pytest.raises(DataFileError, match="'ball' moves, and its marker is seen in 2 % of the frames"):
-            recorded(recording, "ball", 0.05)
+            obstacle_motion(recording, "ball", 0.05)
 
     @pytest.mark.slow
     def test_a_recorded_bar_pushes_the_beam_of_the_laboratory_and_of_the_models(self, tmp_path):

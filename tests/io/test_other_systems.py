@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from warp_resphys.io import atomic, fan_out, memory
+from warp_resphys.io import atomic, fan_out, machine
 from warp_resphys.io.imports import uncollected
 from warp_resphys.io.machine import available_cores, commit, hardware
 
@@ -35,10 +35,10 @@ print(available_memory_gib() > 0.0, peak_memory_gib() >= 0.0)
 
 
 def test_memory_is_not_known_without_a_system_that_tells_it(monkeypatch):
-    monkeypatch.setattr(memory, "_kibibytes", lambda path, key: [])
-    assert memory.peak_memory_gib() > 0.01  # by getrusage, as on macOS
-    monkeypatch.setattr(memory, "resource", None)
-    assert memory.peak_memory_gib() == 0.0
+    monkeypatch.setattr(machine, "_kibibytes", lambda path, key: [])
+    assert machine.peak_memory_gib() > 0.01  # by getrusage, as on macOS
+    monkeypatch.setattr(machine, "resource", None)
+    assert machine.peak_memory_gib() == 0.0
 
 
 def test_cores_and_processor_without_linux(monkeypatch):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import write_json
-from warp_resphys.io.memory import peak_memory_gib
+from warp_resphys.io.machine import peak_memory_gib
 from warp_resphys.io.progress import Progress, one_line
 from warp_resphys.io.stages import (
     Stage,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_resphys.report.driven_film import DrivenBodies
+from warp_resphys.report.control_section import DrivenBodies
 from warp_resphys.report.figures import TONES
 from warp_resphys.report.render import path_axes
 

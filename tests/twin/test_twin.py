@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.control.estimate import conditioned
+from warp_resphys.control.controllers import conditioned
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load
 from warp_resphys.twin.estimator import distances

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..data.rigid import RigidTransform, kabsch
+from ..data.registration import RigidTransform, kabsch
 from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import make_setup

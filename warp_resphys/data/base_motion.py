@@ -1,8 +1,10 @@
-"""Rigid motion of the base of a body: a function of time, a table, or estimated from markers on the base.
+"""Rigid motion of the base of a body, and of obstacles: a function of time, a table, or estimated from markers on it.
 
-A pose (6,) is a translation t [m] and the rotation vector of R [rad]: a point at x before time zero is at R x + t.
+A pose (6,) is a translation t [m] and the rotation vector of R [rad]: a point at x before time zero is at R x + t, for
+an obstacle from its configured place.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..energies.contact import MOTION, Contact
+from ..fem.body import Body
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.text import read_rows
 from ..settings.trials import MotionSettings
-from .rigid import RigidTransform, kabsch
+from .registration import RigidTransform, kabsch
 
 LARGEST_STEP = 0.2  # of the size of a body
 _MILLI = 1e3
@@ -191,3 +195,28 @@ def _unwrapped(vectors: FloatArray) -> FloatArray:
             turns = np.round((unwrapped[row - 1] @ axis - angle) / (2.0 * np.pi))
             unwrapped[row] = (angle + 2.0 * np.pi * turns) * axis
     return unwrapped
+
+
+def prescribed_all(
+    common: Mapping[str, Any], own: Mapping[str, MotionSettings], times: NDArray[Any], folder: str = "."
+) -> dict[str, FloatArray]:
+    """Poses (T, 6) by obstacle at times (T,) [s] of a trial's given motions: its own, or common ones, none recorded."""
+    motions = {name: motion for name, motion in {**common, **own}.items() if isinstance(motion, MotionSettings)}
+    return {name: prescribed(motion, times, folder) for name, motion in motions.items()}
+
+
+def contact_inputs(body: Body, motions: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Inputs (..., O) of a body's contact by name, for poses (..., 6) of its obstacles; others stand still.
+
+    The inputs turn an obstacle about its position: p moves to R p + t.
+    """
+    contact = next(energy for energy in body.energies if isinstance(energy, Contact))
+    shape = np.broadcast_shapes(*(poses.shape[:-1] for poses in motions.values()))
+    values = np.zeros((len(MOTION), *shape, contact.count))
+    for number, (name, obstacle) in enumerate(contact.obstacles.items()):
+        if name in motions:
+            poses, place = motions[name], np.asarray(obstacle.position)
+            moved = rigid(poses.reshape(-1, 6)).apply(np.broadcast_to(place, (poses[..., 0].size, 1, 3)))[:, 0] - place
+            turned = poses[..., 3:]
+            values[..., number] = np.moveaxis(np.concatenate([moved.reshape(turned.shape), turned], -1), -1, 0)
+    return {quantity.name: own for quantity, own in zip(MOTION, values, strict=True)}

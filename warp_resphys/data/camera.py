@@ -15,6 +15,9 @@ A `Lens` moves the point (x, y) = (X / Z, Y / Z) of the image at distance one, w
 (Brown 1966, with OpenCV's names), which the matrix K takes to pixels (Hartley and Zisserman, Multiple View Geometry,
 2nd edition, eq. 6.8). Its focal lengths are corrected by a factor, its principal point by a shift.
 
+The picture of one small square tag (ArUco or AprilTag), by OpenCV, has two poses that fit nearly as well (Collins and
+Bartoli 2014): both are returned, the better one first.
+
 `tests/data/test_camera.py` compares with a camera of closed form and with differences, and identifies Young's modulus.
 """
 
@@ -26,10 +29,13 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 import torch
 import yaml
+from numpy.typing import NDArray
 from typing_extensions import override
 
+from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.text import read_text
+from ..settings.pictures import TagSettings
 from ..stepping.rotations import rotations
 from .markers import Markers
 from .observation import Observation
@@ -46,6 +52,7 @@ _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs
 _COUNTS = (0, 4, 5, 8)  # of the coefficients of a lens
 _UNDISTORTING = 30  # steps of Newton's method
 _UNDISTORTED = 0.01  # px: error of a ray
+_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])  # in the order of OpenCV
 
 
 @dataclass(frozen=True)
@@ -256,3 +263,48 @@ class CameraMarkers(Observation):
         """Returns pixels (B, M, 2), NaN for a marker behind the camera."""
         corrections = self.camera.corrections({}).to(positions.device)
         return self.camera.pixels(self.markers(positions).double(), corrections).to(positions)
+
+
+def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[FloatArray]:
+    """Returns the one or two world_to_camera (4, 4) that a picture (H, W, 3) allows; none without the tag.
+
+    Raises:
+        InputError: OpenCV is not installed, or has no such dictionary; or the edges are not perpendicular.
+    """
+    try:
+        import cv2
+    except ModuleNotFoundError:
+        raise InputError("data.tag needs a package that is not installed: pip install 'warp-resphys[tags]'.") from None
+    constant = getattr(cv2.aruco, f"DICT_{tag.dictionary.upper()}", None)
+    if constant is None:
+        raise InputError(f"OpenCV has no tags {tag.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11.")
+    right, up = np.array(tag.right), np.array(tag.up)
+    if not abs(right @ up) <= 1e-3 * np.linalg.norm(right) * np.linalg.norm(up) or not (right.any() and up.any()):
+        raise InputError("right and up of a tag are directions of two of its edges: they must be perpendicular.")
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    dictionary = cv2.aruco.getPredefinedDictionary(constant)
+    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(
+        np.ascontiguousarray(image[..., ::-1])
+    )
+    seen = [] if numbers is None else zip(corners, numbers.ravel(), strict=True)
+    found = [own[0] for own, number in seen if number == tag.number]
+    if not found:
+        return []
+    distortion = None if lens.distortion is None else lens.distortion.numpy()
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        0.5 * tag.size * _CORNERS,
+        found[0].astype(np.float64),
+        lens.matrix.numpy(),
+        distortion,
+        flags=cv2.SOLVEPNP_IPPE_SQUARE,
+    )
+    right, up = (own / np.linalg.norm(own) for own in (right, up))
+    axes = np.stack([right, up, np.cross(right, up)])  # from the scene to the tag
+    poses = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        rotation = cv2.Rodrigues(turn)[0] @ axes
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, shift.ravel() - rotation @ np.array(tag.centre)
+        poses.append(pose)
+    return poses

@@ -23,7 +23,7 @@ from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, did_you_mean, listed
 from ..settings.trials import CORNERS
 from .recordings.recording import ARM, Recording
-from .rigid import RigidTransform, fit
+from .registration import RigidTransform, fit
 
 _SIGNS = np.array([[1.0 if sign == "+" else -1.0 for sign in corner] for corner in CORNERS])
 

@@ -22,7 +22,7 @@ from ..energies.materials import ConvexMaterial, Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.body import Body
 from ..io.errors import InputError, naming
-from ..io.memory import available_memory_gib
+from ..io.machine import available_memory_gib
 from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor

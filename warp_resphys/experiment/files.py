@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..data.base_motion import at_times
-from ..data.obstacle_motion import contact_inputs
+from ..data.base_motion import at_times, contact_inputs
 from ..data.trials import Trials
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.body import Body

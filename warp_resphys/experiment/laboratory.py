@@ -16,7 +16,7 @@ from ..data.actuation import draw_inputs, wave_inputs
 from ..data.base_motion import in_frame, rigid
 from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
-from ..data.rigid import RigidTransform
+from ..data.registration import RigidTransform
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray

@@ -18,10 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..data.base_motion import check_steps, prescribed, rigid
+from ..data.base_motion import check_steps, contact_inputs, prescribed, prescribed_all, rigid
 from ..data.markers import MarkerMap
 from ..data.observation import WHOLE_STATE, Observation
-from ..data.obstacle_motion import contact_inputs, prescribed_all
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError

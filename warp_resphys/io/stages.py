@@ -26,7 +26,7 @@ from .atomic import digest
 from .classes import check_packages
 from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, read_json, to_plain, write_json
-from .memory import peak_memory_gib
+from .machine import peak_memory_gib
 from .progress import one_line
 from .settings import packages_of
 

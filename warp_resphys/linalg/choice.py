@@ -11,13 +11,13 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.tiled_cholesky import TILE
 from .banded import BandedSolver
 from .bordered import BorderedSolver, banded_rest, hubs
-from .dense import DenseSolver
-from .linear_solver import Indices, LinearSolver, bandwidth
+from .linear_solver import Factor, Indices, LinearSolver, Mask, bandwidth
 from .multigrid import MultigridSolver
 from .pardiso import PardisoSolver, has_pardiso
 from .sparse import SparseSolver
@@ -32,6 +32,47 @@ MAX_PARDISO_UNKNOWNS = 80_000  # unknowns above which its factor takes too much 
 BORDER_FLOPS = 44  # of an unknown beside a band, in multiplications of a banded factor
 MAX_TILED_BANDWIDTH = 600  # unknowns above which the tiles of a band hold mostly fill on a GPU
 MAX_DENSE_UNKNOWNS = 4000  # unknowns
+
+
+class DenseSolver(LinearSolver):
+    """Batched dense Cholesky in torch, on any device."""
+
+    @override
+    def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
+        i, j = self._entries(rows, cols)
+        self.address = (np.maximum(i, j) * self.n + np.minimum(i, j)).astype(np.int32)
+        self.address[(rows == cols)[:, None] & (i < j)] = -1
+        self.n_values = self.n * self.n
+
+    @override
+    def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
+        factor = DenseFactor(values.reshape(-1, self.n, self.n))
+        if idle is not None and isinstance(before, DenseFactor):
+            factor.keep(before, idle)
+        return factor
+
+
+class DenseFactor(Factor):
+    """Factors of symmetric matrices, from their lower triangles (B, n, n)."""
+
+    def __init__(self, lower: torch.Tensor) -> None:
+        self._cholesky, info = torch.linalg.cholesky_ex(lower)
+        self.failed = info.cpu().numpy() != 0
+        if self.failed.any():
+            self._cholesky[info != 0] = torch.nan
+
+    def keep(self, before: "DenseFactor", idle: torch.Tensor) -> None:
+        """Replaces the Cholesky factors of idle matrices (B,) by those of an earlier factor."""
+        self._cholesky = torch.where(idle[:, None, None], before._cholesky, self._cholesky)
+        self.failed = np.where(idle.cpu().numpy(), before.failed, self.failed)
+
+    @override
+    def solve(self, rhs: torch.Tensor) -> torch.Tensor:
+        b, n, m = rhs.shape
+        shared = len(self.failed) == 1 and b > 1
+        columns = rhs.permute(1, 0, 2).reshape(1, n, b * m) if shared else rhs
+        solution = torch.cholesky_solve(columns, self._cholesky)
+        return solution.reshape(n, b, m).permute(1, 0, 2) if shared else solution
 
 
 def make_linear_solver(

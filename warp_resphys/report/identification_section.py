@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ..data.rigid import root_mean_square
+from ..data.registration import root_mean_square
 from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..data.rigid import RigidTransform
+from ..data.registration import RigidTransform
 from ..energies.contact import GROWTH, MOTION, SHIFT, TURN, Contact
 from ..energies.obstacles import surface_of
 from ..fem.body import Body

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from ..data.markers import Markers
-from ..data.rigid import RigidTransform, kabsch
+from ..data.registration import RigidTransform, kabsch
 from ..energies.contact import MOTION, Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.arrays import FloatArray

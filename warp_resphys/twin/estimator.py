@@ -17,7 +17,7 @@ from typing import ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
-from ..control.estimate import conditioned
+from ..control.controllers import conditioned
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from ..robot.inputs import Given

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..data.recordings.reading import read_recording
-from ..data.registration import register_markers
-from ..data.rigid import RigidTransform
+from ..data.registration import RigidTransform, register_markers
 from ..data.rigid_bodies import with_corners
 from ..io.errors import InputError, ResphysError, listed
 from ..robot.robot import Robot

@@ -13,7 +13,7 @@ from scipy.ndimage import median_filter
 
 from ...io.arrays import FloatArray, IntArray
 from ...io.errors import DataFileError, InputError, listed
-from ..base_motion import at_times
+from ..base_motion import at_times, followed
 from .recording import Recording, bridged, runs
 
 _FIRST_SECONDS = 0.2  # [s] latest start of a stretch after that of the first one
@@ -299,3 +299,30 @@ def _root_line(time: FloatArray | IntArray, travelled: FloatArray) -> tuple[floa
         return None
     slope, intercept = np.polyfit(time, root, 1)
     return float(slope), float(-intercept / slope)
+
+
+def obstacle_motion(recording: Recording, name: str, seconds: float) -> FloatArray:
+    """Poses (T, 6) of an obstacle in the frame of a recording, from the marker or rigid body of its name.
+
+    Args:
+        recording: with all of its markers.
+        name: of the obstacle. A marker shows a translation alone.
+        seconds: at the start, in which the obstacle stands at its configured place [s].
+
+    Raises:
+        DataFileError: there is no such marker, or it is seen in less than half of the frames, or not at the start.
+    """
+    if name not in recording.labels:
+        raise DataFileError(
+            f"{recording.source} has no marker or rigid body {name!r}, which shows the motion of this obstacle: name "
+            "it so, or give its motion in data.obstacle_motion."
+        )
+    arms = [f"{name} +{axis}" for axis in "xyz"]
+    shown = recording.select([name, *(arms if {*arms} <= {*recording.labels} else ())])
+    first = shown.positions[: max(round(seconds * recording.rate), 1)]
+    if not np.isfinite(first).all(-1).any(0).all():
+        raise DataFileError(
+            f"{recording.source}: {name!r} is not seen in the first {seconds:g} s, while its obstacle stands: start "
+            "the recording earlier, or give the motion in data.obstacle_motion."
+        )
+    return followed(shown.positions, np.nanmedian(first, axis=0), recording.source, f"the obstacle {name!r}")

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...data.camera import Lens, PlacedCamera
+from ...data.camera import Lens, PlacedCamera, tag_poses
 from ...data.markers import bind_markers
 from ...fem.body import Body
 from ...io.atomic import atomic_path, digest
@@ -35,7 +35,6 @@ from ...pictures.reading import (
     read_tracked,
 )
 from ...pictures.seen import Photo, SeenPose
-from ...pictures.tags import tag_poses
 from ...settings.body import MaterialSettings
 from ...settings.pictures import PictureData, PoseSettings
 from ...settings.stages import StageSettings

@@ -16,7 +16,7 @@ from ...data.actuation import NO_INPUT
 from ...data.base_motion import at_times, check_steps
 from ...data.recordings.processing import smooth
 from ...data.recordings.quality import quality
-from ...data.rigid import root_mean_square
+from ...data.registration import root_mean_square
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, number_of

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...data.marker_view import MarkerView
-from ...data.obstacle_motion import recorded
+from ...data.recordings.processing import obstacle_motion
 from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording
 from ...data.registration import assign, axes_rotation
@@ -162,7 +162,7 @@ class Reader:
         recording = with_corners(recording, lengths)
         seconds = _HELD_SECONDS if trial.is_released else data.rest_seconds
         shown = [name for name, motion in data.obstacle_motion.items() if motion == "recorded"]
-        recording = replace(recording, obstacles={name: recorded(recording, name, seconds) for name in shown})
+        recording = replace(recording, obstacles={name: obstacle_motion(recording, name, seconds) for name in shown})
         driven, rate, frames = recording.actuation, recording.rate, np.arange(len(recording.positions))
         if abs(trial.input_delay) * rate >= len(frames):
             raise InputError(

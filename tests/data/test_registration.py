@@ -26,12 +26,12 @@ MOTION = RigidTransform(Rotation.from_euler("xyz", [0.4, -2.0, 1.1]).as_matrix()
 SOURCE = "swing.c3d"
 
 
-def measured(**moved):
+def measured(motion=MOTION, **moved):
     """The nominal markers in the recording's frame, some moved [m] by their names' place."""
     points = NOMINAL.copy()
     for place, by in moved.items():
         points[int(place[1:])] += by
-    return MOTION.apply(points)
+    return motion.apply(points)
 
 
 def assert_inverse(result, atol=1e-12):
@@ -60,14 +60,6 @@ def test_kabsch_refuses(points):
 
 
 class TestRegisterMarkers:
-    def test_a_known_motion_is_recovered(self):
-        result = register_markers(measured(), NOMINAL, NAMES, source=SOURCE)
-        assert_inverse(result.transform)
-        np.testing.assert_allclose(result.positions, NOMINAL, rtol=0, atol=1e-12)
-        assert result.inliers.all()
-        assert result.outliers == ()
-        assert result.rms < 1e-12
-
     @pytest.mark.parametrize("astray", [0, 4])
     def test_one_marker_ten_centimetres_off_changes_nothing(self, astray):
         points = measured(**{f"m{astray}": [0.06, 0.0, -0.08]})
@@ -172,10 +164,7 @@ def test_closest_points_of_a_box(mesh):
 def shifted(axes, **moved):
     """The nominal markers in a frame with other axes, some moved [m], and the rotation back."""
     rotation = axes_rotation(axes)
-    points = NOMINAL.copy()
-    for place, by in moved.items():
-        points[int(place[1:])] += by
-    return (points - [0.3, -0.2, 1.5]) @ rotation, rotation
+    return measured(RigidTransform(rotation.T, rotation.T @ [-0.3, 0.2, -1.5]), **moved), rotation
 
 
 def test_known_axes_leave_a_shift_that_one_marker_determines():
@@ -209,20 +198,19 @@ class TestWithAKnownVertical:
 
     UP = np.array([0.0, 0.0, 1.0])
 
-    def register(self, nominal, angle=2.0, lean=(0.7, -0.4, 0.0), **more):
-        turn = Rotation.from_rotvec(np.asarray(lean)) * Rotation.from_rotvec(angle * self.UP)
+    def register(self, nominal):
+        lean = Rotation.from_rotvec([0.7, -0.4, 0.0])
+        turn = lean * Rotation.from_rotvec(-3.1 * self.UP)
         measured = turn.apply(nominal) + [0.3, 0.2, -0.1]
-        below = Rotation.from_rotvec(np.asarray(lean)).apply(self.UP)
         names = [f"B{number}" for number in range(len(nominal))]
-        result = register_markers(measured, nominal, names, source=SOURCE, vertical=(9.8 * below, self.UP), **more)
-        return result, turn
+        vertical = 9.8 * lean.apply(self.UP), self.UP
+        return register_markers(measured, nominal, names, source=SOURCE, vertical=vertical), turn
 
-    @pytest.mark.parametrize("angle", [-3.1])
     @pytest.mark.parametrize(
         "nominal", [[[0.1, 0.0, 0.02], [-0.1, 0.03, 0.0]], [[0.0, 0.0, 0.0], [0.05, 0.0, 0.1], [0.1, 0.0, 0.2]]]
     )
-    def test_two_markers_or_a_row_register_with_a_known_vertical(self, nominal, angle):
-        result, turn = self.register(np.array(nominal), angle)
+    def test_two_markers_or_a_row_register_with_a_known_vertical(self, nominal):
+        result, turn = self.register(np.array(nominal))
         np.testing.assert_allclose(result.transform.rotation, turn.inv().as_matrix(), atol=1e-12)
         np.testing.assert_allclose(result.positions, nominal, atol=1e-12)
 

@@ -20,15 +20,12 @@ MESH = Mesh(BOX.vertices, BOX.cells, {"beam": np.array([0, 1]), "cap": np.array(
 TENDON = Tendons([[[x, 0.01, 0.02] for x in (0.0, 0.01, 0.03, 0.04)]], 400.0, directions=[[[0.0, 0.0, 1.0]]])
 
 
-def simulator(rigid):
-    mesh = MESH if rigid else BOX
-    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[TENDON], rigid={"cap": Rigid()} if rigid else {})
-    return Simulator(body, {"beam": Corotated(2e5)} if rigid else Corotated(2e5))
-
-
 def linearised(rigid):
     """A step of two bent bodies, positions at which to take it, and a direction of the coordinates."""
-    s, generator = simulator(rigid), torch.Generator().manual_seed(0)
+    mesh = MESH if rigid else BOX
+    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[TENDON], rigid={"cap": Rigid()} if rigid else {})
+    s = Simulator(body, {"beam": Corotated(2e5)} if rigid else Corotated(2e5))
+    generator = torch.Generator().manual_seed(0)
     state = s.rest_state(2)
     bend = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     state = s.state(state.q + 20.0 * state.q[..., :1] ** 2 * bend, 0.1 * state.q)

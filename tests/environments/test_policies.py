@@ -17,10 +17,6 @@ from warp_resphys.settings.control import ReductionSettings
 from warp_resphys.studies.policy import _text
 
 
-def still(seen):
-    return -np.ones((len(seen), 3), dtype=np.float32)
-
-
 @pytest.mark.slow
 class TestScriptedPolicy:
     def test_it_is_as_good_as_the_exact_static_actions(self, folder):
@@ -32,6 +28,7 @@ class TestScriptedPolicy:
             distances = np.abs(robots.task.goals[:, :1] - reach.places).sum(axis=2)
             return reach.actions[distances.argmin(axis=1)].astype(np.float32)
 
+        still = lambda seen: -np.ones((len(seen), 3), dtype=np.float32)  # noqa: E731
         errors, best, idle = (errors_mm(robots, policy, seed=1) for policy in (ScriptedPolicy(robots), exact, still))
         assert errors.shape == (40, 3)
         assert (idle[-1] - best[-1]).min() > 10.0

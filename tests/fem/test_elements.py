@@ -42,13 +42,6 @@ def meshes():
 MESHES = meshes()
 
 
-def polyhedral_volume(mesh):
-    """Exact volume of a mesh of hexahedra: 4-point Gauss integration of the Jacobian."""
-    points, weights = gauss_box(4)
-    _, determinants = physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])
-    return (determinants @ weights).sum()
-
-
 @pytest.mark.parametrize("kind", SHAPES)
 def test_shape_functions_are_a_nodal_partition_of_unity(kind):
     shape = SHAPES[kind]
@@ -91,7 +84,8 @@ def test_volumes_and_masses_sum_to_the_total(name, integration):
     if "curved" in name:
         total = d.element_volumes.sum()
     elif "hexahedra" in name:
-        total = polyhedral_volume(mesh)
+        points, weights = gauss_box(4)  # which are exact for plane edges
+        total = (physical_gradients(mesh.vertices, mesh.cells, mesh.element.shape(points)[1])[1] @ weights).sum()
     elif "tetrahedra" in name:
         corners = mesh.vertices[mesh.cells[:, :4]]
         total = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from support.swinging_beam import MARKERS, MESH, TIP, blank, double
 from warp_resphys import Body, Simulator
-from warp_resphys.data.markers import bind_markers
-from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.identification import ParameterSearch
@@ -16,13 +15,9 @@ from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.mesh.mesh import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 
-MESH = box_hexahedra(divisions=(4, 1, 1))
-TIP = select_vertices(MESH, x=0.1)
-POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024], [0.1, 0.036, 0.006]])
-MARKERS = bind_markers(MESH, POINTS, ["a", "b", "c"], kind="rigid", vertices=TIP)
 TRUTH = {"youngs_modulus": 215e3, "stiffness_damping": 0.002}
 RANGES = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True), "stiffness_damping": Bounds(0.0, 0.02)}
 FIRST = {"youngs_modulus": 400e3, "stiffness_damping": 0.0}
@@ -32,30 +27,16 @@ def simulator(kind=Simulator, **options):
     return kind(Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01, integrator="bdf2", **options)
 
 
-def double(values):
-    return torch.as_tensor(values, dtype=torch.float64)
-
-
-def hanging(masses):
-    attached = torch.zeros(len(masses), len(MESH.vertices), dtype=torch.float64)
-    attached[:, TIP] = torch.tensor(masses, dtype=torch.float64)[:, None] / len(TIP)
-    return attached
-
-
 def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
     """Motions from rest under gravity with the true parameters, and their beginning."""
-    count = len(masses)
-    times = (0.01 * torch.arange(frames, dtype=torch.float64)).expand(count, -1)
-    held = torch.as_tensor(POINTS).expand(count, -1, -1)
-    names, inputs = tuple(f"m{i}" for i in range(count)), Inputs(attached_mass=hanging(masses))
-    blank = Trials(names, times, held[:, None].repeat(1, frames, 1, 1), held, inputs)
+    count, motions = len(masses), blank(frames, masses)
     release = Start(sim.rest_state(count), torch.zeros(count, dtype=torch.float64))
     with torch.no_grad():
-        markers = Replay(sim, MARKERS, blank)(release, {name: double([value]) for name, value in truth.items()})[0]
+        markers = Replay(sim, MARKERS, motions)(release, {name: double([value]) for name, value in truth.items()})[0]
     markers = markers + noise * torch.randn(
         markers.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
     )
-    return Replay(sim, MARKERS, replace(blank, observed=markers)), release
+    return Replay(sim, MARKERS, replace(motions, observed=markers)), release
 
 
 def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
@@ -160,10 +141,7 @@ def test_bounds_there_and_back(bounds):
 
 def resting_pose(sim):
     """A pose under a weight with the true parameters, and its beginning."""
-    held = torch.as_tensor(POINTS)[None]
-    still = Trials(
-        ("pose",), torch.zeros(1, 1, dtype=torch.float64), held[:, None], held, Inputs(attached_mass=hanging((0.1,)))
-    )
+    still = blank(frames=1, masses=(0.1,))
     start = Start.resting(sim.rest_positions[None])
     assert Replay(sim, MARKERS, still).is_static
     with torch.no_grad():
@@ -192,17 +170,15 @@ def late(observe=MARKERS, noise=1e-5):
     sim, count = simulator(), len(DELAYS)
     force = torch.zeros(FRAMES, count, len(MESH.vertices), 3, dtype=torch.float64)
     force[BEGIN:, :, TIP, 1] = 0.02  # N
-    times = (0.01 * torch.arange(FRAMES, dtype=torch.float64)).expand(count, -1)
-    held = double(POINTS).expand(count, -1, -1)
-    blank = Trials(("m1", "m2", "m3"), times, held[:, None].repeat(1, FRAMES, 1, 1), held, Inputs(force))
+    motions = replace(blank(FRAMES, (0.0,) * count), inputs=Inputs(force))
     start = Start.resting(sim.rest_state(count).q)
     with torch.no_grad():
         delayed = replace(start, delay=double(DELAYS))
-        seen = Replay(sim, observe, blank)(delayed, {name: double([value]) for name, value in DAMPED.items()})[0]
+        seen = Replay(sim, observe, motions)(delayed, {name: double([value]) for name, value in DAMPED.items()})[0]
     random = torch.Generator().manual_seed(1)
     seen = seen + noise * torch.randn(seen.shape, generator=random, dtype=torch.float64)
     seen[1, 20:25, 0] = torch.nan
-    return Replay(sim, MARKERS, replace(blank, observed=seen)), start
+    return Replay(sim, MARKERS, replace(motions, observed=seen)), start
 
 
 @pytest.mark.parametrize("placed", [False, pytest.param(True, marks=pytest.mark.slow)])

@@ -183,12 +183,9 @@ def test_a_branch_between_two_times_of_the_grid_is_one_branch():
     assert found.residual < 0.01 * laws[()].residual
 
 
-def branch(time):
-    return {"prony_modulus_1": 1e5, "prony_time_1": time}
-
-
 def test_neighbouring_relaxation_times_become_one_branch():
-    candidates = [{"c10": 1e5}, {"bulk_1": 1e5}, *map(branch, (0.01, 0.015, 0.1, 0.4)), {"shear_viscosity": 1e2}]
+    branches = [{"prony_modulus_1": 1e5, "prony_time_1": time} for time in (0.01, 0.015, 0.1, 0.4)]
+    candidates = [{"c10": 1e5}, {"bulk_1": 1e5}, *branches, {"shear_viscosity": 1e2}]
     found = _constants(candidates, np.array([0.4, 20.0, 0.1, 0.3, 0.2, 1e-5, 0.5]))
     assert {name: found[name] for name in ("c10", "bulk_1", "shear_viscosity")} == pytest.approx(
         {"c10": 4e4, "bulk_1": 2e6, "shear_viscosity": 50.0}

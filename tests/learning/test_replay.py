@@ -6,46 +6,23 @@ import numpy as np
 import pytest
 import torch
 
+from support.swinging_beam import MARKERS, MESH, TIP, blank, double
 from warp_resphys import Body, Contact, Corotated, HalfSpace, PointMass, Simulator, Tendons
-from warp_resphys.data.markers import bind_markers
-from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, begin_inputs, estimate_release, hold, sideways_shapes
 from warp_resphys.learning.replay import Replay, Start, sample
-from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.mesh.mesh import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
-
-MESH = box_hexahedra(divisions=(4, 1, 1))
-TIP = select_vertices(MESH, x=0.1)
-POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024], [0.1, 0.036, 0.006]])
-MARKERS = bind_markers(MESH, POINTS, ["a", "b", "c"], kind="rigid", vertices=TIP)
-MASSES = (0.0, 0.05)
 
 
 def simulator(masses=(), kind=Simulator, **options):
     options = {"integrator": "bdf2", "material": Corotated(215e3, 0.45)} | options
     body = Body(MESH, select_vertices(MESH, x=0.0), point_masses=[PointMass(m, TIP) for m in masses])
     return kind(body, time_step=0.01, **options)
-
-
-def double(values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def blank(frames=12, masses=MASSES, rate=100.0):
-    """Motions whose markers stand a little off from where they were held."""
-    count = len(masses)
-    times = (torch.arange(frames, dtype=torch.float64) / rate).expand(count, -1)
-    held = torch.as_tensor(POINTS).expand(count, -1, -1)
-    attached = torch.zeros(count, len(MESH.vertices), dtype=torch.float64)
-    attached[:, TIP] = double(masses)[:, None] / len(TIP)
-    names = tuple(f"m{i}" for i in range(count))
-    places = held[:, None].repeat(1, frames, 1, 1) + 1e-3
-    return Trials(names, times, places, held, Inputs(attached_mass=attached))
 
 
 def at_rest(sim, count, delay=0.0):
@@ -203,7 +180,7 @@ def test_releases_within_twice_what_is_expected_are_recovered_in_any_basis(monke
         return torch.cat([basis[:, :2] @ turn, basis[:, 2:]], 1)
 
     monkeypatch.setattr("warp_resphys.learning.release.vibration_modes", rotated)
-    sim, motions = simulator(), blank(frames=12, masses=MASSES * (count // 2))
+    sim, motions = simulator(), blank(frames=12, masses=(0.0, 0.05) * (count // 2))
     replay = Replay(sim, MARKERS, motions)
     values = 4.0 * torch.rand(count, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 2.0
     q = hold(replay, 6)

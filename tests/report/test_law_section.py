@@ -48,18 +48,14 @@ def law(**changes):
     return {**own, **changes}
 
 
-def released(**changes):
-    """Settings of a beam whose last trial is held in another way."""
-    plain = vertex_settings()
-    return plain.changed(law=LawSettings(), data=plain.data.changed(others={OTHER: {"weight_g": 120.0}}), **changes)
-
-
 def run(folder, own, **more):
-    """Writes a run with a law, and returns its page."""
+    """Writes a run with a law, whose last trial is held in another way, and returns its page."""
     models = ("simulation", *(["law"] if own["accepted"] else []), "simfree", "resphys")
-    write_vertex_run(folder, vertex_settings(), models=models, **more)
+    plain = vertex_settings()
+    write_vertex_run(folder, plain, models=models, **more)
     write_json(folder / "law.json", own)
-    return report(folder, released())
+    others = {OTHER: {"weight_g": 120.0}}
+    return report(folder, plain.changed(law=LawSettings(), data=plain.data.changed(others=others)))
 
 
 @pytest.mark.usefixtures("no_drawing")

@@ -50,3 +50,10 @@ def test_it_stops_at_the_tolerance():
     assert len(calls) == 5
     conjugate_gradients(operator, exact, right, tolerance=0.0, shortest=1e-6)
     assert len(calls) == 6
+
+
+def test_a_system_with_an_indefinite_preconditioner_stops():
+    matrices, right = problem()
+    result = conjugate_gradients(product(matrices), torch.neg, right, tolerance=1e-6)
+    assert result.iterations == 0
+    assert result.converged.tolist() == [False, True, False]

@@ -76,8 +76,8 @@ class FullStateProblem(StepProblem):
 
     by conjugate gradients, preconditioned with (I + sqrt(w) H)^2: for every eigenvalue h of H the quotient
     (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations suffice for any w. The
-    preconditioned gradient is thus between a half of the step and the step: where it is far below the tolerance, with H
-    of the iterate before, it is the last step, without a new H. Damping d is relative to the matrix on the left: it
+    preconditioned gradient is thus between a half of the step and the step: where it is far below the tolerance, with
+    the factor of the iterate before, it is the last step, without a new factor. Damping d is relative to the matrix on the left: it
     shortens the step to dx / (1 + d). The search starts at x*.
 
     Where x stands at a fraction e of the time step, |q+ - q*| is |x - x*| / e: w is lambda e^2.
@@ -116,23 +116,24 @@ class FullStateProblem(StepProblem):
     def linearise(self, point: Point) -> Move:
         step, weight, x, (force,) = self._step, self._weight, point.x, point.kept
         short = _SHORT * self.tolerance
+        step.update(x)
+        right = self._target - x - weight * step.product(force)
         if self._inverse is not None:
-            last = self._inverse(self._target - x - weight * step.product(force))
+            last = self._inverse(right)
             if float(last.abs().max()) <= short:
                 return lambda damping: x + last / (1.0 + damping)[:, None, None]
-        step.update(x)
         factor = step.shifted(math.sqrt(weight))
 
         def inverse(r: torch.Tensor) -> torch.Tensor:
-            right = r[:, step.free].reshape(len(r), -1, 1)
-            solved = factor.solve(factor.solve(right)).reshape(len(r), -1, 3)
+            fields = r[:, step.free].reshape(len(r), -1, 1)
+            solved = factor.solve(factor.solve(fields)).reshape(len(r), -1, 3)
             return torch.zeros_like(r).index_copy(1, step.free, solved)
 
         self._inverse = inverse
         change = conjugate_gradients(
             lambda d: d + weight * step.product(step.product(d)),
             inverse,
-            self._target - x - weight * step.product(force),
+            right,
             tolerance=1e-6,
             shortest=0.5 * short,
         ).x

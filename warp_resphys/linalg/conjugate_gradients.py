@@ -52,8 +52,8 @@ def conjugate_gradients(
     indefinite = torch.zeros_like(rz, dtype=torch.bool)
     count = 0
     for count in range(max_iterations + 1):
-        solved = (rz >= 0.0) & ((rz <= goal) | (z.abs().flatten(1).amax(1) <= shortest))
-        active = ~solved & ~indefinite
+        short = z.abs().flatten(1).amax(1) <= shortest
+        active = (rz > goal) & ~short & ~indefinite
         if count == max_iterations or not bool(active.any()):
             break
         hd = operator(d)
@@ -69,4 +69,4 @@ def conjugate_gradients(
         new_rz = dot(r, z)
         d = z + (new_rz / rz.clamp_min(tiny)).view(column) * d
         rz = new_rz
-    return Iterate(x, solved & ~indefinite, count)
+    return Iterate(x, (rz >= 0.0) & ((rz <= goal) | short) & ~indefinite, count)

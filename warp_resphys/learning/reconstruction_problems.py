@@ -77,8 +77,8 @@ class FullStateProblem(StepProblem):
     by conjugate gradients, preconditioned with (I + sqrt(w) H)^2: for every eigenvalue h of H the quotient
     (1 + w h^2) / (1 + sqrt(w) h)^2 lies between 1/2 and 1, so that a dozen iterations suffice for any w. The
     preconditioned gradient is thus between a half of the step and the step: where it is far below the tolerance, with
-    the factor of the iterate before, it is the last step, without a new factor. Damping d is relative to the matrix on the left: it
-    shortens the step to dx / (1 + d). The search starts at x*.
+    the factor of the iterate before, it is the last step, without a new factor. Damping d is relative to the matrix on
+    the left: it shortens the step to dx / (1 + d). The search starts at x*.
 
     Where x stands at a fraction e of the time step, |q+ - q*| is |x - x*| / e: w is lambda e^2.
     """

@@ -7,7 +7,9 @@ import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import torch
@@ -289,6 +291,8 @@ def prepare(run: RunSettings) -> None:
 def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[Stage], str]:
     """Runs the stages that write dataset.h5; returns them, and the fingerprint of the last."""
     stages = acquisition_stages(run)
+    if unfinished(stages, folder):  # Torch's first optimiser imports it for a second, in which kernels are compiled.
+        Thread(target=import_module, args=("torch._dynamo",)).start()
     run_stages(stages, folder, wait)
     (written,) = (stage.name for stage in stages if DATASET in stage.outputs)
     return stages, str(read_json(folder / "stages" / f"{written}.json")["fingerprint"])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_resphys.data.actuation import check_inputs, draw_inputs
+from warp_resphys.data.input_response import check_inputs, draw_inputs
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError

@@ -8,8 +8,8 @@ from support.configured import settings
 from support.main_job import finish, run
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
-from warp_resphys.data.actuation import wave_inputs
 from warp_resphys.data.base_motion import prescribed
+from warp_resphys.data.input_response import wave_inputs
 from warp_resphys.data.marker_view import MarkerView
 from warp_resphys.experiment.build import bound_markers, build_simulator
 from warp_resphys.experiment.files import read_dataset

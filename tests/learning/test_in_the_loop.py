@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.data.markers import bind_markers
-from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.data.markers import WHOLE_STATE, bind_markers
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.experiment import at_steps
 from warp_resphys.io.errors import ConvergenceError

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import warp_resphys as wr
-from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.learning.library import ObservedMotion, evaluate, fit_force, identify, reconstruct
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, Tendons
-from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError

@@ -21,8 +21,8 @@ from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
-from warp_resphys.mesh.poses import twisted
 from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.rotations import twisted
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2))
 REST = torch.as_tensor(MESH.vertices)

@@ -6,8 +6,7 @@ import scipy.optimize
 import torch
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers
-from warp_resphys.data.observation import WHOLE_STATE
+from warp_resphys.data.markers import KINDS, WHOLE_STATE, MarkerMap, bind_markers
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError

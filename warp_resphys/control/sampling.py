@@ -9,8 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
-from ..data.actuation import draw_inputs
-from ..data.input_response import SLOPES, InputResponse, response_of
+from ..data.input_response import SLOPES, InputResponse, draw_inputs, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
 from ..experiment.models import Learned

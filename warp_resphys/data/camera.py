@@ -37,8 +37,7 @@ from ..io.errors import DataFileError, InputError
 from ..io.text import read_text
 from ..settings.pictures import TagSettings
 from ..stepping.rotations import rotations
-from .markers import Markers
-from .observation import Observation
+from .markers import Markers, Observation
 
 SHIFTS: Final = ("camera_shift_1", "camera_shift_2", "camera_shift_3")  # m
 TURNS: Final = ("camera_turn_1", "camera_turn_2", "camera_turn_3")  # rad

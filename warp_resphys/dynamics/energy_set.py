@@ -21,11 +21,10 @@ from ..energies.surfaces import BoundSurfaceContact
 from ..fem.body import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import InputError
-from ..stepping.constants import Constants, Mass
 from ..stepping.inputs import Inputs
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Quantity
-from ..stepping.state import State
+from ..stepping.state import Constants, Mass, State
 
 
 class EnergySet:

@@ -20,11 +20,10 @@ from ..io.errors import ConvergenceError, InputError
 from ..io.machine import find_device
 from ..linalg.threads import shards_of
 from ..stepping.adjoints import refuse_transforms
-from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
 from ..stepping.quantity import Quantity
-from ..stepping.state import State
+from ..stepping.state import Constants, State
 from .assembly import BlockPattern
 from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium

@@ -28,11 +28,10 @@ from ..fem.elements import Points
 from ..io.errors import InputError
 from ..kernels.points import MatrixPoints, VectorPoints
 from ..mesh.mesh import Mesh
-from ..stepping.constants import Constants, Mass
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Parameter, Quantity
-from ..stepping.state import ImplicitStage, State
+from ..stepping.state import Constants, ImplicitStage, Mass, State
 from .launcher import Launcher, struct_of, warp_view
 
 Values = Mapping[str, torch.Tensor | None]

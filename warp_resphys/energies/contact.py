@@ -41,11 +41,10 @@ from ..io.errors import InputError, listed, naming
 from ..kernels import contact as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces, face_triangles
-from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations
-from ..stepping.state import State
+from ..stepping.state import Constants, State
 from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
 from .launcher import Launcher, struct_of, warp_view

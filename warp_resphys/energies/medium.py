@@ -25,9 +25,9 @@ from ..io.errors import InputError
 from ..kernels import medium as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces
-from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
+from ..stepping.state import Constants
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, points_reader, value_of
 from .launcher import Launcher, warp_view
 

@@ -10,9 +10,8 @@ import torch
 from ..fem.body import Body
 from ..fem.elements import Points
 from ..io.errors import InputError
-from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
-from ..stepping.state import ImplicitStage, State
+from ..stepping.state import Constants, ImplicitStage, State
 from .base import Energy, EnergyStep, Term
 from .hysteresis import Hysteresis
 from .materials import Material

@@ -26,8 +26,8 @@ from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.elements import Points, SolidPoints, volume_points
 from ..kernels import rigid as kernels
 from ..mesh.mesh import Mesh
-from ..stepping.constants import Mass
 from ..stepping.quantity import Parameter, Quantity
+from ..stepping.state import Mass
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
 from .launcher import Launcher, warp_view
 from .materials import Corotated

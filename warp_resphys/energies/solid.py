@@ -18,8 +18,8 @@ from ..io.errors import InputError
 from ..kernels import lanes
 from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
-from ..stepping.constants import Constants, Mass
 from ..stepping.quantity import Parameter, Quantity
+from ..stepping.state import Constants, Mass
 from .base import (
     Adjoint,
     BoundEnergy,

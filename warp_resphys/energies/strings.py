@@ -28,10 +28,9 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
 from ..mesh.mesh import Mesh
-from ..stepping.constants import Constants
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from ..stepping.state import ImplicitStage, State
+from ..stepping.state import Constants, ImplicitStage, State
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher
 from .pointwise import PartPoints, ReadingTerm

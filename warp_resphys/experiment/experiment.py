@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ..data.input_response import InputResponse, with_means
 from ..data.marker_view import ViewedMarkers
-from ..data.markers import Markers
-from ..data.observation import WHOLE_STATE, Observation
+from ..data.markers import WHOLE_STATE, Markers, Observation
 from ..data.trials import Trials
 from ..dynamics.frames import BaseFrame, VertexFrames, base_movement
 from ..dynamics.simulator import Simulator

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ..data.actuation import draw_inputs, wave_inputs
 from ..data.base_motion import in_frame, rigid
+from ..data.input_response import draw_inputs, wave_inputs
 from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
 from ..data.registration import RigidTransform

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ..data.observation import WHOLE_STATE
+from ..data.markers import WHOLE_STATE
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import unit_of
 from ..energies.materials import MASS_DAMPING

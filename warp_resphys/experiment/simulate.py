@@ -19,8 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.base_motion import check_steps, contact_inputs, prescribed, prescribed_all, rigid
-from ..data.markers import MarkerMap
-from ..data.observation import WHOLE_STATE, Observation
+from ..data.markers import WHOLE_STATE, MarkerMap, Observation
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
@@ -28,7 +27,6 @@ from ..io.fan_out import ALONE
 from ..io.stages import StageContext
 from ..mesh.location import locate
 from ..mesh.mesh import Mesh, select_vertices
-from ..mesh.poses import twisted
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.stages import PlayedSettings, StageSettings
@@ -42,6 +40,7 @@ from ..settings.trials import (
     Trial,
 )
 from ..stepping.inputs import Inputs
+from ..stepping.rotations import twisted
 from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET, GIVEN, Dataset

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from ..data.observation import WHOLE_STATE, Observation, WholeState
+from ..data.markers import WHOLE_STATE, Observation, WholeState
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError

@@ -16,8 +16,7 @@ from typing import Any
 import torch
 from typing_extensions import override
 
-from ..data.markers import Markers
-from ..data.observation import Observation
+from ..data.markers import Markers, Observation
 from ..io.arrays import FloatArray
 
 _DIRECTIONS = 3

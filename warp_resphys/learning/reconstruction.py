@@ -22,8 +22,7 @@ import scipy.optimize
 import torch
 from typing_extensions import override
 
-from ..data.markers import Markers
-from ..data.observation import WHOLE_STATE, Observation, WholeState
+from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
 from ..dynamics.modes import vibration_modes
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from typing_extensions import override
 
-from ..data.observation import WHOLE_STATE, Observation
+from ..data.markers import WHOLE_STATE, Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError

@@ -14,7 +14,7 @@ from functools import cached_property
 import torch
 
 from ..data.input_response import InputResponse, response_of
-from ..data.observation import Observation
+from ..data.markers import Observation
 from ..data.trials import Trials
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator

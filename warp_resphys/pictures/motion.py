@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from ..data.camera import jacobians
-from ..data.observation import WHOLE_STATE
+from ..data.markers import WHOLE_STATE
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import IntArray

@@ -10,7 +10,7 @@ import shapely
 import torch
 
 from ..data.camera import CORRECTIONS, PLACES, PlacedCamera
-from ..data.observation import Observation
+from ..data.markers import Observation
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError

@@ -64,7 +64,7 @@ class MotionSettings(Settings):
 
 
 class WaveSettings(Settings):
-    """Periodic inputs, `data.actuation.wave_inputs`."""
+    """Periodic inputs, `data.input_response.wave_inputs`."""
 
     frequency: Positive = setting(unit="Hz")
     phases: Some[float] = setting(description="initial phases, one per chamber, tendon or muscle", unit="rad")
@@ -475,7 +475,7 @@ class MarkerSettings(BindingSettings):
 
 
 class SequenceSettings(Settings):
-    """Random inputs of a laboratory, `data.actuation.draw_inputs`."""
+    """Random inputs of a laboratory, `data.input_response.draw_inputs`."""
 
     mean: float = setting(8e3, "mean, in the unit of the input")
     deviation: Positive = setting(9e3, "standard deviation, in the unit of the input")

@@ -9,8 +9,8 @@ from typing import Literal, get_args
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..mesh.poses import twisted
 from ..stepping.inputs import Inputs
+from ..stepping.rotations import twisted
 from ..stepping.state import State
 
 Pose = Literal["rest", "bent", "twisted"]

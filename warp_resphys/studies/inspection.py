@@ -19,8 +19,7 @@ from ..io.errors import InputError, MeshError
 from ..io.settings import Many, Positive, Word, setting
 from ..io.tables import aligned
 from ..mesh.arm import name_surfaces
-from ..mesh.cavities import open_cavities
-from ..mesh.chambers import find_chambers
+from ..mesh.chambers import find_chambers, open_cavities
 from ..mesh.mesh import Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
 from ..mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh

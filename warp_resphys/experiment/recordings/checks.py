@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...data.actuation import draw_inputs
+from ...data.input_response import draw_inputs
 from ...data.markers import follow_vertices
 from ...data.registration import axes_rotation
 from ...data.rigid_bodies import owners

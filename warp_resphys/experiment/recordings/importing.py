@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ...data.actuation import NO_INPUT
 from ...data.base_motion import at_times, check_steps
+from ...data.input_response import NO_INPUT
 from ...data.recordings.processing import smooth
 from ...data.recordings.quality import quality
 from ...data.registration import root_mean_square

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...data.actuation import NO_INPUT, check_inputs
 from ...data.base_motion import followed, in_frame, prescribed, prescribed_all, rigid
+from ...data.input_response import NO_INPUT, check_inputs
 from ...data.marker_view import MarkerView
 from ...data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release, valve_opening
 from ...data.recordings.quality import check_base, check_motion

@@ -3,8 +3,8 @@ from .data.camera import CameraMarkers as CameraMarkers
 from .data.camera import Lens as Lens
 from .data.camera import PlacedCamera as PlacedCamera
 from .data.markers import Markers as Markers
-from .data.markers import bind_markers as bind_markers
 from .data.markers import Observation as Observation
+from .data.markers import bind_markers as bind_markers
 from .data.recordings.reading import read_recording as read_recording
 from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator

@@ -14,7 +14,7 @@ from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
 from warp_resphys import Contact, HalfSpace, pipeline
 from warp_resphys.control import sampling
 from warp_resphys.control.controllers import Estimator
-from warp_resphys.control.files import plans_file, read_plan, read_reduced, reduced_file
+from warp_resphys.control.files import PLANNED, plans_file, read_motion, read_reduced, reduced_file
 from warp_resphys.control.polynomials import SquaredPolynomial
 from warp_resphys.control.reduction import reduce
 from warp_resphys.control.sampling import check_plannable
@@ -253,7 +253,7 @@ class TestReducedTwin:
 @pytest.mark.slow
 class TestPlans:
     def test_plans_stay_within_bounds_and_rates(self, folder):
-        plan, limits = read_plan(folder / plans_file("resphys"), "circle_0.4s"), control_of(folder).limits
+        plan, limits = read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s"), control_of(folder).limits
         assert plan.inputs.min() > limits.low - 1e-3
         assert plan.inputs.max() < limits.high + 1e-3
         assert plan.inputs.max() > 0.1
@@ -261,7 +261,7 @@ class TestPlans:
         assert steps.max() < 1.01 * limits.rate * 0.01
 
     def test_corrections_by_the_simulator_bring_it_closer(self, folder):
-        errors = read_plan(folder / plans_file("resphys"), "circle_0.4s").errors_mm
+        errors = read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s").errors_mm
         assert len(errors) == 3
         assert errors.min() < 0.7 * errors[0]
 
@@ -279,7 +279,9 @@ class TestDriving:
             wanted = 1e3 * np.linalg.norm(points[row] - path, axis=1).mean()
             assert tracking[name]["mean_mm"] == pytest.approx(wanted)
             assert np.ptp(points[row], axis=0).max() > 1e-3
-        np.testing.assert_allclose(inputs[1], read_plan(folder / plans_file("resphys"), "circle_0.4s").inputs)
+        np.testing.assert_allclose(
+            inputs[1], read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s").inputs
+        )
 
     def test_a_replay_repeats_the_motion(self, folder):
         names = ["receding_resphys", "feedback_5"]

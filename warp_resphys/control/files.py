@@ -1,9 +1,9 @@
 """Files of the control stages in a run folder: reduced models, plans, driven motions, baselines."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
@@ -20,18 +20,9 @@ from .reduced_force import ReducedForce
 
 BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"
-_FORCE: Final = (
-    "places",
-    "seen",
-    "conditions",
-    "conditions_by",
-    "usual",
-    "push",
-)  # of a learned force, but its network
+_FORCE: Final = ("places", "seen", "conditions", "conditions_by", "usual", "push")  # of a learned force without network
 _KINDS: Final = {"damping": SquaredPolynomial, "branches": SquaredPolynomial}
 _BASELINES: Final = "baselines"
-_PLANS: Final = "plans"
-_DRIVEN: Final = DRIVEN.removesuffix(".h5")
 _UNITS: Final = {"path": "m", "points": "m", "markers": "m", "errors_mm": "mm", "seconds": "s"}
 _PLAIN: Final = ("time_step", "validation_mm")  # of a linear model
 
@@ -129,38 +120,26 @@ class DrivenMotion:
     seconds: FloatArray
 
 
-def write_plans(path: Path, motions: Mapping[str, PlannedMotion]) -> None:
-    """Writes planned motions by name."""
-    _write_motions(path, _PLANS, {}, motions)
+PLANNED: Final = ("plans", PlannedMotion)  # kinds of files, and of motions in them
+PLAYED: Final = (DRIVEN.removesuffix(".h5"), DrivenMotion)
+
+Motion = TypeVar("Motion", PlannedMotion, DrivenMotion)
 
 
-def read_plan(path: Path, motion: str) -> PlannedMotion:
-    """Reads one planned motion."""
-    return PlannedMotion(*_read_motion(path, _PLANS, motion, PlannedMotion))
-
-
-def write_driven(path: Path, controllers: Sequence[str], time_step: float, motions: Mapping[str, DrivenMotion]) -> None:
-    """Writes driven motions by name."""
-    _write_motions(path, _DRIVEN, {"controllers": list(controllers), "time_step": time_step}, motions)
-
-
-def _write_motions(path: Path, kind: str, more: Mapping[str, Any], motions: Mapping[str, Any]) -> None:
-    with atomic_hdf5(path, kind, {"names": list(motions), **more}) as file:
+def write_motions(path: Path, kind: tuple[str, type[Motion]], motions: Mapping[str, Motion], **more: Any) -> None:
+    """Writes motions by name, and what they have in common."""
+    with atomic_hdf5(path, kind[0], {"names": list(motions), **more}) as file:
         for name, motion in motions.items():
             group = file.create_group(name)
             for key, values in vars(motion).items():
-                time_axis = int(kind == _DRIVEN and key != "path")
+                time_axis = int(kind[1] is DrivenMotion and key != "path")
                 create(group, key, values, _UNITS.get(key, "1"), time_axis)
 
 
-def read_driven(path: Path, motion: str) -> DrivenMotion:
-    """Reads one driven motion."""
-    return DrivenMotion(*_read_motion(path, _DRIVEN, motion, DrivenMotion))
-
-
-def _read_motion(path: Path, kind: str, motion: str, made: type) -> list[FloatArray]:
-    with read_hdf5(path, kind) as file:
-        return [read_array(file, f"{motion}/{field.name}").astype(np.float64) for field in fields(made)]
+def read_motion(path: Path, kind: tuple[str, type[Motion]], motion: str) -> Motion:
+    """Reads one motion."""
+    with read_hdf5(path, kind[0]) as file:
+        return kind[1](*(read_array(file, f"{motion}/{key.name}").astype(np.float64) for key in fields(kind[1])))
 
 
 def write_baselines(path: Path, linear: LinearModel, jacobian: FloatArray) -> None:

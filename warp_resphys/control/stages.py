@@ -23,27 +23,22 @@ from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stages import StageSettings
 from .baselines import fit_linear
-from .controllers import (
-    Controller,
-    JacobianFeedback,
-    LinearRecedingHorizon,
-    RecedingHorizon,
-)
+from .controllers import Controller, JacobianFeedback, LinearRecedingHorizon, RecedingHorizon
 from .files import (
     BASELINES,
+    PLANNED,
+    PLAYED,
     DrivenMotion,
     PlannedMotion,
     plan_table,
     plans_file,
     read_baselines,
-    read_driven,
-    read_plan,
+    read_motion,
     read_quality,
     read_reduced,
     reduced_file,
     write_baselines,
-    write_driven,
-    write_plans,
+    write_motions,
     write_reduced,
 )
 from .plan import follow, tracked_of
@@ -94,7 +89,7 @@ def plan_motions(context: StageContext) -> None:
             paths = np.stack([task.timed(path, seconds, start) for path in task.paths])
             followed = follow(robot, reduced, partial(task.planner, reduced), paths, plan.corrections, progress.advance)
             plans |= dict(zip(_names(task, seconds), followed, strict=True))
-    write_plans(context.run_dir / plans_file(model), plans)
+    write_motions(context.run_dir / plans_file(model), PLANNED, plans)
     driven = driven_input(robot)
     for name, motion in plans.items():
         columns = input_columns(driven.name, driven.parts, driven.unit, motion.inputs)
@@ -167,9 +162,10 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     for part in parts:
         (name,) = part.names
         points, inputs, took = (part.read(key) for key in ("points", "inputs", "seconds"))
-        path = read_plan(context.run_dir / plans_file(control.models[-1]), name).path
+        path = read_motion(context.run_dir / plans_file(control.models[-1]), PLANNED, name).path
         motions[name] = DrivenMotion(path, points, inputs, took)
-    write_driven(context.run_dir / DRIVEN, controllers, robot.time_step, motions)
+    common = {"controllers": controllers, "time_step": robot.time_step}
+    write_motions(context.run_dir / DRIVEN, PLAYED, motions, **common)
     write_json(context.run_dir / CONTROL, _summary(context.run_dir, control, controllers, motions))
     remove_parts(context)
 
@@ -191,7 +187,7 @@ def _driven(part: TrialPart, report: Report) -> Arrays:
     robot = load(folder, control.models[-1], settings.device)
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
     laboratory = Laboratory(settings.played, folder, driven.name, count, motions_of(control).index(name))
-    plans = {model: read_plan(folder / plans_file(model), name) for model in control.models}
+    plans = {model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models}
     rest, path = laboratory.rest(), plans[control.models[-1]].path
     linear, jacobian = read_baselines(folder / BASELINES)
     controllers = list[Controller]()
@@ -241,7 +237,7 @@ def _summary(
         }
     times = np.concatenate([motion.seconds for motion in motions.values()], axis=1)
     planned = {
-        model: {name: read_plan(folder / plans_file(model), name).errors_mm.tolist() for name in motions}
+        model: {name: read_motion(folder / plans_file(model), PLANNED, name).errors_mm.tolist() for name in motions}
         for model in control.models
     }
     models = {model: read_quality(folder / reduced_file(model)) for model in control.models}
@@ -296,7 +292,7 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     _check("motion", [motion], motions_of(control))
     _check("controllers", controllers, names)
     robot = load(folder, control.models[-1], settings.device)
-    driven, rows = read_driven(folder / DRIVEN, motion), [names.index(name) for name in controllers]
+    driven, rows = read_motion(folder / DRIVEN, PLAYED, motion), [names.index(name) for name in controllers]
     steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
     laboratory = Laboratory(settings.played, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control.tracked)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..data.registration import RigidTransform, kabsch
+from ..data.registration import kabsch
 from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import make_setup
@@ -227,7 +227,10 @@ class Laboratory(RobotWorld):
         super().__init__(robot, name, count, time_step=settings.time_step)
         self.noise = settings.laboratory.noise
         self._seeds = (settings.seed, _STREAM, seed)
-        self._frame = _registered(run_dir, make_setup(settings).reference, tuple(settings.binding.reference))
+        trials, reference = read_json(run_dir / REGISTRATION).values(), make_setup(settings).reference
+        seen = [trial["positions"] for trial in trials if "positions" in trial]
+        places = np.mean([[own[label] for label in settings.binding.reference] for own in seen], axis=0)
+        self._frame = kabsch(reference, places)  # from the frame of the body to that of the experiment
 
     @override
     def markers(self) -> FloatArray:
@@ -251,13 +254,6 @@ class Laboratory(RobotWorld):
     def rest(self, frames: int = 20) -> FloatArray:
         """Returns noisy markers (B, M, 3) averaged over frames taken before anything moves [m]."""
         return np.asarray(np.mean([self.seen(_BEFORE + number) for number in range(frames)], axis=0))
-
-
-def _registered(run_dir: Path, reference: FloatArray, labels: tuple[str, ...]) -> RigidTransform:
-    """Transform from the frame of the laboratory's body to the frame of the experiment."""
-    trials = read_json(run_dir / REGISTRATION).values()
-    positions = [trial["positions"] for trial in trials if "positions" in trial]
-    return kabsch(reference, np.mean([[places[label] for label in labels] for places in positions], axis=0))
 
 
 class ReducedWorld(World):

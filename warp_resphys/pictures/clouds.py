@@ -44,19 +44,17 @@ class Cloud:
     reach: float = 0.05  # distance from which points have no effect [m]
 
     @classmethod
-    def of_depth(cls, depth: FloatArray, mask: Mask | None = None, noise: float = 1e-3, reach: float = 0.05) -> Self:
+    def of_depth(cls, depth: FloatArray, mask: Mask | None = None) -> Self:
         """Returns the points of a depth image.
 
         Args:
             depth: (H, W) along the axis of the lens, zero or not finite where there is none [m].
             mask: (H, W) whether a pixel shows the body; all of them, if left out.
-            noise: see above.
-            reach: see above.
         """
         seen = np.isfinite(depth) & (depth > 0.0) & (True if mask is None else mask)
         rows, columns = np.nonzero(seen)
         measured = np.stack([columns, rows, depth[seen]], 1).astype(np.float64)
-        return cls(measured, measured * (1.0, 1.0, 0.0), noise, reach)  # at depth zero is the camera
+        return cls(measured, measured * (1.0, 1.0, 0.0))  # at depth zero is the camera
 
     def around(self, camera: PlacedCamera, mesh: Mesh, clamped: IntArray, count: int = 1000, seed: int = 0) -> Self:
         """Returns at most a number of points that may be of a body, in their order along the longest axis.

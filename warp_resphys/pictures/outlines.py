@@ -27,6 +27,7 @@ Mask = BoolArray
 _SMOOTH = 1.0  # px, of a mask before its contour is drawn: a contour of pixels is a staircase
 _PIXEL = 1.0  # px
 _ON = 1e-3  # px, between the border of the seen body and points that form it
+_APART = 2.0  # px, between points of an outline
 _NEAR = 0.5  # px, between points of an outline to which distances are measured
 _BORDER = 2.0  # px, at which a body is cut off by its picture
 _LEAST = 8  # points of an outline
@@ -43,12 +44,11 @@ class Outline:
     outward: FloatArray  # (Q, 2) unit vectors across it there
 
     @classmethod
-    def of_mask(cls, mask: Mask, spacing: float = 2.0) -> "Outline":
+    def of_mask(cls, mask: Mask) -> "Outline":
         """Returns the outline of a mask, to a fraction of a pixel, without the borders of the picture.
 
         Args:
             mask: (H, W) whether a pixel shows the body; that of row i and column j is at (j, i) [px].
-            spacing: of the points [px].
 
         Raises:
             InputError: nothing is seen, or the body fills the picture.
@@ -59,7 +59,7 @@ class Outline:
         if not lines:
             raise InputError("the mask shows nothing of the body: check the picture, or the colours of its mask.")
         size = (mask.shape[1], mask.shape[0])
-        points, near = (np.concatenate([_evenly(line, by) for line in lines]) for by in (spacing, _NEAR))
+        points, near = (np.concatenate([_evenly(line, by) for line in lines]) for by in (_APART, _NEAR))
         points, near = points[within(points, size)], near[within(near, size)]
         if not len(points):
             raise InputError("the mask fills the picture: no outline of the body is in it.")

@@ -205,7 +205,13 @@ class LiveTwin:
         return True
 
     def _take(self, packet: Packet) -> None:
-        for moved in [packet] if not self._settings.align else self._aligned(packet):
+        packets = [packet]
+        if self._settings.align:
+            if self._alignment is None:
+                at_rest = self.robot.observe(self.robot.settle(1, **packet.inputs))[0]
+                self._alignment = Alignment(self.robot, at_rest.double().cpu().numpy())
+            packets = self._alignment.moved(packet)
+        for moved in packets:
             self.twin.take(moved.time, moved.markers or None, **moved.inputs)
             if moved.plan is not None:
                 self.twin.plan(moved.plan)
@@ -223,12 +229,6 @@ class LiveTwin:
             with suppress(ConvergenceError):  # The twin counts it.
                 self._prediction = self.twin.ahead()
             self._spent = time.perf_counter() - began
-
-    def _aligned(self, packet: Packet) -> list[Packet]:
-        if self._alignment is None:
-            at_rest = self.robot.observe(self.robot.settle(1, **packet.inputs))[0]
-            self._alignment = Alignment(self.robot, at_rest.double().cpu().numpy())
-        return self._alignment.moved(packet)
 
     def _due(self) -> Iterator[Packet]:
         if self._listener is not None:

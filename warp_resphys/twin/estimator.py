@@ -248,9 +248,9 @@ class TwinEstimator(ABC, Generic[B]):
         covariance[:, known] /= much
         return replace(belief, bias=fades * belief.bias, covariance=covariance)
 
-    def markers(self, belief: B, ago: float = 0.0) -> tuple[FloatArray, FloatArray]:
-        """Returns markers (M, 3) some time ago, and the standard deviations of their coordinates [m]."""
-        now, slopes, _ = self._seen(belief, ago)
+    def markers(self, belief: B) -> tuple[FloatArray, FloatArray]:
+        """Returns markers (M, 3), and the standard deviations of their coordinates [m]."""
+        now, slopes, _ = self._seen(belief, 0.0)
         spread = np.einsum("min,nk,mik->mi", slopes, belief.covariance, slopes, optimize=True)
         return now, np.sqrt(np.maximum(spread, 0.0))
 

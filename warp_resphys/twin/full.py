@@ -72,13 +72,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         ConvergenceError: there is no equilibrium.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        inputs: Mapping[str, Given],
-        refine: Mapping[str, float],
-        noise: float,
-    ) -> None:
+    def __init__(self, robot: Robot, inputs: Mapping[str, Given], refine: Mapping[str, float], noise: float) -> None:
         if robot.is_data_driven:
             raise InputError("a network in the simulator's place cannot be corrected by a force: load another model.")
         if any(isinstance(energy, SurfaceContact) for energy in robot.simulator.body.energies):
@@ -95,19 +89,16 @@ class FullEstimator(TwinEstimator[FullBelief]):
                 "leave refine out."
             )
         self._refined, self.robot = dict(refine), robot
-        self._check()
+        named = [name for name in refine if name != PAYLOAD.name or name not in robot.inputs]
+        check_names(named, identifiable_parameters(robot.simulator))
+        for name, deviation in refine.items():
+            if not deviation > 0.0:
+                raise InputError(f"refine.{name} is {deviation:g}: give its standard deviation, which is positive.")
         self._known = self._values(inputs)
         resting = at_rest(robot, 1, inputs)
         self.tangent = StepTangent.of(robot, resting, inputs, _MODES)
         super().__init__(robot, inputs, self._refined, self.tangent.frequencies, self.tangent.size, noise)
         self._apart = _DIFFERENCE * self._prior
-
-    def _check(self) -> None:
-        named = [name for name in self._refined if name != PAYLOAD.name or name not in self.robot.inputs]
-        check_names(named, identifiable_parameters(self.robot.simulator))
-        for name, deviation in self._refined.items():
-            if not deviation > 0.0:
-                raise InputError(f"refine.{name} is {deviation:g}: give its standard deviation, which is positive.")
 
     def _values(self, inputs: Mapping[str, Given]) -> FloatArray:
         """First values (P,) of the refined parameters."""

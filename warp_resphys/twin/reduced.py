@@ -50,13 +50,7 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
 
     engine = "reduced model"
 
-    def __init__(
-        self,
-        robot: Robot,
-        inputs: Mapping[str, Given],
-        refine: Mapping[str, float],
-        noise: float,
-    ) -> None:
+    def __init__(self, robot: Robot, inputs: Mapping[str, Given], refine: Mapping[str, float], noise: float) -> None:
         if refine:
             raise InputError(
                 f"a reduced model has no {next(iter(refine))} to refine: set engine=full, in which a twin refines it."

@@ -374,14 +374,11 @@ def picture_metrics(folder: Path, run: RunSettings) -> dict[str, Any]:
     """Returns the content of metrics.json."""
     data = run.pictures
     assert data is not None
-    stages = [
-        stage for stage in ("laboratory", "import", "identify", COMPARE) if stage != "laboratory" or data.folder is None
-    ]
-    rows = read_json(folder / DIFFERENCES)["rows"]
+    rows, stages = read_json(folder / DIFFERENCES)["rows"], ["laboratory", "import", "identify", COMPARE]
     return {
         "poses": [asdict(result) for result in summary_of(rows, data)],
         "parameters": read_json(folder / IDENTIFICATION)["sysid"]["parameters"],
-        **resources_used(folder, stages),
+        **resources_used(folder, stages[data.folder is not None :]),
         "versions": package_versions(),
         "device": str(simulation_device(run.device)),
     }

@@ -135,15 +135,15 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]:
-    """Returns the median times of the parts of a solver's iteration [ms] in the last state of a batch."""
-    workspace = simulator.workspace(batch)
-    potential = workspace.gather()
+    """Returns the median times of the parts of an iteration [ms] in the last state of a batch, of its first shard."""
+    workspace = simulator.workspace(batch).parts[0][1]
+    potential = workspace.potential
     linear = workspace.linear_solver(simulator.settings.linear_solver, simulator.dtype)
     assemble = HessianAssembly(potential, linear, workspace.pattern)
     potential.update_tangent()
     values = assemble().to(simulator.dtype, copy=True)
     factor = linear.factor(values.clone())
-    right = torch.ones(batch, linear.n, 1, device=potential.device, dtype=simulator.dtype)
+    right = torch.ones(potential.batch, linear.n, 1, device=potential.device, dtype=simulator.dtype)
     parts: dict[str, Callable[[], object]] = {
         "local_step": potential.evaluate,
         "tangent": potential.update_tangent,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from warp_resphys.experiment.files import Dataset, driving, read_dataset, since_change
+from warp_resphys.experiment.files import Dataset, driving, first_change, read_dataset, since_change
 from warp_resphys.io.files import read_hdf5
 
 TIMES = 0.1 * np.arange(6)
@@ -60,3 +60,11 @@ def test_the_time_since_a_change_counts_all_inputs_of_a_trial():
     np.testing.assert_allclose(since[0], [0.0, 0.1, 0.0, 0.1, 0.0, 0.1], atol=1e-12)
     np.testing.assert_allclose(since[1], TIMES)  # Since its release.
     assert np.isinf(since[2]).all()
+
+
+def test_inputs_begin_to_change_after_noise():
+    valve = 1e-3 * (np.arange(24.0).reshape(2, 12, 1) % 4)
+    valve[0, 6:] += 1.0
+    own = dataset(("rest", "rest"), pressure=valve + 0.5)
+    assert first_change(own, "a") == TIMES[3]
+    assert first_change(own, "b") == 0.0

@@ -31,7 +31,7 @@ from ..settings.stages import StageSettings
 from .build import finer
 from .checks import check_memory
 from .experiment import LEARNED, Experiment
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, Dataset, driving, phases_of, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, Dataset, first_change, phases_of, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
@@ -349,7 +349,7 @@ def check_mesh(context: StageContext) -> None:
             for experiment in experiments:
                 replay = experiment.replay(experiment.model_simulator(model), names, model)
                 if moving:
-                    seconds = _first_change(experiment, names[0]) + CHECKED_SECONDS
+                    seconds = first_change(experiment.dataset, names[0]) + CHECKED_SECONDS
                     replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
                 points = replay(experiment.start(replay, model), experiment.parameters(model))[0].cpu().numpy()
                 shown.append(as_markers(points, experiment.dataset.labels))
@@ -362,12 +362,3 @@ def check_mesh(context: StageContext) -> None:
     except (ConvergenceError, InputError) as error:
         content["failed"] = str(error)
     write_json(context.run_dir / MESH_CHECK, content)
-
-
-def _first_change(experiment: Experiment, name: str) -> float:
-    """Time at which the inputs of a trial begin to change [s]; zero if none does."""
-    times = experiment.dataset.times[experiment.dataset.rows([name])[0]]
-    acting = np.concatenate(
-        [times[:, None] * 0.0, *(own[0] for own in driving(experiment.dataset, [name]).values())], 1
-    )
-    return float(times[int((acting != acting[:1]).any(1).argmax())])

@@ -355,6 +355,12 @@ def since_change(dataset: Dataset, names: Sequence[str]) -> FloatArray:
     return since
 
 
+def first_change(dataset: Dataset, name: str) -> float:
+    """Returns the time at which the inputs of a trial begin to change by more than noise [s]; zero if none does."""
+    changes = np.flatnonzero(since_change(dataset, [name])[0] == 0.0)  # The first frame counts as one.
+    return float(dataset.times[dataset.rows([name])[0], changes[1]]) if len(changes) > 1 else 0.0
+
+
 def phases_of(dataset: Dataset, names: Sequence[str]) -> NDArray[np.str_]:
     """Returns the phases (R, T) of driven trials, see `learning.metrics.phases`; empty words for others and for poses.
 

@@ -47,19 +47,15 @@ def test_masked_gaps_stay_and_short_ones_are_filled():
     recording.positions[100:103, 0] = np.nan
     recording.positions[150:170, 1] = np.nan
     recording.positions[:4, 2] = np.nan
-    filled = fill_gaps(recording, 5, mask_long=True)
+    filled = fill_gaps(recording, 5)
     np.testing.assert_allclose(filled.positions[100:103, 0], true[100:103, 0], atol=2e-4)
     assert filled.seen[:, 0].all()
     np.testing.assert_array_equal(np.flatnonzero(~filled.seen[:, 1]), np.arange(150, 170))
     np.testing.assert_array_equal(np.flatnonzero(~filled.seen[:, 2]), np.arange(4))
     np.testing.assert_array_equal(filled.positions[recording.seen], recording.positions[recording.seen])
-    with pytest.raises(DataFileError, match=r"swing\.c3d: marker tip 2 is occluded in frames 150 to 169"):
-        fill_gaps(recording, 5)
-    whole = fill_gaps(recording, 20)  # At the ends, with the nearest sample.
-    np.testing.assert_array_equal(whole.positions[:4, 2], np.stack([true[4, 2]] * 4))
     recording.positions[:, 3] = np.nan
     with pytest.raises(DataFileError, match=r"swing\.c3d: marker base 2 is seen in 0 of 300 frames"):
-        fill_gaps(recording, 5, mask_long=True)
+        fill_gaps(recording, 5)
 
 
 def test_a_multiple_of_the_rate_is_thinned_exactly():
@@ -91,15 +87,14 @@ def test_interpolation_follows_a_swing(rate):
     np.testing.assert_allclose(new.actuation[:, 0], true, atol=0.01 * (omega / 100.0) ** 2 / 8.0)
 
 
-def test_trimming_keeps_the_time_from_the_release_and_the_rest_shape():
+def test_trimming_keeps_the_time_from_the_release():
     recording = swinging()
-    release = release_of(recording, TIP)
+    release = release_of(recording, TIP, 5)
     assert release.frame == pytest.approx(RELEASE, abs=0.25)
     swing = trim_to_release(recording, Release(RELEASE, release.rest), seconds=1.0)
     assert swing.start == pytest.approx(0.006)
     np.testing.assert_array_equal(swing.positions, recording.positions[61:161])
     assert swing.time[-1] == pytest.approx(0.996)
-    np.testing.assert_allclose(swing.rest, PLACES, atol=4.0 * NOISE)
     with pytest.raises(DataFileError, match=r"swing\.c3d ends 1 frames after its release"):
         trim_to_release(recording, Release(298.5, (200, 290)))
 
@@ -107,20 +102,20 @@ def test_trimming_keeps_the_time_from_the_release_and_the_rest_shape():
 def test_the_release_is_found_from_the_markers_that_are_seen():
     recording = swinging()
     recording.positions[58:90, 0] = np.nan
-    assert release_of(recording, TIP).frame == pytest.approx(RELEASE, abs=0.25)
+    assert release_of(recording, TIP, 5).frame == pytest.approx(RELEASE, abs=0.25)
     recording.positions[:8] = np.nan
     recording.positions[200:220, 1] = np.nan
-    result = release_of(recording, TIP)
+    result = release_of(recording, TIP, 5)
     assert result.frame == pytest.approx(RELEASE, abs=0.25)
     assert 8 <= result.rest[0] < result.rest[1] <= 61
     recording.positions[50:70, 1] = np.nan
     with pytest.raises(
         DataFileError, match=r"in swing\.c3d, frames 8 to 57, the first without a long gap: the tip never"
     ):
-        release_of(recording, TIP)
+        release_of(recording, TIP, 5)
     recording = swinging()
     with pytest.raises(DataFileError, match=r"No release found in swing\.c3d"):
-        release_of(recording, BASE)
+        release_of(recording, BASE, 5)
 
 
 def test_a_swing_has_no_jumps():

@@ -178,7 +178,7 @@ class TestHdf5:
             ("none.h5", "does not exist"),
             (".", "Is a directory"),
         ]:
-            with pytest.raises(DataFileError, match=message), files.open_hdf5(tmp_path / name):
+            with pytest.raises(DataFileError, match=message), files.read_hdf5(tmp_path / name, "trajectories"):
                 pass
 
     def test_missing_and_misshapen_datasets(self, trajectory):
@@ -208,12 +208,12 @@ class TestHdf5:
                 group.create_virtual_dataset("x", layout)
         with (
             pytest.raises(DataFileError, match="'/inner/x'"),
-            files.open_hdf5(path),
+            files.read_hdf5(path, "trajectories"),
         ):
             pass
 
     def test_errors_of_other_files_are_not_blamed_on_this_one(self, trajectory, tmp_path):
-        with pytest.raises(FileNotFoundError), files.open_hdf5(trajectory):
+        with pytest.raises(FileNotFoundError), files.read_hdf5(trajectory, "trajectories"):
             (tmp_path / "other").read_text()
 
 

@@ -114,41 +114,13 @@ def create(group: h5py.Group, name: str, array: npt.ArrayLike, units: str = "1",
         time_axis: The axis of the steps.
     """
     values = np.asarray(array)
-    chunks = chunk_shape(values.shape, time_axis)
+    chunks = None  # one index before the time axis, up to 64 steps, and all indices after it
+    if values.size and values.shape:
+        steps = min(CHUNK_STEPS, values.shape[time_axis])
+        chunks = (*(1,) * time_axis, steps, *values.shape[time_axis + 1 :])
     dataset = group.create_dataset(name, data=values, chunks=chunks, fletcher32=chunks is not None)
     dataset.attrs["units"] = units
     return dataset
-
-
-def chunk_shape(shape: tuple[int, ...], time_axis: int = 0) -> tuple[int, ...] | None:
-    """Returns chunks of one index before the time axis, up to 64 steps, and all indices after it; None without data."""
-    if not shape or 0 in shape:
-        return None
-    return (*(1,) * time_axis, min(CHUNK_STEPS, shape[time_axis]), *shape[time_axis + 1 :])
-
-
-@contextlib.contextmanager
-def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
-    """Opens an HDF5 file of any origin for reading.
-
-    Raises:
-        DataFileError: the file is missing, unreadable, damaged or not HDF5, or it refers to other files (external
-            links, external storage, virtual datasets).
-    """
-    path = Path(path)
-    with contextlib.ExitStack() as stack:
-        try:
-            path.open("rb").close()  # The library's error for a file that cannot be opened has no cause.
-            file = stack.enter_context(h5py.File(path, "r"))
-            refuse_data_elsewhere(file)
-        except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise hdf5_error(path, error) from error
-        try:
-            yield file
-        except OSError as error:
-            if error.filename is not None:
-                raise
-            raise hdf5_error(path, error) from error
 
 
 def hdf5_error(path: Path, error: Exception) -> DataFileError:
@@ -173,24 +145,37 @@ def read_hdf5(path: str | Path, expected_kind: str) -> Iterator[h5py.File]:
     """Opens a file of `atomic_hdf5`.
 
     Raises:
-        DataFileError: the file is missing, unreadable or damaged, of another program, kind or version, or unfinished.
+        DataFileError: the file is missing, unreadable or damaged, refers to other files (external links, external
+            storage, virtual datasets), is of another program, kind or version, or unfinished.
     """
-    with open_hdf5(path) as file:
-        origin, version, kind, complete = (
-            str(file.attrs.get(name)) for name in ("format", "version", "kind", "complete")
-        )
-        if origin != FORMAT:
-            raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
-        if version != str(FORMAT_VERSION):
-            raise DataFileError(
-                f"{path} has format version {version}, this program reads version {FORMAT_VERSION}: write it again or "
-                "use the program that wrote it"
+    path = Path(path)
+    with contextlib.ExitStack() as stack:
+        try:
+            path.open("rb").close()  # The library's error for a file that cannot be opened has no cause.
+            file = stack.enter_context(h5py.File(path, "r"))
+            refuse_data_elsewhere(file)
+        except (DecodingError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise hdf5_error(path, error) from error
+        try:
+            origin, version, kind, complete = (
+                str(file.attrs.get(name)) for name in ("format", "version", "kind", "complete")
             )
-        if kind != expected_kind:
-            raise DataFileError(f"{path} contains '{kind}' where '{expected_kind}' is needed: check the path")
-        if complete != "True":
-            raise DataFileError(f"{path} is unfinished: delete it and run the stage that writes it again")
-        yield file
+            if origin != FORMAT:
+                raise DataFileError(f"{path} was not written by {FORMAT}: check the path")
+            if version != str(FORMAT_VERSION):
+                raise DataFileError(
+                    f"{path} has format version {version}, this program reads version {FORMAT_VERSION}: write it again "
+                    "or use the program that wrote it"
+                )
+            if kind != expected_kind:
+                raise DataFileError(f"{path} contains '{kind}' where '{expected_kind}' is needed: check the path")
+            if complete != "True":
+                raise DataFileError(f"{path} is unfinished: delete it and run the stage that writes it again")
+            yield file
+        except OSError as error:
+            if error.filename is not None:
+                raise
+            raise hdf5_error(path, error) from error
 
 
 def read_arrays(path: str | Path, names: Sequence[str] | None = None) -> dict[str, npt.NDArray[Any]]:

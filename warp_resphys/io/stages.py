@@ -304,13 +304,9 @@ def run_lock(run_dir: str | Path, wait: bool = False) -> Iterator[None]:
         lock.release()
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on; absent packages are left out."""
-    return dict(_versions())
-
-
 @cache
-def _versions() -> dict[str, str]:
+def package_versions() -> Mapping[str, str]:
+    """Versions of Python and of the packages that results depend on; absent packages are left out."""
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(PackageNotFoundError):

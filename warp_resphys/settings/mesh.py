@@ -61,29 +61,26 @@ class BoxSettings(_Given):
     z: Span | None = setting(None, "lowest and highest z", "m")
 
 
-class HexahedralBox(Settings):
+class _Box(Settings):
+    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(
+        description="lengths of its edges", unit="m"
+    )
+    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
+        description="cells along each edge"
+    )
+
+
+class HexahedralBox(_Box):
     """A box of hexahedra."""
 
     kind: Literal["box_hexahedra"]
-    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(
-        description="lengths of its edges", unit="m"
-    )
-    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
-        description="cells along each edge"
-    )
     nodes: Nodes = setting(8, "nodes of a cell: 8, or quadratic with 20 or 27")
 
 
-class TetrahedralBox(Settings):
+class TetrahedralBox(_Box):
     """A box of tetrahedra, six in each of its cells."""
 
     kind: Literal["box_tetrahedra"]
-    size: Annotated[Many[Positive], Field(min_length=3, max_length=3)] = setting(
-        description="lengths of its edges", unit="m"
-    )
-    divisions: Annotated[Many[Divisions], Field(min_length=3, max_length=3)] = setting(
-        description="cells along each edge"
-    )
     order: Order = setting(1, "2: with edge midpoints; linear tetrahedra bend far too stiffly")
 
 

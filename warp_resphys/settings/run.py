@@ -39,6 +39,7 @@ from .trials import (
     ReleaseFromLoad,
     ReleaseFromTwist,
     SimulatedData,
+    by_file,
 )
 
 Name = Annotated[
@@ -50,10 +51,6 @@ Name = Annotated[
 DataSettings = Annotated[
     RecordedData | ReleaseFromLoad | ReleaseFromTwist | MovingBase | PictureData, Field(discriminator="kind")
 ]
-
-
-def _law_of(value: Any) -> Any:
-    return {"file": value} if isinstance(value, str) else value
 
 
 _LEAST_STEPS = 20  # of a path that is followed
@@ -103,7 +100,7 @@ class RunSettings(SimulatorSettings):
     )
     published: PublishedSettings | None = setting(None, "simulation to compare with")
     identify: IdentifySettings | None = setting(None, "physical parameters to identify; null: none")
-    law: Annotated[LawSettings | None, BeforeValidator(_law_of, json_schema_input_type=LawSettings | str | None)] = (
+    law: Annotated[LawSettings | None, BeforeValidator(by_file, json_schema_input_type=LawSettings | str | None)] = (
         setting(None, "law of the material to identify; null: none")
     )
     shapes: dict[str, ShapeSettings] = setting(

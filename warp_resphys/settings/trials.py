@@ -111,7 +111,8 @@ class TrialSettings(_Performed):
     begins: Begins | None = setting(None, "how it begins; null: as data.begins")
 
 
-def _file(value: Any) -> Any:
+def by_file(value: Any) -> Any:
+    """Takes a path in place of a group as its key `file`."""
     return {"file": value} if isinstance(value, str) else value
 
 
@@ -123,7 +124,7 @@ def _named(trials: dict[str, TrialSettings]) -> dict[str, TrialSettings]:
 
 
 TrialTable = Annotated[
-    dict[str, Annotated[TrialSettings, BeforeValidator(_file, json_schema_input_type=TrialSettings | str)]],
+    dict[str, Annotated[TrialSettings, BeforeValidator(by_file, json_schema_input_type=TrialSettings | str)]],
     AfterValidator(_named),
 ]
 

@@ -75,7 +75,7 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
     where a gap is masked; where it was filled, the line is thin. A triangle marks the first frame after a jump.
     """
     several = [label for label, seen in zip(recording.labels, recording.seen.T, strict=True) if seen.sum() > 1]
-    bridged = fill_gaps(recording.select(several), result.longest_gap_filled, mask_long=True)
+    bridged = fill_gaps(recording.select(several), result.longest_gap_filled)
     still = {marker.label for marker in result.markers if marker.still}
     panels = [*("xyz" if len(still) < len(recording.labels) else ""), *(["still"] if still else [])]
     heights = [*(1.2 if panel == "still" else 1.5 for panel in panels), _ROW * len(recording.labels) + 0.1]

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from ...io.arrays import FloatArray, IntArray
-from ...io.errors import DataFileError, InputError, listed
+from ...io.errors import DataFileError, InputError
 from ..base_motion import at_times, followed
 from .recording import Recording, bridged, runs
 
@@ -39,17 +39,13 @@ class Release:
     rest: tuple[int, int]  # First and past-the-last frame of the quiet stretch before, in which the body was held
 
 
-def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False) -> Recording:
-    """Interpolates short occlusions by a cubic spline through the frames in which the marker was seen.
+def fill_gaps(recording: Recording, longest: int) -> Recording:
+    """Interpolates gaps of up to `longest` frames by a cubic spline through the frames in which the marker was seen.
 
-    Args:
-        recording: The recording.
-        longest: The longest gap that is filled, in frames.
-        mask_long: Keep longer gaps, and gaps at either end, as NaN. Otherwise a longer gap is an error, and a short one
-            at either end is filled with the nearest sample.
+    Longer gaps, and gaps at either end, stay NaN.
 
     Raises:
-        DataFileError: A marker is seen in fewer than two frames or, unless masked, occluded for longer.
+        DataFileError: A marker is seen in fewer than two frames.
     """
     positions = recording.positions.copy()
     for column, (label, seen) in enumerate(zip(recording.labels, recording.seen.T, strict=True)):
@@ -60,13 +56,7 @@ def fill_gaps(recording: Recording, longest: int = 5, *, mask_long: bool = False
             )
         wanted = np.zeros(len(seen), dtype=np.bool_)
         for start, stop in runs(~seen):
-            inner = start > 0 and stop < len(seen)
-            if stop - start > longest and not mask_long:
-                raise DataFileError(
-                    f"{recording.source}: marker {label} is occluded in frames {start} to {stop - 1}, longer "
-                    f"than the {longest} frames that are interpolated; leave it out or raise the limit."
-                )
-            wanted[start:stop] = stop - start <= longest and (inner or not mask_long)
+            wanted[start:stop] = stop - start <= longest and start > 0 and stop < len(seen)
         if wanted.any():
             positions[wanted, column] = bridged(recording, column, np.flatnonzero(wanted))
     return dataclasses.replace(recording, positions=positions)
@@ -187,7 +177,7 @@ def _onset(path: FloatArray, rest: tuple[int, int], fast: int, drop: float) -> f
     return float(np.clip(zero, last_still - min(moved / slope, 1.0), last_still + 1))
 
 
-def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5) -> Release:
+def release_of(recording: Recording, labels: Sequence[str], longest_gap: int) -> Release:
     """Finds the release of the body from the mean of the moving markers with the longest first stretch without gaps.
 
     Occlusions of up to `longest_gap` frames are interpolated.
@@ -195,7 +185,7 @@ def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5
     Raises:
         DataFileError: A marker is missing, or there is no release before all markers are hidden.
     """
-    moving = fill_gaps(recording.select(labels), longest_gap, mask_long=True)
+    moving = fill_gaps(recording.select(labels), longest_gap)
     stretches = [stretch for seen in moving.seen.T for stretch in runs(seen)]
     earliest = min(start for start, _ in stretches) + _FIRST_SECONDS * moving.rate
     start, stop = max((stretch for stretch in stretches if stretch[0] <= earliest), key=lambda ends: ends[1] - ends[0])
@@ -209,22 +199,14 @@ def release_of(recording: Recording, labels: Sequence[str], longest_gap: int = 5
 
 
 def trim_to_release(recording: Recording, release: Release, seconds: float | None = None) -> Recording:
-    """Returns the frames from the release on, with the held markers as `rest`.
+    """Returns the frames from the release on.
 
     The release is between two frames: `start` of the result is the time from the release to the first frame. Frames
     later than `seconds` after the release are left out.
 
     Raises:
-        DataFileError: A marker is never seen while the body is held, or too few frames are left.
+        DataFileError: Too few frames are left.
     """
-    held = recording.positions[slice(*release.rest)]
-    visible = recording.seen[slice(*release.rest)]
-    hidden = [label for label, frames in zip(recording.labels, visible.T, strict=True) if not frames.any()]
-    if hidden:
-        raise DataFileError(
-            f"{recording.source}: {listed(hidden)} cannot be seen while the body is held (frames {release.rest[0]} to "
-            f"{release.rest[1] - 1}), so where it sits is not known; leave it out of the configured markers."
-        )
     first = max(0, int(np.ceil(release.frame)))
     last = len(recording.positions)
     if seconds is not None:
@@ -235,7 +217,7 @@ def trim_to_release(recording: Recording, release: Release, seconds: float | Non
             "recording of the motion that follows."
         )
     start = (first - release.frame) / recording.rate
-    return dataclasses.replace(recording.frames(slice(first, last)), rest=np.nanmedian(held, axis=0), start=start)
+    return dataclasses.replace(recording.frames(slice(first, last)), start=start)
 
 
 def valve_opening(recording: Recording, followed: Sequence[str]) -> float:

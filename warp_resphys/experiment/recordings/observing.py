@@ -148,10 +148,8 @@ class Observer(Reader):
         """Refuses recordings if reference markers moved relative to each other between trials."""
         reference, still = list(self.markers.reference), []
         for trial, (recording, release) in zip(trials, ready, strict=True):
-            first, last = 0, None if self._base_motion(trial) is None else self._rest_frames(recording)
-            if release is not None:
-                first, last = release.rest
-            still.append(_frames(recording, first, last))
+            frames = (None,) if self._base_motion(trial) is None else (self._rest_frames(recording),)
+            still.append(recording.frames(slice(*(frames if release is None else release.rest))))
         if len(reference) > 1:
             limits = {"largest_distortion": self.markers.largest_distortion}
             check_base(still, reference, **limits, largest_shift=self.markers.largest_shift)
@@ -226,7 +224,7 @@ class Observer(Reader):
     def _released(self, trial: Trial, recording: Recording, release: Release) -> Observed:
         """Observes a body that was held, undeformed or deformed, and then released."""
         tracked = self.tracked_in(trial)
-        still = _central(_frames(recording, *release.rest), tracked, np.median, "is held")
+        still = _central(recording.frames(slice(*release.rest)), tracked, np.median, "is held")
         places = _rest_of(recording, tracked) if self.data.rest == "file" else still
         registration = self._register(trial, places, recording, self.expected(trial))
         off = f"; left out: {listed(registration.outliers)}" if registration.outliers else ""
@@ -234,7 +232,7 @@ class Observer(Reader):
             "import: %s is released in frame %.1f, registered to %.2f mm%s",
             *(trial.name, release.frame, _MILLI * registration.rms, off),
         )
-        filled = fill_gaps(recording.select(tracked), self.data.longest_gap, mask_long=True)
+        filled = fill_gaps(recording.select(tracked), self.data.longest_gap)
         moving = trim_to_release(filled, release, seconds=self.data.seconds)
         lost = [label for label, seen in zip(moving.labels, moving.seen.T, strict=True) if not seen.any()]
         if lost:
@@ -247,17 +245,18 @@ class Observer(Reader):
         driven = None if self.drive is None else self._inputs(moving, trial, self.drive)[:1]
         fields = (trial, recording, trial.tracked(self.tracked), self.view(trial), moving, still, registration, driven)
         first = int(np.ceil(release.frame))
-        return self._with_motions(Observed(*fields, release), _frames(recording, first, first + len(moving.positions)))
+        after = recording.frames(slice(first, first + len(moving.positions)))
+        return self._with_motions(Observed(*fields, release), after)
 
     def _driven(self, trial: Trial, recording: Recording) -> Observed:
         """Observes a body that rests until its inputs begin, or a static pose."""
         static, tracked = trial.begins == STATIC, self.tracked_in(trial)
         if not static:
-            check_motion(_frames(recording, 0, self.data.steps and self.data.steps + 1), tracked)
+            check_motion(recording.frames(slice(self.data.steps and self.data.steps + 1)), tracked)
         driven = None if self.drive is None else self._inputs(recording, trial, self.drive)
         loaded = driven is not None and not self._is_at_rest(driven[:1])[0] and trial.begins != SLACK
         unloaded = trial.payload == 0.0 and not loaded
-        filled = fill_gaps(recording, self.data.longest_gap, mask_long=True)
+        filled = fill_gaps(recording, self.data.longest_gap)
         if static and loaded:
             still = _central(filled, tracked, np.median, "is held")
         else:
@@ -268,7 +267,7 @@ class Observer(Reader):
         moving = filled.select(tracked)
         if static:
             frames = max(round(POSE_SECONDS * moving.rate), 1)
-            last = _central(_frames(moving, -frames, None), tracked, np.median, "is held")
+            last = _central(moving.frames(slice(-frames, None)), tracked, np.median, "is held")
             moving = replace(moving, positions=last[None])
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
         fields = (trial, recording, trial.tracked(self.tracked), self.view(trial), moving, still, registration, driven)
@@ -292,7 +291,7 @@ class Observer(Reader):
                 f"rest without, or give data.trials.{trial.name}.begins: driven if it is at rest under it, slack if it "
                 "does not act yet."
             )
-        resting = _frames(recording, 0, min(until, self._rest_frames(recording)))
+        resting = recording.frames(slice(min(until, self._rest_frames(recording))))
         return _central(resting, self.tracked_in(trial), np.mean, "rests")
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
@@ -312,11 +311,6 @@ class Observer(Reader):
             frame = (opening - recording.start) * recording.rate
             values = np.asarray(values * np.clip(np.arange(len(values)) - frame, 0.0, 1.0)[:, None])
         return values
-
-
-def _frames(recording: Recording, first: int, last: int | None) -> Recording:
-    """The markers in a range of frames."""
-    return replace(recording, positions=recording.positions[first:last])
 
 
 def _central(recording: Recording, tracked: Sequence[str], centre: Any, while_it: str) -> FloatArray:

@@ -126,7 +126,7 @@ class TestRegisterMarkers:
 @pytest.mark.parametrize(("name", "rms"), [("gravity", 0.807e-3), ("load101", 1.132e-3)], ids=["bare", "101g"])
 def test_recordings_of_the_beam(shared_data, name, rms):
     recording = read_recording(shared_data / "beam_mocap" / f"beam_{name}_V2_a.c3d").select(NAMES)
-    positions = fill_gaps(recording).positions
+    positions = fill_gaps(recording, 5).positions
     release = find_release(positions[:, :3].mean(axis=1), recording.rate)
     held = np.median(positions[slice(*release.rest)], axis=0)
     result = register_markers(held, NOMINAL, NAMES, source=recording.source)

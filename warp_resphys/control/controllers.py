@@ -24,7 +24,6 @@ _LEARNING = 0.05  # share of Broyden's correction taken per step
 _LITTLE = 1e-3  # regularises Broyden's correction: squared change of the inputs, as shares of their ranges
 _DAMPING = 0.05  # of the inverse of the Jacobian, relative to its largest singular value
 
-
 Controller = Callable[[int, FloatArray], FloatArray]  # inputs (n,) of a step, from markers (M, 3) before it [m]
 _RATE = 0.3  # unmodelled change of the rates in a step, relative to their spread in a swing of one millimetre
 _BIAS = 5e-3  # drift of the bias in a second, as a displacement of the markers [m]

@@ -30,7 +30,6 @@ from .experiment import Experiment
 
 log = logging.getLogger(__name__)
 
-
 _DIFFERENCE = 1e-3  # of a parameter, over its standard deviation, or over the typical size of an input's response
 
 

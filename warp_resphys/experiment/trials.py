@@ -25,7 +25,6 @@ SPLITS: Final = ("train", "validation", "test")
 OTHERS: Final = "others"
 _SUFFIXES = (".h5", ".hdf5", ".npz", ".c3d", ".tsv", ".csv")
 
-
 # Key with a list of values per split, unit of these and factor to SI units, of what differs between simulated trials.
 _VARIATIONS: Final = {
     "release_from_load": ("weights_g", " g", 1e-3),

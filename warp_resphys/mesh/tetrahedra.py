@@ -24,7 +24,6 @@ _ANGLES = (40.0, 30.0, 20.0)  # angles between triangles above which their edge 
 _VOLUME = 0.08  # largest relative difference between the volumes of mesh and surface
 _REACH = 0.5  # largest difference between the bounding boxes of mesh and surface, over the cell size
 
-
 SURFACE_SUFFIXES = (".stl", ".obj", ".ply")
 _DIMENSIONS = ("edges", "surfaces", "volume")
 

@@ -47,11 +47,9 @@ Name = Annotated[
     Field(pattern=r"^[\w-]+$", json_schema_extra={"wanted": "letters, digits, _ and - alone, as it names a folder"}),
 ]
 
-
 DataSettings = Annotated[
     RecordedData | ReleaseFromLoad | ReleaseFromTwist | MovingBase | PictureData, Field(discriminator="kind")
 ]
-
 
 _LEAST_STEPS = 20  # of a path that is followed
 

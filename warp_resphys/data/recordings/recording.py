@@ -17,7 +17,6 @@ from ..base_motion import since_first
 
 log = logging.getLogger(__name__)
 
-
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 _LONG = {"": "m", "centi": "cm", "milli": "mm"}
 _SPELLED = {

@@ -31,7 +31,6 @@ from .reading import vertical
 
 log = logging.getLogger(__name__)
 
-
 _LARGEST_LEAN = 30.0  # degrees between the vertical of a recording and the configured gravity
 _SHOWN = 6  # driven trials whose quality and registration are reported
 _MILLI = 1e3

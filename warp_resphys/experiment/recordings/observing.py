@@ -24,7 +24,6 @@ from .reading import POSE_SECONDS, Reader, central_places
 
 log = logging.getLogger(__name__)
 
-
 _LEAST_RATE = 40.0  # Hz; the release is estimated from the first tenth of a second, i.e. at least four frames
 _MILLI = 1e3
 _SHARE_AT_REST = 0.1  # of the largest displacement of a marker: up to there, the body counts as at rest

@@ -25,7 +25,6 @@ from ..files import STATIC, payload_inputs
 
 log = logging.getLogger(__name__)
 
-
 POSE_SECONDS = 0.2  # at the end of a recording, from which a static pose is read
 _HELD_SECONDS = 0.1  # at the beginning of a recording, while a body is held
 _MILLI = 1e3

@@ -131,11 +131,15 @@ DECKS = {  # text, largest coordinates [mm], regions, surfaces
         *([0.0, 25.0, 10.0], {"tip": [1]}, {}),
     ),
     "two instances": (
-        PART + "*Assembly\n" + INSTANCE.format(1, "") + INSTANCE.format(2, "0., 30., 0.\n") + "*Node\n1, 0., 0., 99.\n"
+        PART.replace("*End", "*Surface, name=End\nTip, S4\n*End")
+        + "*Assembly\n"
+        + INSTANCE.format(1, "")
+        + INSTANCE.format(2, "0., 30., 0.\n")
+        + "*Node\n1, 0., 0., 99.\n"
         "*Elset, elset=ends, instance=b-2\n 1\n*Elset, elset=ends\nb-1.2\n*Elset, elset=TIP\nB-1.tip, b-2.TIP\n",
         [20.0, 40.0, 10.0],
         {"b-1": [0, 1], "b-1_tip": [1], "b-2": [2, 3], "b-2_tip": [3], "ends": [1, 2], "tip": [1, 3]},
-        {},
+        {"b-1_End": [0], "b-2_End": [0]},
     ),
     "independent instance, surface": (
         "*Part, name=p\n*End Part\n*Instance, name=i, part=p\n"

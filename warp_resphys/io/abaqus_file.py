@@ -1,7 +1,7 @@
 """Reads meshes of Abaqus and CalculiX (.inp): parts and their instances, element sets, surfaces of sides of elements.
 
-The name of a set that several parts have begins with its instance. Keywords that say nothing about the mesh are
-ignored; those that generate nodes or elements, or name other files, are refused.
+The name of a set or surface that several parts have begins with its instance. Keywords that say nothing about the mesh
+are ignored; those that generate nodes or elements, or name other files, are refused.
 """
 
 import re
@@ -77,6 +77,15 @@ class _Deck:
     def scopes(self) -> dict[str, _Scope]:
         """Returns the model's own scope and the instances by name; the parts if none has an instance."""
         return {"": self.model, **(self.instances or self.parts)}
+
+    def shown(self, kind: str) -> dict[tuple[str, str], str]:
+        """Returns names of all sets or sides by scope and name; those of several scopes begin with their instance."""
+        named = [(at, name) for at, scope in self.scopes().items() for name in getattr(scope, kind)]
+        times, spelling = Counter(name for _, name in named), self.spelling
+        return {
+            (at, name): spelling[name] if times[name] == 1 or not at else f"{spelling[at]}_{spelling[name]}"
+            for at, name in named
+        }
 
     def members(self, scope: str, member: Member, *trail: tuple[str, str]) -> Iterator[tuple[str, IntArray]]:
         """Yields scopes and numbers of the elements of a member of a set."""
@@ -209,15 +218,13 @@ def _member(word: str) -> Member:
 def _groups(deck: _Deck) -> dict[tuple[str, str], list[IntArray]]:
     """Returns numbers of elements by the name of a set or instance, and by scope."""
     scopes, groups = deck.scopes(), dict[tuple[str, str], list[IntArray]]()
-    times = Counter(name for scope in scopes.values() for name in scope.sets if name not in deck.hidden)
     parts = [at for at, scope in scopes.items() if any(dimension == 3 for _, dimension, _ in scope.blocks)]
     for at, scope in scopes.items():
         if at in parts and len(parts) > 1:
             groups[deck.spelling.get(at, "model"), at] = [rows[:, 0] for _, _, rows in scope.blocks]
-        for name in (name for name in scope.sets if name in times):
-            shown = deck.spelling[name] if times[name] == 1 or not at else f"{deck.spelling[at]}_{deck.spelling[name]}"
-            for place, numbers in deck.members(at, ("", name)):
-                groups.setdefault((shown, place), []).append(numbers)
+    for (at, name), shown in deck.shown("sets").items():
+        for place, numbers in deck.members(at, ("", name)) if name not in deck.hidden else ():
+            groups.setdefault((shown, place), []).append(numbers)
     return groups
 
 
@@ -240,13 +247,11 @@ def _arranged(deck: _Deck) -> tuple[FloatArray, list[Block]]:
         rotation, translation = scope.motion
         points.append(np.array([*scope.nodes.values()]).reshape(-1, 3) @ rotation.T + translation)
         first += len(numbers)
-    for at, scope in deck.scopes().items():
-        for name, sides in scope.sides.items():
-            for member, side in sides:
-                for place, elements in deck.members(at, member):
-                    for kind, numbers, nodes in solids.get(place, []):
-                        corners = _SIDES.get(kind.rstrip("0123456789"), [])[side - 1 : side]
-                        faces = nodes[np.isin(numbers, elements)][:, np.ravel(corners).astype(np.int64)]
-                        name_of_all = {deck.spelling[name]: np.arange(len(faces))}
-                        blocks.append(Block(_FACES.get(faces.shape[1], ""), 2, faces, name_of_all))
+    for (at, name), shown in deck.shown("sides").items():
+        for member, side in deck.scopes()[at].sides[name]:
+            for place, elements in deck.members(at, member):
+                for kind, numbers, nodes in solids.get(place, []):
+                    corners = _SIDES.get(kind.rstrip("0123456789"), [])[side - 1 : side]
+                    faces = nodes[np.isin(numbers, elements)][:, np.ravel(corners).astype(np.int64)]
+                    blocks.append(Block(_FACES.get(faces.shape[1], ""), 2, faces, {shown: np.arange(len(faces))}))
     return np.concatenate(points), blocks

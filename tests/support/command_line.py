@@ -62,8 +62,12 @@ def refusal(*arguments: object) -> str:
 
 def configuration(name: str, *overrides: str) -> dict:
     """A configuration of the package as plain data."""
+    words, late = readable(overrides)
     with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        return OmegaConf.to_container(compose(name, readable(overrides)[0]), resolve=True)
+        config = compose(name, words)
+    for override in late:
+        override.apply(config)
+    return OmegaConf.to_container(config, resolve=True)
 
 
 def settings_of(settings: type[S], name: str, *overrides: str) -> S:

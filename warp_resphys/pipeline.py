@@ -65,8 +65,8 @@ from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.kernel_cache import start_quietly
+from .io.progress import show
 from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
-from .io.tables import show
 from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
 from .report.sections import shapes_table

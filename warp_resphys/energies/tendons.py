@@ -30,8 +30,8 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels import tendons as kernels
-from ..mesh.location import locate
 from ..mesh.mesh import Mesh
+from ..mesh.surface import locate
 from ..stepping.quantity import Parameter, Quantity
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, PointSet, Values, value_of
 from .launcher import Launcher, warp_view

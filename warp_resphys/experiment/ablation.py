@@ -16,8 +16,8 @@ from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
+from ..io.progress import show
 from ..io.stages import Stage, StageContext, package_versions, resources_used
-from ..io.tables import show
 from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.mesh import surface_vertices
 from ..settings.run import RunSettings

@@ -25,8 +25,8 @@ from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.fan_out import ALONE
 from ..io.stages import StageContext
-from ..mesh.location import locate
 from ..mesh.mesh import Mesh, select_vertices
+from ..mesh.surface import locate
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.stages import PlayedSettings, StageSettings

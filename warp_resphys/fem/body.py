@@ -12,9 +12,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
-from ..mesh.location import locate
 from ..mesh.mesh import Mesh
 from ..mesh.plotting import Picture
+from ..mesh.surface import locate
 from .coordinates import Coordinates, SymmetryPlane, rigid_weights
 from .elements import Discretisation, Points, discretise
 

@@ -1,16 +1,16 @@
-"""Progress of a computation: a bar in a terminal, an occasional line in a log."""
+"""Progress of a computation: a bar in a terminal, an occasional line in a log; tables and sentences in a terminal."""
 
 from __future__ import annotations
 
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Final
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
 
@@ -42,6 +42,7 @@ _TITLES: Final = {  # of stages, by the first word of their names, and of single
     "drive": "Driving the robot",
     "report": "Writing the report",
 }
+_LOG_WIDTH: Final = 110  # of tables that go to a file, in characters
 
 
 def title_of(stage: str) -> str:
@@ -194,3 +195,22 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def show(*parts: RenderableType) -> None:
+    """Prints tables and sentences, as wide as the terminal."""
+    console = Console(width=None if sys.stdout.isatty() else _LOG_WIDTH)
+    for part in parts:
+        console.print(part, markup=False, highlight=False, soft_wrap=isinstance(part, str))
+
+
+def aligned(rows: Sequence[Sequence[str]], left: int = 1) -> str:
+    """Rows as lines of text, the first `left` columns aligned to the left, the others to the right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if at < left else cell.rjust(width)
+            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )

@@ -29,9 +29,8 @@ from ..experiment.build import choose_device
 from ..fem.body import Body
 from ..fem.scene import Scene
 from ..io.errors import ResphysError
-from ..io.progress import Progress
+from ..io.progress import Progress, show
 from ..io.settings import Settings, Word, setting
-from ..io.tables import show
 from ..linalg.choice import LINEAR_SOLVERS
 from ..linalg.pardiso import has_pardiso
 from ..mesh.chambers import find_chambers

@@ -13,9 +13,9 @@ from ..energies.contact import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
 from ..io.files import read_json
+from ..io.progress import show
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
-from ..io.tables import show
 from ..learning.baselines import BASELINES
 from ..report.bodies import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion
 from ..report.control_section import compared_controllers

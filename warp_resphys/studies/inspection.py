@@ -16,8 +16,8 @@ from ..experiment.build import build_mesh
 from ..fem.body import Body
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
+from ..io.progress import aligned
 from ..io.settings import Many, Positive, Word, setting
-from ..io.tables import aligned
 from ..mesh.arm import name_surfaces
 from ..mesh.chambers import find_chambers, open_cavities
 from ..mesh.mesh import Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices

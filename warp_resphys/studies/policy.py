@@ -13,10 +13,9 @@ from pydantic import AfterValidator
 
 from ..io.errors import InputError
 from ..io.files import read_json, write_json
-from ..io.progress import Progress
+from ..io.progress import Progress, show
 from ..io.settings import Count, Natural, Settings, Some, Word, setting
 from ..io.stages import finished_record
-from ..io.tables import show
 from ..report.page import PageTable
 from ..settings.trials import Labels, different
 

@@ -28,8 +28,8 @@ from ..data.recordings.recording import Recording
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_json
+from ..io.progress import aligned
 from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
-from ..io.tables import aligned
 from ..report.figures import STYLE, TONES, new_figure, save_png
 from ..settings.trials import BagSettings, TableSettings
 

@@ -24,9 +24,9 @@ from ..experiment.experiment import LEARNED, Experiment
 from ..experiment.learn import run_epochs, trainer_of
 from ..experiment.trials import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
+from ..io.progress import show
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
 from ..io.stages import StageInterrupted, run_stages
-from ..io.tables import show
 from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import PageTable, number_text
 from ..settings.learning import TrainingSettings

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError
+from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting
-from ..io.tables import show
 from ..mesh.mesh import boundary_triangles, surface_vertices
 from ..report.bodies import sharp_edges
 from ..report.figures import TONES

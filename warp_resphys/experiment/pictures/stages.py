@@ -20,9 +20,8 @@ from ...data.camera import CORRECTIONS, PlacedCamera
 from ...energies.catalogue import LAW_FORMAT, unit_of
 from ...io.errors import InputError
 from ...io.files import atomic_hdf5, create, read_json, write_json
-from ...io.progress import Progress
+from ...io.progress import Progress, show
 from ...io.stages import Stage, StageContext, package_versions, resources_used
-from ...io.tables import show
 from ...learning.identification import ParameterSearch
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.misfit import PictureMisfit, values_of

@@ -439,11 +439,7 @@ class TestProcess:
 
     @pytest.mark.parametrize(
         ("arguments", "code", "lines"),
-        [
-            ("--help", NOBODY_READS, 0),
-            ("--multirun seed=1,2", NOBODY_READS, 0),
-            ("seed=[1", 2, 1),
-        ],
+        [("--help", NOBODY_READS, 0), ("--multirun seed=1,2", NOBODY_READS, 0), ("seed=[1", 2, 1)],
     )
     def test_a_closed_pipe_ends_it_silently(self, config_dir, arguments, code, lines):
         child = self.start(config_dir, self.job('print("x" * 100_000)'), *arguments.split())

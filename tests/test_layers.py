@@ -36,11 +36,7 @@ def place_of(name):
 def modules():
     """File and dotted name below the package of every module but the package's own file, which only hands out names."""
     found = {}
-    for folder, prefix in (
-        (PACKAGE, ()),
-        (KERNELS, ("kernels",)),
-        (REPOSITORY / "scripts", ("scripts",)),
-    ):
+    for folder, prefix in ((PACKAGE, ()), (KERNELS, ("kernels",)), (REPOSITORY / "scripts", ("scripts",))):
         for path in folder.rglob("*.py"):
             parts = path.relative_to(folder).with_suffix("").parts
             parts = parts[:-1] if parts[-1] == "__init__" else parts

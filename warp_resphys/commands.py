@@ -76,9 +76,7 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
             "compare a device with the CPU, and time both, in two minutes", "studies.check:check", word="device"
         ),
         "train-policy": Command(
-            "learn a policy on a run's robot, and try it on its laboratory",
-            "studies.policy:train_policy",
-            word="run",
+            "learn a policy on a run's robot, and try it on its laboratory", "studies.policy:train_policy", word="run"
         ),
     }
 )

@@ -21,26 +21,13 @@ from typing import Any, Final, get_type_hints
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import (
-    HydraException,
-    InstantiationException,
-    MissingConfigException,
-    OverrideParseException,
-)
+from hydra.errors import HydraException, InstantiationException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
 
-from .commands import (
-    CONFIG_PACKAGE,
-    OWN_OPTIONS,
-    USER_ERROR,
-    configuration,
-    ends_where_nobody_reads,
-    quote,
-    run_label,
-)
+from .commands import CONFIG_PACKAGE, OWN_OPTIONS, USER_ERROR, configuration, ends_where_nobody_reads, quote, run_label
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected

@@ -23,18 +23,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from warp_resphys import (
-    Body,
-    Contact,
-    Corotated,
-    HalfSpace,
-    Inputs,
-    Mesh,
-    Muscle,
-    Muscles,
-    Simulator,
-    box_hexahedra,
-)
+from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Mesh, Muscle, Muscles, Simulator, box_hexahedra
 
 wp.config.log_level = wp.LOG_WARNING
 

@@ -110,8 +110,7 @@ def written(path, kind="sqlite3", left_out=(), late=0.0):
 
 
 @pytest.mark.parametrize(
-    ("kind", "late", "file"),
-    [("sqlite3", 0.0, ""), ("mcap", 30.0, "trial.mcap"), ("bag", 0.0, "")],
+    ("kind", "late", "file"), [("sqlite3", 0.0, ""), ("mcap", 30.0, "trial.mcap"), ("bag", 0.0, "")]
 )
 def test_topics_are_brought_to_common_frames(kind, late, file, tmp_path):
     """Also where the clock of the computer that recorded is not that of the headers, which numbers lack."""
@@ -161,11 +160,7 @@ def test_a_gap_is_not_bridged(tmp_path):
         (of_tip("/cloud"), InputError, "say which entry"),
         (of_tip("/mocap/tip", "/pressure#3 [mbar]"), DataFileError, "has 2 entries"),
         (of_tip("/mocap/tip", "/pressure#1 [psi]"), InputError, "whose unit is unknown"),
-        (
-            of_tip("/mocap/tip", "/joint_states#winch"),
-            InputError,
-            "name the joint and its position",
-        ),
+        (of_tip("/mocap/tip", "/joint_states#winch"), InputError, "name the joint and its position"),
         (of_tip("mocap tip"), InputError, "write a topic"),
         (BagSettings(markers={}), InputError, "data.bag.markers is empty"),
         (None, InputError, "name topics in data.bag .* /pressure .std_msgs/msg/Float64MultiArray"),

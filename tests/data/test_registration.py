@@ -139,10 +139,7 @@ def test_recordings_of_the_beam(shared_data, name, rms):
     assert np.linalg.norm(without.positions - result.positions, axis=1)[:3].max() < 2.5e-3
 
 
-MESHES = {
-    "hexahedra": box_hexahedra(divisions=(5, 2, 2)),
-    "tetrahedra10": box_tetrahedra(divisions=(5, 2, 2), order=2),
-}
+MESHES = {"hexahedra": box_hexahedra(divisions=(5, 2, 2)), "tetrahedra10": box_tetrahedra(divisions=(5, 2, 2), order=2)}
 
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())

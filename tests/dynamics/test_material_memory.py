@@ -136,10 +136,7 @@ def test_a_slider_that_sticks_is_a_spring_for_every_integrator():
 
 @pytest.mark.parametrize(
     ("material", "memory"),
-    [
-        (TWO_SLIDERS, "plastic_strain"),
-        (TWO_BRANCHES, "viscous_strain"),
-    ],
+    [(TWO_SLIDERS, "plastic_strain"), (TWO_BRANCHES, "viscous_strain")],
     ids=["sliders", "branches"],
 )
 def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments(material, memory):

@@ -173,11 +173,7 @@ def test_an_overflow_touches_neither_neighbours_nor_later_steps(name, linear_sol
 
 @pytest.mark.parametrize(
     ("name", "dtype", "offset"),
-    [
-        ("quasi_newton", torch.float32, 1.0),
-        ("newton", torch.float64, 1.0),
-        ("projective_dynamics", torch.float32, 0.0),
-    ],
+    [("quasi_newton", torch.float32, 1.0), ("newton", torch.float64, 1.0), ("projective_dynamics", torch.float32, 0.0)],
 )
 def test_a_body_on_which_nothing_acts_converges_at_once(name, dtype, offset):
     """Its residual is rounding, and so are the forces that it would be measured against."""

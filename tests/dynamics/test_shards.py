@@ -50,8 +50,7 @@ def rolled(motion, rows, **settings):
 
 
 @pytest.mark.parametrize(
-    ("name", "linear_solver"),
-    [("newton", "banded"), ("quasi_newton", "tiled"), ("quasi_newton", "sparse")],
+    ("name", "linear_solver"), [("newton", "banded"), ("quasi_newton", "tiled"), ("quasi_newton", "sparse")]
 )
 def test_an_environment_does_what_it_does_alone(motion, name, linear_solver):
     """Its directions, line searches and factors are its own: nothing depends on its neighbours."""

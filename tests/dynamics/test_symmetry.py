@@ -5,16 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from warp_resphys import (
-    Body,
-    Mesh,
-    Rigid,
-    Simulator,
-    SolverSettings,
-    StableNeoHookean,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Mesh, Rigid, Simulator, SolverSettings, StableNeoHookean, box_hexahedra, select_vertices
 from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import POSES, check_gradients

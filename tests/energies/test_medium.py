@@ -27,10 +27,7 @@ from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 SIZE = (0.04, 0.03, 0.02)
 BOX = box_hexahedra(SIZE, (2, 2, 2))
-MESHES = {
-    "hexahedra": BOX,
-    "tetrahedra10": box_tetrahedra(SIZE, (2, 2, 2), order=2),
-}
+MESHES = {"hexahedra": BOX, "tetrahedra10": box_tetrahedra(SIZE, (2, 2, 2), order=2)}
 STIFF = Corotated(1e6, 0.3, density=1000.0)
 TIGHT = SolverSettings("newton", relative_tolerance=1e-9)
 MASS = 1000.0 * math.prod(SIZE)

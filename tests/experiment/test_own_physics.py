@@ -211,11 +211,7 @@ def test_the_example_of_the_page_acts(tmp_path, monkeypatch):
     own["identify"]["parameters"] |= {"poissons_ratio": None, "youngs_modulus": None}
     config = composed("experiment=beam_real", "mesh.divisions=[4,1,1]")
     config |= {key: own[key] for key in ("simulation", "energies")}
-    config["identify"] |= {
-        "parameters": own["identify"]["parameters"],
-        "elastic": None,
-        "first_guess": {},
-    }
+    config["identify"] |= {"parameters": own["identify"]["parameters"], "elastic": None, "first_guess": {}}
     check(config)
     run = parse(RunSettings, config)
     simulator = build_simulator(run, run.simulation)

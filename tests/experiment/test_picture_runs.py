@@ -333,10 +333,7 @@ class TestRelease:
         assert row["outline_mm"]["sysid"] < 0.5 * row["outline_mm"]["simulation"]
         assert row["points_mm"]["sysid"] < 0.5 * row["points_mm"]["undeformed"]
         page = (run / "report.html").read_text()
-        for name, true in {
-            "Release delay, released [ms]": "7",
-            "Gravity tilt 1, released [°]": "0",
-        }.items():
+        for name, true in {"Release delay, released [ms]": "7", "Gravity tilt 1, released [°]": "0"}.items():
             cells = re.sub(r"<[^>]*>", " ", page.partition(name)[2].partition("</tr>")[0]).split()
             assert cells[-1] == true
         assert "Stiffness damping [ms]: " in out
@@ -368,10 +365,7 @@ class TestRelease:
         [
             (lambda _, frames: frames[5].pop("time"), "frame 5 has no 'time', and its body is released: give it"),
             (lambda _, frames: frames[5].update(time="late"), "frames[5].time is 'late': it must be a number, or null"),
-            (
-                lambda _, frames: frames[5].update(time=0.02),
-                "has the time 0.02 s, and frame 4 before it 0.0666667",
-            ),
+            (lambda _, frames: frames[5].update(time=0.02), "has the time 0.02 s, and frame 4 before it 0.0666667"),
             (lambda scene, _: scene.update(frame_rate=0), "frame_rate is 0: it must be a positive number, or null"),
             (lambda scene, frames: scene.update(frames=frames[:6]), "fewer than 3 different frames after the release"),
         ],

@@ -90,10 +90,7 @@ CASES = {
             "target: integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2",
             *("target.regions={tip:{x:[0.05,0.1]}}", "target.rigid={tip:{}}", "target.integrator=midpoint"),
         ),
-        (
-            "target.muscles.stiffness is 0, but not",
-            "target.muscles={bundles:{a:{direction:[1,0,0]}},stiffness:0.0}",
-        ),
+        ("target.muscles.stiffness is 0, but not", "target.muscles={bundles:{a:{direction:[1,0,0]}},stiffness:0.0}"),
         (
             "laboratory: its body takes muscle_stress of 1 muscle, but that of the simulator takes no input",
             "experiment=beam_real",
@@ -198,7 +195,7 @@ CASES = {
         ("data.base_motion moves the fixed vertices, but fixed is null", "data.base_motion=reference"),
     ],
     ("experiment=beam_obstacle", "~obstacles", "~laboratory.obstacles", "~contact", "~laboratory.contact"): [
-        ("identify.integrator is midpoint", "identify.integrator=midpoint", "+self_contact={friction: 0.3}"),
+        ("identify.integrator is midpoint", "identify.integrator=midpoint", "+self_contact={friction: 0.3}")
     ],
     ("experiment=marker_ablation", "mesh.divisions=[4,2,2]", "ablation.counts=[1,4]"): [
         ("ablation.counts", "ablation.counts=[1,43]"),

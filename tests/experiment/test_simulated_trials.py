@@ -165,8 +165,7 @@ def test_the_beam_is_let_go_from_cross_sections_turned_rigidly_by_the_configured
 
 
 @pytest.mark.parametrize(
-    ("experiment", "unit", "factor"),
-    [(["experiment=beam_twist"], "°", np.pi / 180.0), (["~data.others"], " g", 1e-3)],
+    ("experiment", "unit", "factor"), [(["experiment=beam_twist"], "°", np.pi / 180.0), (["~data.others"], " g", 1e-3)]
 )
 def test_the_quick_budget_picks_evenly(experiment, unit, factor):
     runs = [settings(*experiment, f"budget={budget}") for budget in ("full", "quick")]

@@ -100,8 +100,7 @@ class TestJson:
         assert os.listdir(tmp_path) == []
 
     @pytest.mark.parametrize(
-        ("content", "message"),
-        [(b'{"a": 1', "not a JSON file"), (b"\xff\xfe", "not a JSON"), (None, "not exist")],
+        ("content", "message"), [(b'{"a": 1', "not a JSON file"), (b"\xff\xfe", "not a JSON"), (None, "not exist")]
     )
     def test_unreadable(self, tmp_path, content, message):
         path = tmp_path / "a.json"
@@ -206,10 +205,7 @@ class TestHdf5:
                 layout = h5py.VirtualLayout((130, 4, 3), "f8")
                 layout[...] = h5py.VirtualSource(str(trajectory), "positions", (130, 4, 3))
                 group.create_virtual_dataset("x", layout)
-        with (
-            pytest.raises(DataFileError, match="'/inner/x'"),
-            files.read_hdf5(path, "trajectories"),
-        ):
+        with pytest.raises(DataFileError, match="'/inner/x'"), files.read_hdf5(path, "trajectories"):
             pass
 
     def test_errors_of_other_files_are_not_blamed_on_this_one(self, trajectory, tmp_path):

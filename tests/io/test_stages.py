@@ -165,10 +165,7 @@ class TestInterruption:
 
         experiment.behaviour["train"] = interrupt_after_a_while
         for _ in range(2):
-            with pytest.raises(
-                StageInterrupted,
-                match=r"in stage 'train' \(finished and kept: generate; ",
-            ):
+            with pytest.raises(StageInterrupted, match=r"in stage 'train' \(finished and kept: generate; "):
                 experiment.run()
         experiment.behaviour["train"] = finish
         assert experiment.run() == ["train", "report"]
@@ -198,20 +195,14 @@ class TestInterruption:
 
 class TestLock:
     def test_one_process_at_a_time(self, experiment):
-        with (
-            run_lock(experiment.run_dir),
-            pytest.raises(InputError, match="another process is writing the run folder"),
-        ):
+        with run_lock(experiment.run_dir), pytest.raises(InputError, match="another process is writing the run folder"):
             experiment.run()
         assert experiment.ran == []
         assert experiment.run() == ["generate", "train", "report"]
 
     def test_a_folder_that_cannot_be_made(self, tmp_path):
         (tmp_path / "file").touch()
-        with (
-            pytest.raises(DataFileError, match="cannot write the run folder"),
-            run_lock(tmp_path / "file" / "run"),
-        ):
+        with pytest.raises(DataFileError, match="cannot write the run folder"), run_lock(tmp_path / "file" / "run"):
             pass
 
 

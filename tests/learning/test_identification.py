@@ -104,11 +104,7 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
 
 
 @pytest.mark.parametrize(
-    ("bounds", "sentence"),
-    [
-        ({}, "nothing to identify"),
-        ({"stiffness": Bounds(0.0, 1.0)}, "no parameter 'stiffness'"),
-    ],
+    ("bounds", "sentence"), [({}, "nothing to identify"), ({"stiffness": Bounds(0.0, 1.0)}, "no parameter 'stiffness'")]
 )
 def test_unknown_parameters_are_refused(bounds, sentence):
     replay, release = replay_of(simulator(), TRUTH, frames=3)

@@ -38,12 +38,7 @@ def test_a_diverged_rollout_is_counted_and_leaves_no_mean(bad: float) -> None:
     errors = marker_errors(positions[1:], target[1:])
     assert errors[0] == pytest.approx(1.0)
     summary = summarise([good, errors])
-    assert (summary["mean"], summary["std"], summary["diverged"], summary["trajectories"]) == (
-        None,
-        None,
-        1,
-        2,
-    )
+    assert (summary["mean"], summary["std"], summary["diverged"], summary["trajectories"]) == (None, None, 1, 2)
     entries = summarise_trajectories(["a", "b"], {"resphys": [good, errors]})
     assert [entry["errors_mm"]["resphys"] for entry in entries] == [pytest.approx(1.0), None]
     json.dumps([summary, entries], allow_nan=False)

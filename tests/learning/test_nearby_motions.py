@@ -59,8 +59,7 @@ def replayed(frames, kind=Simulator, energies=(), static=False, **options):
 
 
 @pytest.mark.parametrize(
-    ("static", "energies"),
-    [(True, ()), (False, (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),))],
+    ("static", "energies"), [(True, ()), (False, (Tendons([[[0.0, 0.015, 0.02], [0.1, 0.015, 0.02]]], friction=0.2),))]
 )
 def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(static, energies):
     replay, start = replayed(1 if static else 8, energies=energies, static=static, relative_tolerance=1e-12)

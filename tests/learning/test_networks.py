@@ -17,10 +17,7 @@ from warp_resphys.settings.learning import NetworkSettings
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
-KINDS = {
-    "reduced": NetworkSettings(**REDUCED, **ARCHITECTURE),
-    "nodal": NetworkSettings(kind="nodal", **ARCHITECTURE),
-}
+KINDS = {"reduced": NetworkSettings(**REDUCED, **ARCHITECTURE), "nodal": NetworkSettings(kind="nodal", **ARCHITECTURE)}
 
 
 def field(samples, vertices=6, rank=None, seed=0):

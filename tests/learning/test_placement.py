@@ -243,10 +243,7 @@ def test_misplaced_vertices_and_priors_out_of_range_are_refused():
         Bounds(1e5, 1e6, prior=Prior(2e6, 1.0))
 
 
-OWN = {
-    **RANGES,
-    **{f"attached_mass_factor@w{i}": Bounds(0.7, 1.3, prior=Prior(1.0, 0.05)) for i in (1, 2, 3, 4)},
-}
+OWN = {**RANGES, **{f"attached_mass_factor@w{i}": Bounds(0.7, 1.3, prior=Prior(1.0, 0.05)) for i in (1, 2, 3, 4)}}
 GAINS = (1.0, 0.93, 1.05, 1.0, 0.97)  # of the weights that hung on the body, over those that were logged
 
 

@@ -73,8 +73,7 @@ class TestResume:
 
 class TestSelection:
     @pytest.mark.parametrize(
-        ("errors", "best"),
-        [([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)],
+        ("errors", "best"), [([math.inf, 5.0, math.inf], 1), ([2.0, 2.0, 2.0], 0), ([math.inf, 4.0, 3.0], 2)]
     )
     def test_the_smallest_roll_out_error_is_selected(self, errors, best):
         queue, weights = list(errors), []

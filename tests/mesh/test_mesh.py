@@ -38,13 +38,7 @@ BOXES = {
     "hexahedron27": partial(box_hexahedra, nodes=27),
 }
 PER_METRE = {"m": 1, "cm": 100, "mm": 1000}
-TRIANGLES_PER_BRICK_SIDE = {
-    "hexahedron": 2,
-    "tetrahedron": 2,
-    "tetrahedron10": 8,
-    "hexahedron20": 6,
-    "hexahedron27": 8,
-}
+TRIANGLES_PER_BRICK_SIDE = {"hexahedron": 2, "tetrahedron": 2, "tetrahedron10": 8, "hexahedron20": 6, "hexahedron27": 8}
 
 
 def enclosed_volume(mesh: Mesh) -> float:

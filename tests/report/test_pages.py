@@ -76,10 +76,7 @@ class TestArms:
             assert all(number_text(row["errors_mm"][model]) in page.text for row in errors["per_trajectory"])
         for said in (
             *("7.31 ± 3.54", "No recordings are configured"),
-            *(
-                "The noise of the markers alone is 0.08 mm.",
-                "of 0.120 mm from the observed ones, 0.610 mm at most",
-            ),
+            *("The noise of the markers alone is 0.08 mm.", "of 0.120 mm from the observed ones, 0.610 mm at most"),
             "mean over 3 test trials of 4 s and 12 markers",
             "SimFree: 2 of 3 roll-outs left the training range, the first after 0.84 s (test_00).",
             *("dashed, the limit of 20 kPa", "Young's modulus [kPa]264237250", "1 min 15 s", "no OpenGL here"),

@@ -23,14 +23,7 @@ from warp_resphys.learning.metrics import (
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report.bodies import instants
 from warp_resphys.report.control_section import control_section
-from warp_resphys.report.data import (
-    Driven,
-    along_body,
-    at_times,
-    drawn_markers,
-    shown_models,
-    tip_markers,
-)
+from warp_resphys.report.data import Driven, along_body, at_times, drawn_markers, shown_models, tip_markers
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import (
     MINUS,
@@ -409,11 +402,6 @@ def test_page_has_the_bodies(tmp_path):
     shape = {"mesh": vertex_settings().mesh, "fixed": {"x": 0.0}, "held": {"twist_deg": 10.0}}
     ranges = {"youngs_modulus": {"lower": 1e5, "upper": 1e6}}
     page = report(tmp_path, vertex_settings().changed(identify={"parameters": ranges}, shapes={"thin": shape}))
-    for said in (
-        "Other bodies of the same material",
-        "thin <beam>",
-        "removes 99 %",
-        "225 vertices, moves by 12.5 mm",
-    ):
+    for said in ("Other bodies of the same material", "thin <beam>", "removes 99 %", "225 vertices, moves by 12.5 mm"):
         assert said in page.text
     assert "was learned at, with the share of cells and times: thin <beam> (12 %)." in page.text

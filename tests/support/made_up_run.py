@@ -298,9 +298,7 @@ def _arm_errors(simulated, measured, names, test, labels, scales, horizons):
         return _errors(own, measured[rows, steps], names[rows], labels)
 
     late = {"left": 2, "first_s": {"test_01": 1.2, "test_00": 0.84}}
-    content = part(0, test) | {
-        "range": {"simfree": late, "resphys": {"left": 0, "first_s": {}}},
-    }
+    content = part(0, test) | {"range": {"simfree": late, "resphys": {"left": 0, "first_s": {}}}}
     if horizons:
         content["horizons"] = {f"{w:g}": part(0, test, round(w / ARM_STEP))["errors_mm"] for w in horizons}
     if scales:

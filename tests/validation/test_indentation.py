@@ -83,12 +83,7 @@ def _block(x: FloatArray, y: FloatArray, depth: FloatArray) -> Mesh:
 
 
 def press(
-    obstacle: Sphere | Cylinder,
-    mesh: Mesh,
-    depths,
-    distance: float,
-    stiffness: float,
-    device: str,
+    obstacle: Sphere | Cylinder, mesh: Mesh, depths, distance: float, stiffness: float, device: str
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Presses an obstacle at depths [m] below z = 0 into a block with a fixed base.
 

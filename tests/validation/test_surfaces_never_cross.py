@@ -289,10 +289,7 @@ def tentacle() -> Case:
     return Case({"tentacle": body}, contact, distance, 120, material=soft, pull={"tentacle": (2.7, 1.5)})
 
 
-CASES = {
-    **erleben_cases(),
-    **{"mat": mat(), "rollers": rollers(), "funnel": funnel(), "tentacle": tentacle()},
-}
+CASES = {**erleben_cases(), **{"mat": mat(), "rollers": rollers(), "funnel": funnel(), "tentacle": tentacle()}}
 
 
 @pytest.mark.parametrize("name", CASES)

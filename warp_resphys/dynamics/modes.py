@@ -104,9 +104,7 @@ def _inverse(root: scipy.sparse.csc_array) -> scipy.sparse.csc_array:
     return scipy.sparse.csc_array(inverse)
 
 
-def _about_rest(
-    simulator: Simulator,
-) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, IntArray]:
+def _about_rest(simulator: Simulator) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, IntArray]:
     """Returns elastic stiffness and inertia (3 F, 3 F) [N/m] at rest, and the F free vertices."""
     simulator = replace(simulator, dtype=torch.float64)  # The lowest eigenvalues are below the rounding of float32.
     rest = simulator.rest_state()

@@ -523,11 +523,7 @@ class Simulator:
         return self._coordinates.expand(x), report
 
     def rollout(
-        self,
-        state: State,
-        steps: int,
-        inputs: Inputs | None = None,
-        parameters: Parameters | Constants | None = None,
+        self, state: State, steps: int, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
     ) -> Trajectory:
         """Simulates several time steps.
 

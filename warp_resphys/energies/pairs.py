@@ -200,12 +200,7 @@ class PairList:
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
         self._origin, self._outer, self._inner = origin + 0.5 * ways, outer, inner
         motion = struct_of(
-            broad_phase.Sweep,
-            origin=self._origin,
-            outer=outer,
-            inner=inner,
-            piece=self._piece_array,
-            reach=self.reach,
+            broad_phase.Sweep, origin=self._origin, outer=outer, inner=inner, piece=self._piece_array, reach=self.reach
         )
         size = len(surface.vertices) * len(surface.triangles)
         total, vertices = size + len(surface.edges) ** 2, self.vertex_array.reshape((-1, 1))

@@ -351,10 +351,7 @@ class IncrementalPotential(Launcher):
                     kernel, inputs, threads = whole.tangent, whole.inputs, s.cells
                 tangents.append(self.record(kernel, (self.batch, threads), [*masks, *inputs], [tangent]))
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
-                products += [
-                    self.product(s, tangent, direction, stress),
-                    self.gather(s, stress, self._product),
-                ]
+                products += [self.product(s, tangent, direction, stress), self.gather(s, stress, self._product)]
         self.tangent_launches, self._product_commands = self.capture(*tangents), self.capture(*products)
 
     def stiffness_product(self, direction: torch.Tensor) -> torch.Tensor:

@@ -20,18 +20,7 @@ from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Constants, Mass
-from .base import (
-    Adjoint,
-    BoundEnergy,
-    Energy,
-    EnergySite,
-    EnergyStep,
-    Memory,
-    PointSet,
-    Values,
-    WholeCells,
-    value_of,
-)
+from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, WholeCells, value_of
 from .launcher import Launcher, struct_of, warp_view
 from .materials import Material
 from .viscosity import GreenStrain, StrainTerm, Viscosity

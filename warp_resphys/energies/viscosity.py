@@ -126,12 +126,7 @@ class StrainTerm(Term):
         at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
         view = warp_view(at, wp.vec3d)
         commands = [
-            own.record(
-                kernels.strain,
-                (own.batch, s.n_points),
-                [s.points, view],
-                [warp_view(out[:, s.own], wp.mat33d)],
-            )
+            own.record(kernels.strain, (own.batch, s.n_points), [s.points, view], [warp_view(out[:, s.own], wp.mat33d)])
             for s in self.sets
         ]
         recorded = own.capture(*commands)

@@ -19,13 +19,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.metrics import (
-    PHASES,
-    errors_per_marker,
-    marker_errors,
-    summarise,
-    summarise_trajectories,
-)
+from ..learning.metrics import PHASES, errors_per_marker, marker_errors, summarise, summarise_trajectories
 from ..learning.replay import Replay
 from ..settings.stages import StageSettings
 from .build import finer

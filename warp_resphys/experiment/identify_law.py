@@ -259,11 +259,7 @@ class _LawSearch(LawTrials):
             is_last: see `ParameterSearch.run`.
         """
         wanted, whole, given = self.settings.law, "whole" in key, key == "given"
-        limits = (
-            self.seconds,
-            None if whole else wanted.seconds,
-            None if whole or given else self.early,
-        )
+        limits = (self.seconds, None if whole else wanted.seconds, None if whole or given else self.early)
 
         def work() -> Found:
             seconds = min((limit for limit in limits if limit is not None), default=None)

@@ -23,16 +23,7 @@ from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
-from ..report.data import (
-    MODELS,
-    Driven,
-    Film,
-    FollowedPath,
-    Recordings,
-    RunReport,
-    TrialResults,
-    models_in_figures,
-)
+from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults, models_in_figures
 from ..report.obstacles import ObstacleSurface
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity

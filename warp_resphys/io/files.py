@@ -91,10 +91,7 @@ def atomic_hdf5(path: str | Path, kind: str, attributes: Mapping[str, Any] | Non
         attributes: Further attributes of the file's root (numbers, strings, small arrays).
     """
     in_memory = {"driver": "core", "backing_store": False, "block_size": 1 << 20}
-    with (
-        atomic_path(path) as partial,
-        h5py.File(partial.name, "w", libver=("v110", "v110"), **in_memory) as file,
-    ):
+    with atomic_path(path) as partial, h5py.File(partial.name, "w", libver=("v110", "v110"), **in_memory) as file:
         file.attrs.update({**(attributes or {}), "format": FORMAT, "version": FORMAT_VERSION, "kind": kind})
         file.attrs["complete"] = False
         yield file

@@ -77,11 +77,7 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def run_stages(
-    stages: Sequence[Stage],
-    run_dir: str | Path,
-    wait: bool = False,
-) -> dict[str, float]:
+def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False) -> dict[str, float]:
     """Runs the stages whose outputs are missing, damaged or of other settings.
 
     Args:

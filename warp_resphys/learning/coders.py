@@ -30,11 +30,7 @@ class Coder(nn.Module):
     dual: torch.Tensor | None
 
     def __init__(
-        self,
-        mean: torch.Tensor,
-        basis: torch.Tensor | None,
-        scale: torch.Tensor,
-        dual: torch.Tensor | None = None,
+        self, mean: torch.Tensor, basis: torch.Tensor | None, scale: torch.Tensor, dual: torch.Tensor | None = None
     ) -> None:
         super().__init__()
         for name, values in (("mean", mean), ("basis", basis), ("scale", scale), ("dual", dual)):

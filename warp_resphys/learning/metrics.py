@@ -117,7 +117,7 @@ PUBLISHED_WINDOWS_MM: Final[Mapping[str, Mapping[str, Mapping[str, PublishedErro
             "resphys": PublishedError(5.79, 3.09),
         },
         "10": PUBLISHED_MM["sopra_extrapolation"],
-    },
+    }
 }
 
 

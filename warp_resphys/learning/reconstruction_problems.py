@@ -131,11 +131,7 @@ class FullStateProblem(StepProblem):
 
         self._inverse = inverse
         change = conjugate_gradients(
-            lambda d: d + weight * step.product(step.product(d)),
-            inverse,
-            right,
-            tolerance=1e-6,
-            shortest=0.5 * short,
+            lambda d: d + weight * step.product(step.product(d)), inverse, right, tolerance=1e-6, shortest=0.5 * short
         ).x
         return lambda damping: x + change / (1.0 + damping)[:, None, None]
 

@@ -298,11 +298,7 @@ class Replay:
         return self.at_frames(self._observed(state.q for state in states), start)[None]
 
     def varied(
-        self,
-        start: Start,
-        parameters: Parameters,
-        states: Sequence[State] | None = None,
-        record: Record | None = None,
+        self, start: Start, parameters: Parameters, states: Sequence[State] | None = None, record: Record | None = None
     ) -> torch.Tensor:
         """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first."""
         series = self.varied_series(start, parameters, states, record)
@@ -310,11 +306,7 @@ class Replay:
 
     @torch.no_grad()
     def varied_series(
-        self,
-        start: Start,
-        parameters: Parameters,
-        states: Sequence[State] | None = None,
-        record: Record | None = None,
+        self, start: Start, parameters: Parameters, states: Sequence[State] | None = None, record: Record | None = None
     ) -> torch.Tensor:
         """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first.
 

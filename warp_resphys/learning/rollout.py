@@ -260,11 +260,7 @@ class LearnedPredictor:
 
 
 def equilibrium_under_feedback(
-    simulator: Simulator,
-    inputs: Inputs,
-    constants: Constants,
-    guess: State,
-    force: Callable[[State], torch.Tensor],
+    simulator: Simulator, inputs: Inputs, constants: Constants, guess: State, force: Callable[[State], torch.Tensor]
 ) -> State:
     """Returns the state of rest under constant inputs and a force (B, N, 3) [N] that depends on the state.
 

@@ -55,11 +55,7 @@ class Uncertainty:
 
 
 def uncertainty_of(
-    trials: Sequence[Linearised],
-    prior: FloatArray,
-    prior_weight: float,
-    bounds: Mapping[str, Bounds],
-    unit: FloatArray,
+    trials: Sequence[Linearised], prior: FloatArray, prior_weight: float, bounds: Mapping[str, Bounds], unit: FloatArray
 ) -> Uncertainty:
     """Returns the uncertainty of P parameters at the minimum.
 

@@ -199,10 +199,7 @@ FACES: dict[int, Face] = {
     for corners, parents, exponents, triangles in (
         (_TRIANGLE, [], _exponents(1, total=1, others=2), [[0, 1, 2]]),
         (_SQUARE, [], _exponents(1, others=2), [[0, 1, 2], [0, 2, 3]]),
-        (
-            *(_TRIANGLE, _TRIANGLE_EDGES, _exponents(2, total=2, others=2)),
-            [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]],
-        ),
+        (*(_TRIANGLE, _TRIANGLE_EDGES, _exponents(2, total=2, others=2)), [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]),
         (
             *(_SQUARE, _SQUARE_EDGES, _serendipity(_exponents(2, others=2))),
             [[0, 4, 7], [4, 1, 5], [5, 2, 6], [6, 3, 7], [4, 5, 6], [4, 6, 7]],

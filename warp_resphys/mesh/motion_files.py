@@ -99,11 +99,7 @@ def write_vtk(
 
 
 def _write_series(
-    path: Path,
-    times: FloatArray,
-    points: FloatArray,
-    cells: tuple[str, IntArray],
-    fields: Iterator[dict[str, Any]],
+    path: Path, times: FloatArray, points: FloatArray, cells: tuple[str, IntArray], fields: Iterator[dict[str, Any]]
 ) -> None:
     """Writes one file per time, then the collection that lists them."""
     import meshio

@@ -11,17 +11,7 @@ from matplotlib.figure import Figure
 from ..io.arrays import FloatArray
 from ..settings.run import RunSettings
 from .figures import TONES, new_figure, use_logarithm
-from .page import (
-    NO_BREAK_SPACE,
-    Cell,
-    PageTable,
-    Part,
-    Row,
-    Text,
-    canvas_beside,
-    number_text,
-    write_page,
-)
+from .page import NO_BREAK_SPACE, Cell, PageTable, Part, Row, Text, canvas_beside, number_text, write_page
 
 _COLUMNS: Final[Mapping[str, str]] = {
     "median_mm": "Median [mm]",
@@ -75,10 +65,7 @@ def write_ablation_report(
         figure = canvas.figure("marker_ablation", boxes, alt, caption)
     write_page(
         path,
-        [
-            Part("", [figure, ablation_table(rows, note)]),
-            Part("How it was reconstructed", [Text(how)]),
-        ],
+        [Part("", [figure, ablation_table(rows, note)]), Part("How it was reconstructed", [Text(how)])],
         settings,
         [verdict(rows, uncorrected)],
         metrics,

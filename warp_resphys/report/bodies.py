@@ -203,10 +203,7 @@ def _views(motion: ComparedMotion, size: tuple[int, int], headroom: float = 0.0)
     room = headroom * height
     return [
         View([*layers, *_dots(motion.measured, simulated, half_height, _RADII[size])], turned, focus, half_height)
-        for turned, focus, half_height in (
-            (axes, middle + room * axes[1], height + room),
-            (second, near, near_height),
-        )
+        for turned, focus, half_height in ((axes, middle + room * axes[1], height + room), (second, near, near_height))
     ]
 
 

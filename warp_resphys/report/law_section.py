@@ -12,31 +12,9 @@ from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from .data import RunReport
 from .identification_section import Wording, identified_cell, parameter_wording
-from .page import (
-    NONE,
-    Block,
-    Canvas,
-    Cell,
-    Drawn,
-    PageTable,
-    Part,
-    Row,
-    Text,
-    in_a_row,
-    significant,
-    unbroken,
-)
+from .page import NONE, Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, in_a_row, significant, unbroken
 from .sections import BEYOND
-from .uniaxial import (
-    ACROSS,
-    ALONG,
-    SmallStrain,
-    families,
-    ogden_terms,
-    small_strain,
-    small_strain_of,
-    uniaxial_stress,
-)
+from .uniaxial import ACROSS, ALONG, SmallStrain, families, ogden_terms, small_strain, small_strain_of, uniaxial_stress
 from .verdict import model_name
 
 _NOT_FACTORS: Final = ("ms", "%", "°")  # Units of constants that multiply no term: times, slacks, directions.

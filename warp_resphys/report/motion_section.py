@@ -10,15 +10,7 @@ from markupsafe import Markup
 
 from ..learning.baselines import BASELINES
 from .bodies import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion
-from .data import (
-    MODELS,
-    Film,
-    RunReport,
-    TrialResults,
-    at_times,
-    shown_markers,
-    shown_models,
-)
+from .data import MODELS, Film, RunReport, TrialResults, at_times, shown_markers, shown_models
 from .page import Block, Canvas, Drawn, Part, largest_text, unbroken
 from .render import Renderer, draw, hangs, write_film
 

@@ -234,11 +234,7 @@ def canvas_beside(path: Path) -> Iterator[Canvas]:
 
 
 def write_page(
-    path: Path,
-    parts: Sequence[Part],
-    run: RunSettings,
-    verdict: Sequence[str],
-    metrics: Mapping[str, Any],
+    path: Path, parts: Sequence[Part], run: RunSettings, verdict: Sequence[str], metrics: Mapping[str, Any]
 ) -> None:
     """Write the page of a run.
 

@@ -15,16 +15,7 @@ from .error_section import error_section
 from .identification_section import identification_section
 from .law_section import law_section
 from .motion_section import motion_section, start_drawing
-from .page import (
-    Canvas,
-    Items,
-    Part,
-    Text,
-    canvas_beside,
-    mm_text,
-    unbroken,
-    write_page,
-)
+from .page import Canvas, Items, Part, Text, canvas_beside, mm_text, unbroken, write_page
 from .sections import (
     details_table,
     horizons_section,

@@ -49,10 +49,7 @@ def training_curves(records: Sequence[Mapping[str, Any]]) -> "Figure":
     figure = figures.new_figure(0.6 + 0.57 * sum(heights.values()))
     rows = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=[*heights.values()])[:, 0]
     axes = dict(zip(heights, rows, strict=True))
-    for key, label, colour in (
-        ("train_loss", "Training loss", muted),
-        ("validation_loss", "Validation loss", strong),
-    ):
+    for key, label, colour in (("train_loss", "Training loss", muted), ("validation_loss", "Validation loss", strong)):
         epochs, losses = measured(key)
         if len(epochs):
             axes["losses"].plot(epochs, losses, color=colour, label=label, **thin)

@@ -12,8 +12,7 @@ from .mesh import BoxSettings, Curve, Direction, Divisions, LengthUnit, MeshSett
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
 OwnEnergies = Annotated[
-    dict[str, ClassSettings],
-    BeforeValidator(without_null, json_schema_input_type=dict[str, ClassSettings | None]),
+    dict[str, ClassSettings], BeforeValidator(without_null, json_schema_input_type=dict[str, ClassSettings | None])
 ]
 
 
@@ -242,8 +241,7 @@ class SolveSettings(Settings):
         "auto", "linear solver; banded, bordered and pardiso need a CPU"
     )
     factors: Literal["double", "single"] = setting(
-        "double",
-        "precision of factors and L-BFGS pairs; results stay accurate",
+        "double", "precision of factors and L-BFGS pairs; results stay accurate"
     )
     on_failure: Literal["raise", "count"] = setting("raise", "effect of a failed step; count continues")
 

@@ -11,8 +11,7 @@ from .trials import different
 Model = Literal["published", "simulation", "sysid_elastic", "sysid", "law", "simfree", "resphys_uncorrected", "resphys"]
 Models = Annotated[Some[Model], AfterValidator(different)]
 Shape = Annotated[
-    str,
-    Field(pattern="^(circle|eight|[A-Z])$", json_schema_extra={"wanted": "circle, eight or a capital letter"}),
+    str, Field(pattern="^(circle|eight|[A-Z])$", json_schema_extra={"wanted": "circle, eight or a capital letter"})
 ]
 Numbers = Annotated[Some[Positive], AfterValidator(different)]
 

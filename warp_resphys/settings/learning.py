@@ -47,8 +47,7 @@ class RangeSettings(Settings):
     logarithmic: bool = setting(False, "whether the scale is logarithmic")
     prior: PriorSettings | None = setting(None, "prior knowledge")
     per: Literal["all", "session", "trial", "material", "lens"] = setting(
-        "all",
-        "what shares a value; session, trial: values near the mean of the prior; material, lens: for pictures",
+        "all", "what shares a value; session, trial: values near the mean of the prior; material, lens: for pictures"
     )
 
     @model_validator(mode="after")
@@ -80,8 +79,7 @@ class PlacementSettings(Settings):
 
 
 Ranges = Annotated[
-    dict[str, RangeSettings],
-    BeforeValidator(without_null, json_schema_input_type=dict[str, RangeSettings | None]),
+    dict[str, RangeSettings], BeforeValidator(without_null, json_schema_input_type=dict[str, RangeSettings | None])
 ]
 Guesses = Annotated[dict[str, float], BeforeValidator(without_null, json_schema_input_type=dict[str, float | None])]
 
@@ -230,8 +228,7 @@ class InTheLoopSettings(EpochSettings):
     epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
     rollout_every: Natural = setting(1, "epochs between roll-outs that choose the weights")
     hold_out: bool = setting(
-        True,
-        "from zero, without validation trials, hold out each training trial to choose the epochs",
+        True, "from zero, without validation trials, hold out each training trial to choose the epochs"
     )
     patience: Natural = setting(3, "epochs without improvement after which training ends")
     penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")

@@ -159,9 +159,7 @@ class GeneratedArm(Settings):
     web: Positive = setting(0.004, "thickness between neighbouring chambers", "m")
     core: Positive | None = setting(None, "distance of the chambers from the axis at the base; null: the least", "m")
     rotations: Many[float] = setting(
-        (),
-        "rotations of the chambers, one per segment; for tetrahedra and a round outline",
-        "degrees",
+        (), "rotations of the chambers, one per segment; for tetrahedra and a round outline", "degrees"
     )
 
 

@@ -59,8 +59,7 @@ class ParallelSettings(Settings):
 
     processes: Natural | None = setting(1, "number of processes; null: one for each core")
     address: Word | None = setting(
-        None,
-        "address of a Dask cluster with the same folders, such as tcp://head:8786; null: this machine",
+        None, "address of a Dask cluster with the same folders, such as tcp://head:8786; null: this machine"
     )
     batch: Natural | None = setting(None, "trials that a process simulates at once; null: all")
 
@@ -117,8 +116,7 @@ class RunSettings(SimulatorSettings):
     ablation: AblationSettings | None = setting(None, "study of the number of markers, in place of learning")
     correct_uncorrected: bool = setting(False, "also learn a force for the simulator without identification")
     force_frame: Literal["corotated", "world"] = setting(
-        "world",
-        "corotated: residual forces rotate with the body; world: they keep their directions, as published",
+        "world", "corotated: residual forces rotate with the body; world: they keep their directions, as published"
     )
     range_guard: bool = setting(True, "limit the inputs of networks to their training range")
     mesh_check: Annotated[float, Field(gt=1.0, le=4.0)] | None = setting(

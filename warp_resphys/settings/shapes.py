@@ -18,10 +18,7 @@ class ShapeSettings(BodySettings):
 
     target_mesh: MeshSettings | None = setting(None, "mesh of its target; null: the same")
     held: HeldSettings | None = setting(None, "how it is held before its release")
-    inputs: Many[float] | None = setting(
-        None,
-        "inputs before the release, one per chamber, tendon or muscle",
-    )
+    inputs: Many[float] | None = setting(None, "inputs before the release, one per chamber, tendon or muscle")
 
     @model_validator(mode="after")
     def _begins(self) -> Self:

@@ -23,14 +23,7 @@ from .learning import (
 from .mesh import PlaceSettings
 from .run import PublishedSettings, RunSettings
 from .shapes import ShapeSettings
-from .trials import (
-    BindingSettings,
-    MarkerSettings,
-    PlaySettings,
-    ReadingSettings,
-    Split,
-    Trial,
-)
+from .trials import BindingSettings, MarkerSettings, PlaySettings, ReadingSettings, Split, Trial
 
 LEARNING: Final = (  # keys of all stages of a split, beside those of the simulator
     *("payload_at", "simulation", "markers", "release", "force_frame", "train_fraction", "trial_seconds", "identified"),

@@ -319,8 +319,7 @@ class ReadingSettings(Settings):
     alignment: Literal["shared", "own"] = setting("own", "own: shift each trial to the mean marker positions")
     base_motion: BaseMotion = setting(None, "motion of the base: recorded, reference (by markers), or given")
     obstacle_motion: dict[str, MotionSettings | Literal["recorded"]] = setting(
-        {},
-        "motion of obstacles, given or recorded",
+        {}, "motion of obstacles, given or recorded"
     )
     payload_at: PlaceSettings | None = setting(None, "vertices that carry payloads, in equal shares")
     up: SignedAxis | Direction | None = setting(

@@ -184,12 +184,7 @@ class Inputs:
         return self._derived({name: pick(v) if has_time[name] else v for name, v in self.fields.items()})
 
     def check(
-        self,
-        accepted: Mapping[str, tuple[Quantity, int]],
-        batch: int,
-        vertices: int,
-        fixed: int,
-        like: torch.Tensor,
+        self, accepted: Mapping[str, tuple[Quantity, int]], batch: int, vertices: int, fixed: int, like: torch.Tensor
     ) -> None:
         """Checks all fields.
 

@@ -139,11 +139,7 @@ def _bound(
 
 
 def _mountings(
-    observer: Observer,
-    observed: Sequence[Observed],
-    bound: FloatArray,
-    offsets: FloatArray,
-    training: Container[str],
+    observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray, training: Container[str]
 ) -> dict[str, dict[str, Any]]:
     """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial.
 

@@ -194,12 +194,7 @@ class Observer(Reader):
         return replace(observed, base=base, obstacles=obstacles)
 
     def _register(
-        self,
-        trial: Trial,
-        places: FloatArray,
-        recording: Recording,
-        expected: FloatArray,
-        only_reference: bool = False,
+        self, trial: Trial, places: FloatArray, recording: Recording, expected: FloatArray, only_reference: bool = False
     ) -> Registration:
         """Registers places (M', 3) of markers in the frame of a recording [m].
 

@@ -68,15 +68,10 @@ def true_markers(played, setup, trials, times):
         return Replay(simulator, read, motions)(start)[0].numpy()
 
 
-def read_motions(folder, run):
-    """The dataset of a run, and its trials as a simulator takes them."""
-    dataset = read_dataset(folder / DATASET)
-    return dataset, dataset.trials(dataset.names, build_body(run), run.payload_at)
-
-
 def test_simulated_markers_come_back_within_noise(laboratory):
     folder, run = laboratory
-    dataset, motions = read_motions(folder, run)
+    dataset = read_dataset(folder / DATASET)
+    motions = dataset.trials(dataset.names, build_body(run), run.payload_at)
     bound = dataset.bound
     assert motions.names == ("m0", "m50", "m90")
     assert dataset.labels == TIPS
@@ -235,17 +230,11 @@ def test_a_trial_with_markers_of_its_own(shelf):
     assert read_dataset(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
 
 
-def published_layout(shelf, name, first):
-    """The recording from a frame on, with the places of its markers on the undeformed body."""
-    positions = shelf.recordings[name].positions
-    shelf.write(name, positions=positions[first:], rest=np.median(positions[:40], axis=0))
-
-
 def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     """As the published ones do: a loaded beam at rest, whose weight is cut off."""
     whole = shelf.bring_in()
-    for name in shelf.recordings:
-        published_layout(shelf, name, first=44)
+    for name, recording in shelf.recordings.items():
+        shelf.write(name, positions=recording.positions[44:], rest=np.median(recording.positions[:40], axis=0))
     shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
     results = shelf.bring_in()
     np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=2e-5)
@@ -261,11 +250,6 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
 def refuse(shelf, message, error=DataFileError):
     with pytest.raises(error, match=message):
         shelf.bring_in()
-
-
-def truncate(shelf):
-    path = shelf.folder / "load52.h5"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
 def hide(label, frames):
@@ -285,7 +269,6 @@ def still(shelf, noise):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (truncate, "is (truncated|damaged)"),
         (
             give(labels=("Tip 1", *TIPS[1:], *BASES)),
             " has no marker named 'Tip - 1'; it has 'Tip 1', 'Tip - 2'.*set the marker names",

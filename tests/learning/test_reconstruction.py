@@ -259,7 +259,6 @@ class TestLevenbergMarquardt:
         ({"method": "adam"}, "reconstruction.method"),
         ({"method": "lbfgsb", "modes": 3}, "reconstruction.method"),
         ({"regularisation": -1e-9, "observation": WHOLE_STATE}, "reconstruction.regularisation"),
-        ({"regularisation": float("nan"), "observation": WHOLE_STATE}, "reconstruction.regularisation"),
         ({"regularisation": 0.0}, "reconstruction.regularisation"),
         ({"tolerance": 0.0}, "reconstruction.tolerance"),
         ({"max_iterations": 0}, "reconstruction.max_iterations"),

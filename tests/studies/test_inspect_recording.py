@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from support.command_line import refusal, settings_of
+from support.command_line import settings_of
 from warp_resphys.data.recordings.processing import Release
 from warp_resphys.data.recordings.quality import quality
 from warp_resphys.data.recordings.reading import write_recording
@@ -107,9 +107,3 @@ def test_files_are_told_by_their_ends():
 def test_wrong_settings(tmp_path, path, overrides, message):
     with pytest.raises(InputError, match=message):
         inspect_recording(configured(f"recording.path={path}", *overrides), tmp_path)
-
-
-def test_command_ends_with_one_sentence(folder, path):
-    sentence = refusal("inspect", path, "still=[foot]")
-    assert sentence.startswith(f"error: {path} has no marker named 'foot'; it has 'tip'")
-    assert sentence.count("\n") == 1

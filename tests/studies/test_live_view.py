@@ -4,7 +4,7 @@ import re
 import socket
 import sys
 import threading
-from contextlib import contextmanager
+from contextlib import ExitStack
 from urllib.request import urlopen
 
 import numpy as np
@@ -17,15 +17,6 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import held_out_names, load
 from warp_resphys.studies.live import LiveRobot, range_of
 from warp_resphys.studies.view import Page
-
-
-@contextmanager
-def closing(server):
-    """The server, stopped at the end."""
-    try:
-        yield server
-    finally:
-        server.stop()
 
 
 @pytest.fixture
@@ -161,7 +152,9 @@ def test_a_browser_drives_and_pulls_it(finished):
     from selenium.webdriver.common.by import By
 
     live = LiveRobot(load(finished[0]))
-    with opened() as browser, closing(viser.ViserServer("127.0.0.1", 0, verbose=False)) as server:
+    with opened() as browser, ExitStack() as stack:
+        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        stack.callback(server.stop)
         page = Page(server, live)
 
         def look() -> None:

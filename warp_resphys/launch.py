@@ -14,7 +14,6 @@ import warnings
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from importlib import import_module, resources
 from pathlib import Path
 from typing import Any, Final, get_type_hints
@@ -83,6 +82,9 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
                 raise SystemExit(USER_ERROR) from error
             raise
 
+    def label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
+        return run_label([*overrides, *(override.argument for override in late)], excluded)
+
     full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # It tells of its list of fonts.
     before = sys.argv
@@ -99,7 +101,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             rest, shown = _without_shown(rest)
         settings = RunSettings if command in TYPED else _function(function)[1]
         rest, late = readable(rest, settings.model_json_schema())
-        OmegaConf.register_new_resolver("run_label", partial(_label, late), replace=True)
+        OmegaConf.register_new_resolver("run_label", label, replace=True)
         sys.argv = [before[0], *rest, *(_SILENT if shown is not None else ())]
         place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}
         with _ends_as_after_ctrl_c(), names_are_texts():
@@ -129,11 +131,6 @@ def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
         run = getattr(import_module(f"{__package__}.{module}"), function)
     settings, *_ = get_type_hints(run).values()
     return run, settings
-
-
-def _label(late: Sequence[LateOverride], overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
-    """`run_label` of all overrides."""
-    return run_label([*overrides, *(override.argument for override in late)], excluded)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ _NO_MEMORY = -2  # error
 _PERTURBED = 13  # place of the number of pivots that were made larger
 _DEFINITE: Final = 2  # kind of symmetric matrices that are positive definite
 
-FloatArray = NDArray[np.floating[Any]]
+Values = NDArray[np.floating[Any]]
 
 
 class PardisoSolver(LinearSolver):
@@ -97,7 +97,7 @@ class _Systems(SeparateFactors):
 class _System:
     """A matrix of values (n_values,), and the room of its factor until the next matrix takes it."""
 
-    def __init__(self, room: "_Room", values: FloatArray) -> None:
+    def __init__(self, room: "_Room", values: Values) -> None:
         self._room, self._values = room, values
         self._stamp = 0
 
@@ -128,7 +128,7 @@ class _Room:
         stamp: number of factorisations.
     """
 
-    def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: FloatArray) -> None:
+    def __init__(self, pattern: tuple[NDArray[np.int32], ...], values: Values) -> None:
         self._pattern, self.stamp = pattern, 0
         self._threads = torch.get_num_threads()  # A factor by another number than the analysis may crash.
         self._internal, self._options = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int32)
@@ -143,13 +143,13 @@ class _Room:
         if not sys.is_finalizing():
             self.call(_RELEASE)
 
-    def factorise(self, values: FloatArray) -> bool:
+    def factorise(self, values: Values) -> bool:
         """Returns whether the matrix of values (n_values,) has a factor, without a pivot that was made larger."""
         self.stamp += 1
         finite = np.isfinite(values.sum())
         return bool(finite and self.call(_FACTOR, values) == 0 and self._options[_PERTURBED] == 0)
 
-    def call(self, phase: int, values: FloatArray | None = None, right: FloatArray | None = None) -> int:
+    def call(self, phase: int, values: Values | None = None, right: Values | None = None) -> int:
         """Runs a phase on contiguous arrays, and returns Pardiso's error, zero for none.
 
         Args:

@@ -5,7 +5,7 @@ are ignored; those that generate nodes or elements, or name other files, are ref
 """
 
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -248,10 +248,13 @@ def _arranged(deck: _Deck) -> tuple[FloatArray, list[Block]]:
         points.append(np.array([*scope.nodes.values()]).reshape(-1, 3) @ rotation.T + translation)
         first += len(numbers)
     for (at, name), shown in deck.shown("sides").items():
+        chosen = defaultdict[tuple[str, int], list[IntArray]](list)  # elements by scope and side
         for member, side in deck.scopes()[at].sides[name]:
             for place, elements in deck.members(at, member):
-                for kind, numbers, nodes in solids.get(place, []):
-                    corners = _SIDES.get(kind.rstrip("0123456789"), [])[side - 1 : side]
-                    faces = nodes[np.isin(numbers, elements)][:, np.ravel(corners).astype(np.int64)]
-                    blocks.append(Block(_FACES.get(faces.shape[1], ""), 2, faces, {shown: np.arange(len(faces))}))
+                chosen[place, side].append(elements)
+        for (place, side), members in chosen.items():
+            for kind, numbers, nodes in solids.get(place, []):
+                corners = _SIDES.get(kind.rstrip("0123456789"), [])[side - 1 : side]
+                faces = nodes[np.isin(numbers, np.concatenate(members))][:, np.ravel(corners).astype(np.int64)]
+                blocks.append(Block(_FACES.get(faces.shape[1], ""), 2, faces, {shown: np.arange(len(faces))}))
     return np.concatenate(points), blocks

@@ -67,7 +67,7 @@ COMMANDS: Final[Mapping[str, Command]] = MappingProxyType(
         ),
         "convert": Command(
             "recordings, such as bags, MCAP files and exported tables, to HDF5",
-            "studies.conversion:convert",
+            "studies.recording_quality:convert",
             words="files",
         ),
         "view": Command("a run's robot in the browser, to be driven and pulled", "studies.view:view", word="run"),

@@ -46,13 +46,12 @@ from .experiment.files import (
     training_file,
     weights_file,
 )
-from .experiment.folds import Fold, run_folds
 from .experiment.identify import identify
 from .experiment.identify_law import identify_law
 from .experiment.laboratory import run_laboratory
 from .experiment.learn import train
 from .experiment.models import SIMFREE
-from .experiment.parts import workers_for
+from .experiment.parts import Fold, run_folds, workers_for
 from .experiment.prediction_intervals import intervals_of_folds
 from .experiment.reconstruct import reconstruct
 from .experiment.recordings.importing import import_recordings, import_scaled

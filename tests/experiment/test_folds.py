@@ -8,9 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_resphys.experiment import folds
-from warp_resphys.experiment.folds import Fold, run_folds
-from warp_resphys.experiment.parts import padded, read_parts, remove_parts, split_into_parts, work_on, workers_for
+from warp_resphys.experiment import parts as module
+from warp_resphys.experiment.parts import (
+    Fold,
+    padded,
+    read_parts,
+    remove_parts,
+    run_folds,
+    split_into_parts,
+    work_on,
+    workers_for,
+)
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.fan_out import WorkerError, Workers
 from warp_resphys.io.stages import Stage, StageContext, StageInterrupted
@@ -64,12 +72,12 @@ def test_a_fold_that_fails_or_is_interrupted_is_named_and_what_is_done_is_kept(t
         finished(0)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(folds, "fan_out", one_after_another)
+    monkeypatch.setattr(module, "fan_out", one_after_another)
     with pytest.raises(WorkerError, match=r"^fold b: the simulation fails"):
         run_folds(made(tmp_path, fails="b"), Workers(2))
     assert (written(tmp_path).keys(), written(tmp_path, "first").keys()) == ({"a"}, {"a", "b"})
     first = (tmp_path / "fold_b" / "first.json").stat().st_mtime_ns
-    monkeypatch.setattr(folds, "fan_out", interrupted)
+    monkeypatch.setattr(module, "fan_out", interrupted)
     with pytest.raises(StageInterrupted, match=r"^interrupted before the folds c, d ended; .* the same command"):
         run_folds(made(tmp_path), Workers(2))
     assert written(tmp_path).keys() == {"a", "b"}

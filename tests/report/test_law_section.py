@@ -12,10 +12,20 @@ from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
 from warp_resphys.energies.materials import ConvexMaterial
 from warp_resphys.io.files import read_json, write_json
-from warp_resphys.report.law_section import drawn_stretches, law_text, not_needed_text, outside_text, wording
+from warp_resphys.report.law_section import (
+    ACROSS,
+    ALONG,
+    drawn_stretches,
+    law_text,
+    not_needed_text,
+    outside_text,
+    small_strain,
+    small_strain_of,
+    uniaxial_stress,
+    wording,
+)
 from warp_resphys.report.page import number_text
 from warp_resphys.report.run_page import range_texts
-from warp_resphys.report.uniaxial import ACROSS, ALONG, small_strain, small_strain_of, uniaxial_stress
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.learning import LawSettings
 

@@ -1,8 +1,10 @@
 """Rolls trials out in parts, in one process or several; an interrupted stage keeps its finished parts.
 
-A stage splits its trials into parts, with one file per part, and a function computes the arrays of a part.
+A stage splits its trials into parts, with one file per part, and a function computes the arrays of a part. A
+cross-validation runs its folds in parallel, with one folder per fold.
 """
 
+import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,17 +17,18 @@ import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from ..io.errors import InputError
-from ..io.fan_out import Workers, fan_out
+from ..io.errors import InputError, ResphysError
+from ..io.fan_out import ALONE, WorkerError, Workers, fan_out
 from ..io.files import atomic_hdf5, create, is_final, read_array, read_hdf5
 from ..io.machine import available_cores
 from ..io.progress import Progress
-from ..io.stages import StageContext
+from ..io.stages import Stage, StageContext, StageInterrupted, run_stages, unfinished
 from ..settings.run import ParallelSettings
 from .build import simulation_device
 
 Report = Callable[..., None]
 Arrays = Mapping[str, tuple[NDArray[Any], str]]  # with their units
+Stages = Callable[[Workers], list[Stage]]
 
 
 @dataclass(frozen=True)
@@ -184,3 +187,64 @@ def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
 def remove_parts(context: StageContext) -> None:
     """Deletes the files of a stage's parts."""
     shutil.rmtree(_folder(context), ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Fold:
+    """One fold of a cross-validation.
+
+    Attributes:
+        name: name of the trial that is left out.
+        folder: folder of the fold's files.
+        stages: makes the stages of the fold for given workers; can be sent to another process.
+    """
+
+    name: str
+    folder: Path
+    stages: Stages
+
+
+def run_folds(folds: Mapping[str, Fold], workers: Workers) -> None:
+    """Runs the folds that are not up to date, one per worker; a single remaining fold uses all workers.
+
+    The results do not depend on the number of workers.
+
+    Args:
+        folds: by the trial that is left out.
+        workers: share the folds.
+
+    Raises:
+        WorkerError: a fold failed; the other folds keep their results.
+        StageInterrupted: Ctrl-C; all folds keep their results.
+    """
+    left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
+    if workers.alone or len(left) <= 1:
+        with threadpool_limits(1):
+            for fold in left:
+                run_stages(fold.stages(workers), fold.folder)
+        return
+    running = {fold.name for fold in left}
+    folder = left[0].folder.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with Progress("cross-validation", len(left), "folds") as progress:
+
+            def finished(number: int) -> None:
+                running.discard(left[number].name)
+                progress.advance()
+
+            fan_out(_run, left, workers.at_most(len(left)), folder, finished)
+    except KeyboardInterrupt as error:
+        raise StageInterrupted(
+            f"interrupted before the folds {', '.join(sorted(running))} ended; all saved results are kept, and the "
+            "same command resumes there"
+        ) from error
+
+
+def _run(fold: Fold) -> None:
+    """Runs a fold in a worker process, which logs its stages."""
+    logging.basicConfig(level=logging.INFO, format=f"fold {fold.name}: %(message)s", force=True)
+    try:
+        run_stages(fold.stages(ALONE), fold.folder)
+    except ResphysError as error:
+        raise WorkerError(f"fold {fold.name}: {error}") from error

@@ -1,5 +1,6 @@
-"""Quality of a recording as a table and a picture: occlusions, jumps, noise and drift of its markers."""
+"""Quality of a recording as a table and a picture: occlusions, jumps, noise and drift of its markers; conversion."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from ..data.recordings.bag import is_bag
 from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.quality import (
     QUALITY_COLUMNS,
@@ -23,10 +25,10 @@ from ..data.recordings.quality import (
     quality,
     quality_table,
 )
-from ..data.recordings.reading import read_recording
+from ..data.recordings.reading import READERS, read_recording, write_recording
 from ..data.recordings.recording import Recording
 from ..io.atomic import atomic_path
-from ..io.errors import InputError
+from ..io.errors import DataFileError, InputError, listed
 from ..io.files import write_json
 from ..io.progress import aligned
 from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
@@ -195,3 +197,50 @@ def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Qua
     handles: list[Artist] = [Patch(color=colour, label=name) for name, colour in _STATES.items()]
     handles.append(axes.plot([], [], "|", color=TONES["ink"].light, markersize=6, label="jump")[0])
     axes.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, handlelength=1.0)
+
+
+class Conversion(Settings):
+    """The configuration ``convert``, which explains its keys."""
+
+    files: Many[Word]
+    to: Word
+    recording: RecordingFile
+
+
+def convert(settings: Conversion, folder: Path) -> None:
+    """Writes the recordings, and prints a line for each.
+
+    Raises:
+        ResphysError: nothing was named, a recording cannot be read, or two have the same name.
+    """
+    del folder
+    files = [*_recordings(settings.files)]
+    if not files:
+        raise InputError("nothing to convert: name recordings, as in warp-resphys convert FILE.")
+    places = {path: Path(settings.to).expanduser() / f"{path.stem}.h5" for path in files}
+    if len({*places.values()}) < len(files):
+        twice = [str(path) for path in files if [*places.values()].count(places[path]) > 1][:2]
+        raise InputError(f"{' and '.join(twice)} would both be {places[Path(twice[0])]}: convert them to two folders.")
+    for path, place in places.items():
+        if place.exists() and place.samefile(path):
+            raise InputError(f"{path} would be replaced by itself: choose another folder, as in to=converted.")
+        recording = read_recording(path, *settings.recording.arguments())
+        write_recording(place, recording)
+        frames, channels = len(recording.positions), recording.actuation
+        inputs = "" if channels is None else f", inputs {channels.shape[1]}"
+        print(
+            f"{path} -> {place}: {frames} frames at {recording.rate:g} Hz, markers {listed(recording.labels)}{inputs}, "
+            f"seen {recording.seen.mean():.1%}"
+        )
+
+
+def _recordings(files: Sequence[str]) -> Iterator[Path]:
+    """Yields recordings, and those in folders that are no bags."""
+    for path in (Path(name).expanduser() for name in files):
+        if not path.is_dir() or is_bag(path):
+            yield path
+            continue
+        inside = sorted(own for own in path.iterdir() if own.suffix.lower() in READERS or is_bag(own))
+        if not inside:
+            raise DataFileError(f"{path} has no recordings that can be read: name a folder with recordings.")
+        yield from inside

@@ -233,3 +233,6 @@ def test_voxels_and_pixels_of_vtk(tmp_path, extension):
     voxels.cast_to_unstructured_grid().merge(pixel).save(tmp_path / f"scan.{extension}")
     for name in ("grid.vti", f"scan.{extension}"):
         np.testing.assert_allclose(cell_volumes(read_mesh(tmp_path / name)), np.full(20, 1e-6), rtol=1e-5)
+    pyvista.UnstructuredGrid().save(tmp_path / f"empty.{extension}")
+    with pytest.raises(MeshError, match=f"empty.{extension}: the file has no cells; save a mesh of the volume"):
+        read_mesh(tmp_path / f"empty.{extension}")

@@ -47,7 +47,8 @@ def read_vtk(path: str) -> tuple[NDArray[np.float64], list[Block]]:
         converter.AddInputData(grid)
         converter.Update()
         grid = converter.GetOutput()
-    count = grid.GetNumberOfCells()
+    if not (count := grid.GetNumberOfCells()):
+        return np.empty((0, 3)), []
     kinds = np.fromiter(map(grid.GetCellType, range(count)), dtype=np.int64, count=count)
     cells = grid.GetCells()
     ends, nodes = vtk_to_numpy(cells.GetOffsetsArray()), vtk_to_numpy(cells.GetConnectivityArray())

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.linalg.banded import BandedSolver
-from warp_resphys.linalg.bordered import BorderedSolver, hubs
+from warp_resphys.linalg.banded import BandedSolver, BorderedSolver, hubs
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 

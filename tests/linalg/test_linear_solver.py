@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.linalg.bordered import BorderedSolver
+from warp_resphys.linalg.banded import BorderedSolver
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.linalg.linear_solver import bandwidth_reducing_order
-from warp_resphys.linalg.pardiso import has_pardiso
-from warp_resphys.linalg.sparse import SparseSolver
+from warp_resphys.linalg.pardiso import SparseSolver, has_pardiso
 
 NODES, BATCH, HUB = 16, 3, 5
 

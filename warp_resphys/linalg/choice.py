@@ -15,12 +15,10 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.tiled_cholesky import TILE
-from .banded import BandedSolver
-from .bordered import BorderedSolver, banded_rest, hubs
+from .banded import BandedSolver, BorderedSolver, banded_rest, hubs
 from .linear_solver import Factor, Indices, LinearSolver, Mask, bandwidth
 from .multigrid import MultigridSolver
-from .pardiso import PardisoSolver, has_pardiso
-from .sparse import SparseSolver
+from .pardiso import PardisoSolver, SparseSolver, has_pardiso
 from .tiled import TiledSolver
 
 LinearSolverName = Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"]

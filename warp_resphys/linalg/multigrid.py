@@ -13,7 +13,7 @@ from typing_extensions import override
 from ..io.arrays import FloatArray
 from .conjugate_gradients import Iterate, conjugate_gradients
 from .linear_solver import Factor, Indices, Mask, SeparateFactors, sparse_lu
-from .sparse import SparseSolver
+from .pardiso import SparseSolver
 
 _COARSEST = 400  # largest number of unknowns of the coarsest level, which has a dense factor
 _DEGREE = 3  # degree of the smoother's polynomial

@@ -15,8 +15,7 @@ from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
-from ..twin.scores import Forecast
-from ..twin.stream import Alignment, Listener, Packet, recorded_packets
+from ..twin.stream import Alignment, Forecast, Listener, Packet, recorded_packets
 from ..twin.twin import JUMPS, Estimate, Twin
 
 _REMEMBERED: Final = 2000  # computing times

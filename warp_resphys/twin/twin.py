@@ -19,8 +19,7 @@ from ..robot.state import RobotState
 from .estimator import Belief, Correction, TwinEstimator
 from .full import FullEstimator
 from .reduced import ReducedEstimator
-from .scores import REMEMBERED, Disagreement, Forecast, Scores, mean_mm
-from .stream import Faults, position_of
+from .stream import REMEMBERED, Disagreement, Faults, Forecast, Scores, mean_mm, position_of
 
 Engine = Callable[[Robot, Mapping[str, Given], Mapping[str, float], float], TwinEstimator[Any]]
 _ENGINES: Final[Mapping[str, Engine]] = {"full": FullEstimator, "reduced": ReducedEstimator}

@@ -18,7 +18,6 @@ from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
 from .energies.catalogue import law_path
-from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.duration import announcement
@@ -53,7 +52,7 @@ from .experiment.learn import train
 from .experiment.models import SIMFREE
 from .experiment.parts import Fold, run_folds, workers_for
 from .experiment.prediction_intervals import intervals_of_folds
-from .experiment.reconstruct import reconstruct
+from .experiment.reconstruct import ablation_stages, print_ablation, reconstruct
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes

@@ -362,7 +362,13 @@ class Page:
         try:
             while not self._stopped and (seconds is None or time.perf_counter() - began < seconds):
                 now = time.perf_counter()
-                self._handle_requests()
+                with self._lock:
+                    requests, self._requests = self._requests, []
+                for request in requests:
+                    try:
+                        request()
+                    except ResphysError as error:
+                        live.failure = str(error)
                 due = min(due + (now - last) * self._speed, 2.0 * max(self._speed / _RATE, live.robot.time_step))
                 last = now
                 while self._playing and due >= live.robot.time_step and live.step():
@@ -384,15 +390,6 @@ class Page:
     def stop(self) -> None:
         """Ends `run`, from another thread."""
         self._stopped = True
-
-    def _handle_requests(self) -> None:
-        with self._lock:
-            requests, self._requests = self._requests, []
-        for request in requests:
-            try:
-                request()
-            except ResphysError as error:
-                self._live.failure = str(error)
 
     def _show(self) -> None:
         live = self._live

@@ -146,6 +146,16 @@ def test_lines_that_were_not_recorded_are_occlusions(tmp_path, positions):
     np.testing.assert_allclose(recording.positions[13:], positions[13:], atol=1e-9)
 
 
+@pytest.mark.parametrize(("rate", "decimals"), [(30.0, 2), (59.94, 3), (119.88, 4), (120.0, 3), (240.0, 3), (300.0, 3)])
+def test_rounded_times_give_the_rate_whatever_frames_are_missing(tmp_path, rate, decimals):
+    frames = np.delete(np.arange(1500), [10, 300, 301, 302, *range(700, 800)])
+    table = np.column_stack([np.round(frames / rate + 2.0, decimals), frames, frames, frames])
+    np.savetxt(tmp_path / "swing.csv", table, "%.8g", ",", header="time [s],a.x [mm],a.y [mm],a.z [mm]", comments="")
+    recording = read_recording(tmp_path / "swing.csv")
+    assert recording.rate == pytest.approx(rate, rel=2e-5)
+    np.testing.assert_array_equal(np.flatnonzero(recording.seen[:, 0]), frames)
+
+
 @pytest.mark.parametrize(
     ("line", "change", "message"),
     [

@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 AXES = ("x", "y", "z")
 _OCCLUDED = {"", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--"}
 _UNEVEN = 0.25  # of a frame: largest error of a time stamp
+_NEXT = 1.5  # of the median interval: the longest one without a missing frame
+_WHOLE = 5e-4  # difference of a rate from a whole number that counts as none; that of NTSC, 59.94 Hz, is 1e-3
 _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
@@ -230,9 +232,11 @@ def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -
 
     if _LEAST_RECORDED * span > interval * len(stamps):
         raise foreign(int(np.argmax(steps)) + 1)
-    if timed:  # The whole recording gives the interval more precisely than rounded times.
-        interval = span / round(span / interval)
+    if timed:  # Times may be rounded, and frames may be missing.
+        single = float(steps[steps < _NEXT * interval].mean())
+        interval = span / float(np.round(steps / single).sum())
     exact = (stamps - stamps[0]) / interval
+    exact -= np.median(exact - np.round(exact))
     frames = np.round(exact).astype(np.int64)
     uneven = np.abs(exact - frames) > _UNEVEN
     if uneven.any():
@@ -245,5 +249,5 @@ def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -
     if not timed:
         return frames, None
     rate = 1.0 / interval
-    whole = rate < _LARGEST_STAMP and abs(rate - round(rate)) < 1e-3 * rate
+    whole = rate < _LARGEST_STAMP and abs(rate - round(rate)) < _WHOLE * rate
     return frames, float(round(rate)) if whole else rate

@@ -27,7 +27,7 @@ sys.modules.update(dict.fromkeys({UNIX_ALONE}))
 import importlib
 for name in {names}:
     importlib.import_module("warp_resphys.io." + name)
-from warp_resphys.io.memory import available_memory_gib, peak_memory_gib
+from warp_resphys.io.machine import available_memory_gib, peak_memory_gib
 print(available_memory_gib() > 0.0, peak_memory_gib() >= 0.0)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

@@ -19,7 +19,7 @@ UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
 
 @pytest.mark.slow
 def test_the_package_imports_without_the_modules_of_unix():
-    names = ["atomic", "decoding", "fan_out", "files", "kernel_cache", "machine", "memory", "stages"]
+    names = ["atomic", "decoding", "fan_out", "files", "kernel_cache", "machine", "stages"]
     program = f"""
 import sys
 import filelock

@@ -148,6 +148,13 @@ class TestSentences:
         fine |= {"intervals": {"models": {"resphys": {"coverage": 0.88}}}}
         assert sentences(self.ERRORS, **fine)[1:] == ["Use ResPhys."]
 
+    def test_the_error_of_the_mesh_is_set_against_what_a_model_gains_over_that_which_it_improves(self):
+        errors = {"simulation": [1.0] * 5, "sysid": [0.22] * 5, "sysid_elastic": [0.2] * 5}
+        check = {"model": "sysid", "moved_mm": 0.4}
+        assert sentences(errors, mesh_check=check)[1:] == ["Use identification of E and \N{GREEK SMALL LETTER NU}."]
+        said = sentences(errors, mesh_check={**check, "moved_mm": 0.9})
+        assert "by 0.900 mm, but identification of E and \N{GREEK SMALL LETTER NU} gains 0.800 mm" in said[1]
+
     def test_bounds_and_first_guesses_are_counted_over_folds(self):
         identified = {"sysid": {"youngs_modulus": 2e6, "mass_damping": 0.0}, "sysid_elastic": {"poissons_ratio": 0.49}}
         guesses = {"sysid_elastic": {"poissons_ratio": 0.49}}

@@ -58,6 +58,7 @@ LONGEST = 120  # characters of a line of code that fit the column at 1280 px
 def test_no_line_of_code_is_longer_than_the_column():
     long = []
     for page in DOCS.rglob("*.md"):
+        assert page.read_text(encoding="utf-8").count("```") % 2 == 0, page  # A block that does not end hides the rest.
         blocks = re.findall(r"^ *```.*?\n(.*?)^ *```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
         long += [(page.name, line) for block in blocks for line in block.splitlines() if len(line) > LONGEST]
     for program in DOCS.glob("tutorials/*.py"):

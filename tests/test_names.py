@@ -89,6 +89,9 @@ class TestCommandLine:
 
     def test_the_hint_shows_the_quotes(self, folder):
         assert refusal("seed=[1").endswith("""and a text with special characters in quotes, 'seed="[1"'\n""")
+        quoted = """There is no file m=60g.csv either: check its path; in quotes it is 'files=["m=60g.csv"]'.\n"""
+        assert refusal("inspect", "m=60g.csv").endswith(quoted)
+        assert refusal("inspect", "Ü 1/m=60g.csv").startswith("error: Cannot read Ü 1/m=60g.csv: ")
 
 
 class TestFiles:

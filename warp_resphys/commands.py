@@ -117,7 +117,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
         name, named = f"{name} {rest[words[1]]}", words[:2]
     command = COMMANDS[name]
     if command.word or command.words:  # Names of files may be like options or overrides: m=50g.csv, -1.csv, ~a.csv.
-        files = [at for at in range(named[-1] + 1, len(rest)) if os.path.exists(rest[at])]
+        files = [at for at in range(named[-1] + 1, len(rest)) if os.path.exists(rest[at]) or _is_path(rest[at])]
         words = sorted({*words, *(at for at in files if rest[at - 1] not in VALUED)})
     after = [at for at in words if at not in named]
     dropped, quoted = set(named), [quote_name(rest[at]) for at in after]
@@ -132,6 +132,11 @@ def parse(arguments: Sequence[str]) -> tuple[str, list[str]]:
 def _is_word(argument: str, before: str) -> bool:
     """Whether an argument is a word: no option, no value of one, and no override."""
     return "=" not in argument and argument[:1] not in ("-", "+", "~") and before not in VALUED
+
+
+def _is_path(argument: str) -> bool:
+    """Whether an argument has a folder before its first ``=``, as in monday/m=50g.csv, which no key has."""
+    return argument[:1] not in ("-", "+", "~") and "/" in argument.partition("=")[0].removeprefix("hydra/")
 
 
 def quote(text: str) -> str:

@@ -304,6 +304,10 @@ def test_a_base_that_moved_as_a_whole_is_named(shelf):
     refuse(shelf, r"load101\.h5: base marker Base - \d stands 20\.\d\d mm from its place in .*bare\.h5")
     shelf.config["markers"]["largest_shift"] = None
     shelf.bring_in()
+    shelf.move("load101", "Base - 3", [0.002, 0.0, 0.0])
+    refuse(shelf, r"load101\.h5: base marker Base - \d moved by \d\.\d\d mm")
+    shelf.config["data"]["trials"]["load101"]["session"] = "friday"
+    assert shelf.bring_in()["names"].tolist() == [*shelf.recordings]
 
 
 def test_chosen_markers_register(shelf):

@@ -42,3 +42,13 @@ def test_correlated_frames_are_worth_fewer(correlation):
     same = [(rows, np.ones((rows.size, 1)), rows.size)]
     deviation = uncertainty_of(same, np.zeros((1, 1)), 1.0, {"a": BOUNDS["stiffness"]}, UNIT[:1]).deviation["a"]
     assert deviation == pytest.approx(2.0 * np.sqrt(expected / rows.size), rel=0.1)
+
+
+def test_what_the_data_do_not_change_is_uncertain_by_its_range():
+    """A uniform variable in [0, 1] has the standard deviation 1 / sqrt(12)."""
+    rows = series(0.0, (100, 3))
+    jacobian = np.stack([np.ones(rows.size), np.zeros(rows.size)], axis=1)
+    result = uncertainty_of([(rows, jacobian, rows.size)], np.zeros((1, 2)), 1.0, BOUNDS, UNIT)
+    assert result.poorest == {"stiffness": 0.0, "damping": 1.0}
+    assert result.poorest_deviation == pytest.approx(12.0**-0.5)
+    assert result.deviation["damping"] == pytest.approx(12.0**-0.5 * 0.1 * 100**0.25 * np.log(100.0))

@@ -72,7 +72,7 @@ def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> d
     moved = {name: _DIFFERENCE * size for name, size in moved.items()}
     configured = configured_parameters(simulator, moved)
     values = {name: simulator.tensor([value]) for name, value in configured.items()} | experiment.parameters(model)
-    with Progress("evaluate: derivatives by the parameters", len(names), "trials") as progress, torch.no_grad():
+    with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
         for whole in experiment.batches(names):
             size = experiment.settings.batch or len(whole)
             for batch in (whole[first : first + size] for first in range(0, len(whole), size)):

@@ -160,7 +160,9 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
         DecodingError: the file cannot be read.
     """
     suffix = {None: Path(path).suffix.lower(), "gmsh": ".msh", "abaqus": ".inp"}.get(file_format)
-    if (own := MESH_READERS.get(suffix or "")) is None:
+    with Path(path).open("rb") as file:
+        of_fluent = suffix == ".msh" and file.read(1) == b"("  # which meshio writes by default
+    if of_fluent or (own := MESH_READERS.get(suffix or "")) is None:
         return mesh_arrays_of(*_read_by_meshio(path, file_format))
     try:
         return mesh_arrays_of(*own(path))

@@ -61,7 +61,7 @@ def one_line(stage: str) -> Iterator[Callable[[float], str]]:
     before, _in_stage = _in_stage, True
     _done.clear()
     try:
-        yield lambda seconds: f"{title_of(stage):<42}{(_done or [''])[-1]:<16}{duration(seconds)}".rstrip()
+        yield lambda seconds: f"{title_of(stage):<42}{(_done or [''])[0]:<16}{duration(seconds)}".rstrip()
     finally:
         _in_stage = before
 

@@ -80,7 +80,10 @@ def _unknown(schema: Schema, values: Any, where: str, path: Path) -> str:
             return f"{key} is a setting of kind {kind}, not of {inside['kind']}: remove it with ~{key}."
     same = [known for known in every if known.rpartition(".")[2] == name]
     hint = did_you_mean(name, same, preferred=same) or did_you_mean(name, own) or did_you_mean(_dotted(path), every)
-    return f"unknown key '{key}'" + (hint or f": {_dotted(group, where) or 'a configuration'} has {', '.join(own)}.")
+    hint = hint or f": {_dotted(group, where) or 'a configuration'} has {', '.join(own)}."
+    if "files" in own and re.fullmatch(r".+\.[a-z]\w*", str(value := _value(values, path)), re.IGNORECASE):
+        hint += f" There is no file {key}={value} either: check its path; in quotes it is 'files=[\"{key}={value}\"]'."
+    return f"unknown key '{key}'{hint}"
 
 
 def keys(schema: Schema, node: Schema | None = None, prefix: str = "") -> Iterator[str]:

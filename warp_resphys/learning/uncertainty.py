@@ -71,8 +71,9 @@ def uncertainty_of(
     scatter.append(prior_weight * prior.T @ prior)
     curvature = np.sum([jacobian.T @ jacobian for _, jacobian, _ in trials], axis=0) + prior.T @ prior
     values, vectors = np.linalg.eigh(curvature)
-    inverse = (vectors / np.maximum(values, 1e-12 * max(values[-1], 1e-300))) @ vectors.T
-    covariance = inverse @ np.sum(scatter, axis=0) @ inverse
+    known = values > 1e-12 * max(values[-1], 1e-300)  # The data say nothing about the other directions.
+    inverse = vectors[:, known] / values[known] @ vectors[:, known].T
+    covariance = inverse @ np.sum(scatter, axis=0) @ inverse + vectors[:, ~known] / _UNIFORM @ vectors[:, ~known].T
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     slopes = [range_.slope(u) for range_, u in zip(bounds.values(), unit, strict=True)]
     poorest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])

@@ -445,7 +445,7 @@ class MarkerSettings(BindingSettings):
     labels: Literal["recorded", "assigned"] = setting("recorded", "assigned: names are assigned by position")
     register_with: Labels | None = setting(None, "markers for registration; null: all of a body at rest")
     largest_residual: Positive = setting(0.004, "largest residual of the registration", "m")
-    largest_distortion: Positive = setting(0.001, "largest motion of a reference marker between trials", "m")
+    largest_distortion: Positive = setting(0.001, "largest motion of a reference marker in a session", "m")
     largest_shift: Positive | None = setting(None, "largest shift of a reference marker; null: any", "m")
 
     @model_validator(mode="after")

@@ -1,6 +1,7 @@
 """Recorded trials: time zero, registration to the frame of the body, and inputs."""
 
 import logging
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -144,12 +145,12 @@ class Observer(Reader):
         return replace(recording.frames(slice(first, None)), start=float(recording.time[first]))
 
     def _check_reference(self, trials: Sequence[Trial], ready: Sequence[tuple[Recording, Release | None]]) -> None:
-        """Refuses recordings if reference markers moved relative to each other between trials."""
-        reference, still = list(self.markers.reference), []
+        """Refuses recordings if reference markers moved relative to each other between trials of a session."""
+        reference, sessions = list(self.markers.reference), defaultdict[str | None, list[Recording]](list)
         for trial, (recording, release) in zip(trials, ready, strict=True):
             frames = (None,) if self._base_motion(trial) is None else (self._rest_frames(recording),)
-            still.append(recording.frames(slice(*(frames if release is None else release.rest))))
-        if len(reference) > 1:
+            sessions[trial.session].append(recording.frames(slice(*(frames if release is None else release.rest))))
+        for still in sessions.values() if len(reference) > 1 else ():
             limits = {"largest_distortion": self.markers.largest_distortion}
             check_base(still, reference, **limits, largest_shift=self.markers.largest_shift)
 

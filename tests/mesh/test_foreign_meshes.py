@@ -84,6 +84,12 @@ def test_gmsh_orders_of_nodes(tmp_path, kind, version, binary):
     np.testing.assert_array_equal(read_mesh(tmp_path / "bar.msh").cells, mesh.cells)
 
 
+def test_what_meshio_writes_by_default_is_the_format_of_fluent(tmp_path):
+    meshio.write(tmp_path / "bar.msh", meshio.Mesh(BAR.vertices, {"hexahedron": BAR.cells}))
+    assert (tmp_path / "bar.msh").read_bytes()[:1] == b"("
+    np.testing.assert_array_equal(read_mesh(tmp_path / "bar.msh").cells, BAR.cells)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

@@ -228,7 +228,7 @@ def check_mesh(mesh: Mesh, cracks: bool = False) -> None:
     repeated[ranks[1:]] = (keys[ranks[1:]] == keys[ranks[:-1]]).all(axis=1)
     _refuse(repeated, "cells", "have the vertices of an earlier one and would count twice; keep one of each")
     volumes, smallest, largest = _normalised_volumes(mesh)
-    _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat or list their nodes in another order; reorder or remove them")
+    _refuse(np.abs(volumes) < DEGENERATE_VOLUME, "cells", "are flat, or their nodes in another order; mesh anew")
     order = mesh.element.mirrored.tolist()
     _refuse(largest < 0.0, "cells", f"are inverted: their nodes wind the other way; take them as cells[:, {order}]")
     _refuse(smallest < DEGENERATE_VOLUME, "cells", "are folded; move their nodes or mesh the body anew")

@@ -127,7 +127,9 @@ class TestFiles:
             "b",
             "c",
         ]
-        again = "defaults: [base, _self_]\nmarkers: {reference: {_replace_: true, c: [1, 1, 0]}}"
-        assert [*own(again)["markers"]["reference"]] == ["c"]
+        again = (
+            "defaults: [base, override /trainer: short, _self_]\nmarkers: {reference: {_replace_: true, c: [1, 1, 0]}}"
+        )
+        assert (own(again)["trainer"]["epochs"], [*own(again)["markers"]["reference"]]) == (100, ["c"])
         assert [*own(again, "markers.reference.d=[0,0,0]")["markers"]["reference"]] == ["c", "d"]
         assert own("defaults: [base]\nmarkers: {reference: {_replace_: true}}")["markers"]["reference"] == {}

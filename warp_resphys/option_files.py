@@ -48,9 +48,15 @@ class _OptionSource(file_config_source.FileConfigSource):
             if name == config_path:  # The other file comes directly before this one.
                 defaults = values.setdefault("defaults", [])
                 defaults += [] if "_self_" in defaults else ["_self_"]
-                defaults.insert(defaults.index("_self_"), name.rpartition("/")[2] + _EMPTYING)
+                last = (at for at, entry in enumerate(defaults) if entry == "_self_" or _is_override(entry))
+                defaults.insert(next(last), name.rpartition("/")[2] + _EMPTYING)
             config = OmegaConf.create(values if name == config_path else empty)
         return ConfigResult(config=config, path=f"{self.scheme()}://{self.path}", provider=self.provider, header=header)
+
+
+def _is_override(entry: Any) -> bool:
+    """Whether an entry of a defaults list chooses another option, as in ``override /trainer: short``; they are last."""
+    return isinstance(entry, dict) and str(next(iter(entry))).startswith("override ")
 
 
 @contextmanager

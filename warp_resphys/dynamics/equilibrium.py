@@ -153,7 +153,6 @@ class _Solve:
     def __call__(self, inputs: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, SolveReport]:
         """Returns the minimiser and the report for a start, fixed positions and terms."""
         tensors = [None if tensor is None else tensor.detach() for tensor in inputs]
-        parts = [(rows, own, own.solver(self.purpose, self.settings)) for rows, own in self.workspace.parts]
 
         def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
             rows, own, solver = part
@@ -161,8 +160,10 @@ class _Solve:
             return _solve(own, solver, own_follows, self.names, *(_rows(tensor, rows) for tensor in tensors))
 
         assert tensors[0] is not None
-        with self.workspace.potential.lock, threads_for(tensors[0][0].numel(), len(parts)):
-            results = in_threads(solve, parts)
+        with self.workspace.potential.lock:
+            parts = [(rows, own, own.solver(self.purpose, self.settings)) for rows, own in self.workspace.parts]
+            with threads_for(tensors[0][0].numel(), len(parts)):
+                results = in_threads(solve, parts)
         x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
         self.report = SolveReport.of([report for _, report in results])
         return x, self.report
@@ -197,20 +198,21 @@ class _Equilibrium(AdjointFunction):
         needed, solve = ctx.needs_input_grad[2:], ctx.solve
 
         types = (torch.float32, torch.float64) if solve.settings.factors == "single" else (torch.float64,)
-        parts = [
-            (rows, own, [own.hessian(solve.settings.linear_solver, dtype) for dtype in types])
-            for rows, own in solve.workspace.parts
-        ]
-        for _, own, _ in parts:
-            own.potential.prepare_adjoint()
 
         def differentiate(part: tuple[slice, Workspace, list[ExactHessian]]) -> tuple[torch.Tensor | None, ...]:
             rows, own, hessians = part
             return _adjoint(own, hessians, solve.names, needed, *(_rows(t, rows) for t in (gradient, x, *saved)))
 
         try:
-            with solve.workspace.potential.lock, threads_for(gradient[0].numel(), len(parts)):
-                gradients = in_threads(differentiate, parts)
+            with solve.workspace.potential.lock:
+                parts = [
+                    (rows, own, [own.hessian(solve.settings.linear_solver, dtype) for dtype in types])
+                    for rows, own in solve.workspace.parts
+                ]
+                for _, own, _ in parts:
+                    own.potential.prepare_adjoint()
+                with threads_for(gradient[0].numel(), len(parts)):
+                    gradients = in_threads(differentiate, parts)
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.detach().clone(), None) from None
         return (None, None, *map(_join_gradients, (None, *saved), zip(*gradients, strict=True)))

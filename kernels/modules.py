@@ -6,7 +6,7 @@ captures a graph, no other one may launch.
 
 import functools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from threading import Condition, RLock
 from typing import Any, TypeVar
@@ -52,6 +52,23 @@ def shareable() -> Iterator[None]:
             yield
         finally:
             wp.config.enable_tiles_in_stack_memory = before
+
+
+def compile_together(kernels: Iterable[Any], device: torch.device, block: int) -> None:
+    """Compiles the modules of kernels side by side, where each would wait for its first launch.
+
+    Args:
+        kernels: kernels of modules that are complete.
+        device: of their launches.
+        block: threads per block of their launches.
+    """
+    _compile_together(tuple({kernel.module: None for kernel in kernels}), str(device), block)
+
+
+@functools.cache
+def _compile_together(modules: tuple[Any, ...], device: str, block: int) -> None:
+    with shareable():
+        wp.force_load(device, list(modules), block_dim=block)
 
 
 class RecordedLaunch:

@@ -6,14 +6,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+import warp as wp
 from torch.autograd import forward_ad
 from typing_extensions import override
 
-from ..energies.launcher import lasting
+from ..energies.launcher import BLOCK, lasting
 from ..energies.placement import PlacedEnergy
 from ..energies.potential import IncrementalPotential, StepTerms
+from ..energies.solid import Solid
 from ..fem.coordinates import Coordinates
 from ..io.errors import ConvergenceError
+from ..kernels import assembly, line_search, minimisation, points, reductions
+from ..kernels.lbfgs import lbfgs_kernels
+from ..kernels.modules import compile_together
 from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
 from ..linalg.threads import in_threads, threads_for
@@ -28,6 +33,18 @@ Shard = tuple[slice, "Workspace"]
 _REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
 _LEAST_WAY, _MOST_PARTS = 1e-2, 32  # of the way of fixed vertices that bodies bar: a part of it, and their number
 _REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: target, and limit if rounding prevents the target
+
+
+def _kernels(energies: Sequence[PlacedEnergy], device: torch.device, dtype: torch.dtype) -> list[Any]:
+    """Returns a kernel of every module that a solve launches, but those of energies that are not materials."""
+    scalar = wp.float64 if dtype == torch.float64 else wp.float32
+    solids = [placed.energy for placed in energies if isinstance(placed.energy, Solid)]
+    return [
+        *(points.gather_cells, points.gather_kernels(3).gather, reductions.masked_norm),
+        *(solid.kernel(device) for solid in solids),
+        *(assembly.cell_blocks, assembly.scatter_kernel(scalar), minimisation.begin, lbfgs_kernels(scalar).project),
+        *(line_search.perturb, line_search.accept_kernel(scalar)),
+    ]
 
 
 class Workspace:
@@ -58,6 +75,7 @@ class Workspace:
     ) -> None:
         self.fixed = fixed
         eliminated = torch.as_tensor(np.setdiff1d(np.arange(coordinates.n_vertices), pattern.free), device=device)
+        compile_together(_kernels(energies, device, dtype), device, BLOCK)
         self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
         self.pattern, self.dtype = pattern, dtype
         self._cache: dict[Any, Any] = {}

@@ -105,6 +105,13 @@ class Solid(Energy):
     def bind(self, site: EnergySite) -> "BoundSolid":
         return BoundSolid(self, site)
 
+    def kernel(self, device: torch.device) -> Any:
+        """Returns a kernel of the module that evaluates the material on a device."""
+        law, several = self.material.law, any(own.points_per_cell > 1 for own in self.discretisation.point_sets)
+        if device.type == "cpu" and several and getattr(law, "LANES", False):
+            return lanes.cell_kernels(law).step
+        return kernels.solid_kernels(law).local_step
+
 
 def solids_of(body: Body, material: Material | Mapping[str, Material]) -> list[tuple[Solid, str]]:
     """Returns the solid of a body, or one solid per region with a material, each with the prefix of its names.

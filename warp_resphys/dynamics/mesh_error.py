@@ -63,15 +63,15 @@ def warn_of_cells(
             continue
         if abs(change := _change(energies)) < NOTICED:
             continue
-        kind = "tetrahedra" if own.mesh.element.is_simplex else "hexahedra"
+        simplex = own.mesh.element.is_simplex
+        kind, order = ("tetrahedra", " (in a configuration, mesh.order=2)") if simplex else ("hexahedra", "")
         by = f"at least {100.0 * change:.0f} % more" if change > 0.0 else f"about {-100.0 * change:.0f} % less"
         thin = [region for region in regions if region and is_one_cell_thick(own.mesh, own.mesh.region(region))]
         where = f", with its region {thin[0]!r} of one cell through the thickness," if thin else ""
         warn(
             f"the linear {kind} of {f'the body {name!r}' if name else 'the body'}{where} are too coarse for its "
             f"equilibrium: with finer or quadratic ones it would deform by {by} (estimated from jumps "
-            "of the strain between cells); take smaller cells, or quadratic(mesh), which is mesh.order=2 in a "
-            "configuration."
+            f"of the strain between cells); take smaller cells, or quadratic(mesh){order}."
         )
         warned = True
     return warned

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from warp_resphys.experiment.files import Dataset, driving, first_change, read_dataset, since_change
+from warp_resphys.experiment.files import Dataset, driving, first_change, phases_of, read_dataset, since_change
 from warp_resphys.io.files import read_hdf5
 
 TIMES = 0.1 * np.arange(6)
@@ -68,3 +68,9 @@ def test_inputs_begin_to_change_after_noise():
     own = dataset(("rest", "rest"), pressure=valve + 0.5)
     assert first_change(own, "a") == TIMES[3]
     assert first_change(own, "b") == 0.0
+
+
+def test_a_slow_fall_of_one_of_two_inputs_is_a_release():
+    right = np.repeat(np.linspace(0.3, 0.0, 6), 2)
+    own = dataset(("rest",), pressure=np.stack([np.ones(12), right], axis=1)[None])
+    assert phases_of(own, ["a"])[0].tolist() == ["rise", "rise", "release", "release", "release", "release"]

@@ -369,11 +369,13 @@ def phases_of(dataset: Dataset, names: Sequence[str]) -> NDArray[np.str_]:
     rows, acting = dataset.rows(names), driving(dataset, names)
     largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in dataset.inputs.items()}
     kinds = {name: acting[name] / size for name, size in largest.items() if size}
-    since = time_since_change(dataset.times[rows].T, [own.swapaxes(0, 1) for own in kinds.values()]).T
-    found = np.full(since.shape, "", dtype="<U7")
+    found = np.full(dataset.times[rows].shape, "", dtype="<U7")
+    if not kinds:
+        return found
+    sizes = np.linalg.norm(np.concatenate([*kinds.values()], 2), axis=2)  # (R, T)
+    since = time_since_change(dataset.times[rows].T, [sizes.T[..., None]]).T
     for k, row in enumerate(rows):
-        if kinds and dataset.begins[row] != STATIC:
+        if dataset.begins[row] != STATIC:
             before = [dataset.resting[name][row] / largest[name] for name in kinds if name in dataset.resting]
-            sizes = np.linalg.norm(np.concatenate([own[k] for own in kinds.values()], 1), axis=1)
-            found[k] = phases(since[k], sizes, float(np.linalg.norm(np.concatenate([[0.0], *before]))))
+            found[k] = phases(since[k], sizes[k], float(np.linalg.norm(np.concatenate([[0.0], *before]))))
     return found

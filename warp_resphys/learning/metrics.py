@@ -251,7 +251,7 @@ def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float
     grow again. Differences of up to 2 % of the largest size are noise.
 
     Args:
-        since: (T,) since the last change of the inputs [s], see `intervals.time_since_change`.
+        since: (T,) since the last change of the norm [s], see `intervals.time_since_change`.
         sizes: (T,) norm of the inputs.
         before: the norm before the first frame.
     """

@@ -16,6 +16,7 @@ from ..energies.potential import IncrementalPotential, StepTerms
 from ..energies.solid import Solid
 from ..fem.coordinates import Coordinates
 from ..io.errors import ConvergenceError
+from ..io.kernel_cache import start_quietly
 from ..kernels import assembly, line_search, minimisation, points, reductions
 from ..kernels.lbfgs import lbfgs_kernels
 from ..kernels.modules import compile_together
@@ -75,6 +76,7 @@ class Workspace:
     ) -> None:
         self.fixed = fixed
         eliminated = torch.as_tensor(np.setdiff1d(np.arange(coordinates.n_vertices), pattern.free), device=device)
+        start_quietly()
         compile_together(_kernels(energies, device, dtype), device, BLOCK)
         self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
         self.pattern, self.dtype = pattern, dtype

@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from threading import RLock
 from typing import Any
 
@@ -12,7 +11,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from ..io.kernel_cache import ensure_kernel_cache
+from ..io.kernel_cache import ensure_kernel_cache, start_quietly
 from ..kernels import points
 from ..kernels.modules import RecordedLaunch, launch_stream, shareable
 
@@ -23,15 +22,9 @@ BLOCK = 128  # threads per block on a GPU; the same for all kernels, as Warp com
 ensure_kernel_cache()  # before Warp is first used
 
 
-@cache
-def _initialise() -> None:
-    with shareable():
-        wp.init()
-
-
 def warp_view(tensor: torch.Tensor, dtype: Any) -> Any:
     """Returns a Warp array on a tensor's memory, without gradient."""
-    _initialise()  # `from_torch` does not
+    start_quietly()  # `from_torch` does not
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
 
 

@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
+from ..io.kernel_cache import start_quietly
 from ..kernels import obstacles as kernels
 from ..kernels.modules import shareable
 from ..kernels.triangles import from_surface
@@ -277,6 +278,7 @@ def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLik
         places: (P, 3) [m].
     """
     arrays = [np.asarray(vertices), np.asarray(places)]
+    start_quietly()
     with shareable():
         corners: Any = wp.array(arrays[0], dtype=wp.vec3, device="cpu")
         points: Any = wp.array(arrays[1], dtype=wp.vec3, device="cpu")

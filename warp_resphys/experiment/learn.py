@@ -214,7 +214,7 @@ def _in_the_loop(
         parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
         with Progress(f"{model}: held out", len(train) * loop.epochs, "epochs at most") as progress:
             epochs = cross_validated_epochs(make_network, parts, loop, progress.advance)
-        log.info("%s: %d epochs are best for held-out trials", model, epochs)
+        log.debug("%s: %d epochs are best for held-out trials", model, epochs)
         network = make_network()
     else:
         network = make_network()

@@ -5,28 +5,35 @@ import os
 import shutil
 import sys
 import tempfile
+from functools import cache
 from pathlib import Path
+from threading import Lock
+from typing import Final
 
 import torch
 import warp as wp
 
 from .errors import InputError
 
+_STARTING: Final = Lock()
 
+
+@cache
 def start_quietly() -> None:
     """Initialises Warp without a message of its library on a machine without an NVIDIA driver."""
     wp.config.log_level = wp.LOG_WARNING
     if torch.cuda.is_available():
         wp.init()
         return
-    shown = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)  # The library writes to it itself.
-        wp.init()
-    finally:
-        os.dup2(shown, 2)
-        os.close(shown)
+    with _STARTING:
+        shown = os.dup(2)
+        try:
+            with open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), 2)  # The library writes to it itself.
+            wp.init()
+        finally:
+            os.dup2(shown, 2)
+            os.close(shown)
 
 
 def ensure_kernel_cache() -> None:

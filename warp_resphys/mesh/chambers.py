@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..io.arrays import FloatArray
 from ..io.errors import MeshError
-from ..io.kernel_cache import ensure_kernel_cache
+from ..io.kernel_cache import ensure_kernel_cache, start_quietly
 from ..kernels.modules import shareable
 from ..kernels.triangles import blocked
 from .elements import FACES, Rule, Shape
@@ -148,6 +148,7 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity]:
     normals /= sizes[:, None]
     starts = centres + _LIFT * np.linalg.norm(np.ptp(mesh.vertices, axis=0)) * normals
     directions = _half_sphere(normals).reshape(-1, 3)
+    start_quietly()
     with shareable():
         rays: list[Any] = [
             wp.array(own, dtype=wp.vec3, device="cpu") for own in (np.repeat(starts, _DIRECTIONS, axis=0), directions)

@@ -144,6 +144,18 @@ def parameter_wording(parameter: str) -> Wording:
     return words[0].upper() + words[1:], *next(fits, ("", 1.0))
 
 
+def in_sentence(parameter: str) -> str:
+    """Return the name of a parameter as it stands within a sentence."""
+    words = parameter_wording(parameter)[0]
+    return words if words.startswith(("Young", "Poisson", "Prony")) else words[0].lower() + words[1:]
+
+
+def with_unit(parameter: str, value: float) -> str:
+    """Return a value of a parameter in its unit."""
+    _, unit, factor = parameter_wording(parameter)
+    return f"{digits(value, factor)} {unit}".rstrip()
+
+
 def identified_cell(value: float | None, factor: float, deviation: float | None) -> Cell:
     """Return a value in its unit with its standard deviation, if that is known."""
     beside = f"± {digits(deviation, factor, deviation)}" if deviation else ""
@@ -196,8 +208,7 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     if not uncertainty:
         return ""
     names = list(identified["parameters"])
-    words = {parameter: parameter_wording(parameter)[0] for parameter in names}
-    words = {p: w if w.startswith(("Young", "Poisson", "Prony")) else w[0].lower() + w[1:] for p, w in words.items()}
+    words = {parameter: in_sentence(parameter) for parameter in names}
     largest = max(abs(weight) for weight in uncertainty["poorest"].values())
     along = " with ".join(words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest)
     share = 100.0 * uncertainty["poorest_deviation"]

@@ -15,6 +15,7 @@ from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
 from .data import MODELS, Errors, folds_in, grouped_errors, missing_baselines, untrained
+from .identification_section import in_sentence, with_unit
 from .page import Cell, PageTable, Row, mm_text, number_text, share_text, unbroken
 
 LEAST_TRIALS: Final = 5  # with which an interval over trials is given
@@ -276,6 +277,7 @@ def _bounds(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> It
             ends = {end: getattr(own, end) for end in ("lower", "upper")}
             if end := next((end for end, bound in ends.items() if abs(values[name] - bound) <= close), ""):
                 mend = f"widen {key}.{end}" if ends[end] else f"remove it from the fit (~{key})"
-                yield Doubt(f"{name} is at its {end} bound, {ends[end]:g}", mend)
+                yield Doubt(f"{in_sentence(name)} is at its {end} bound, {with_unit(name, ends[end])}", mend)
             elif own.prior is None and abs(values[name] - start.get(name, math.nan)) <= close:
-                yield Doubt(f"{name} stayed at its first guess, {values[name]:g}", "raise identify.starts")
+                fact = f"{in_sentence(name)} stayed at its first guess, {with_unit(name, values[name])}"
+                yield Doubt(fact, "raise identify.starts")

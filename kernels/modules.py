@@ -6,10 +6,11 @@ captures a graph, no other one may launch.
 
 import functools
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from threading import Condition, RLock
-from typing import Any, TypeVar
+from threading import RLock
+from typing import Any, Final, TypeVar
 
 import torch
 import warp as wp
@@ -72,10 +73,13 @@ def _compile_together(modules: tuple[Any, ...], device: str, block: int) -> None
 
 
 class RecordedLaunch:
-    """A recorded launch of Warp, which waits while another thread captures."""
+    """A recorded launch of Warp, which waits while another thread captures.
 
-    _ended = Condition(_WARP)
-    _running = 0  # of all threads
+    Locks would cost several percent of a step: threads enter themselves in a list, in one instruction of Python.
+    """
+
+    _running: Final = list[None]()  # an entry for every launch
+    _captured = False  # whether a thread captures, or waits for launches to end
 
     def __init__(self, command: Any) -> None:
         self._command = command
@@ -83,30 +87,35 @@ class RecordedLaunch:
     def launch(self, stream: Any = None) -> None:
         """Launches the kernel."""
         own = RecordedLaunch
-        with _WARP:
-            own._running += 1
+        own._running.append(None)
+        if own._captured:
+            own._running.pop()
+            with _WARP:  # held by the thread that captures, and its own launches
+                own._running.append(None)
         try:
             self._command.launch(stream)
         finally:
-            with _WARP:
-                own._running -= 1
-                if not own._running:
-                    own._ended.notify_all()
+            own._running.pop()
 
     @classmethod
     def forked(cls) -> None:
         """Lets a forked process begin, which has one thread."""
-        cls._running = 0
+        cls._running.clear()
         _WARP.release()
 
     @classmethod
     @contextmanager
     def captured(cls, device: torch.device) -> Iterator[Any]:
         """Captures the launches of this thread, when those of others have ended."""
-        with cls._ended:
-            cls._ended.wait_for(lambda: not cls._running)
-            with wp.ScopedCapture(device=str(device)) as capture:
-                yield capture
+        with _WARP:
+            cls._captured = True
+            try:
+                while cls._running:
+                    time.sleep(1e-5)
+                with wp.ScopedCapture(device=str(device)) as capture:
+                    yield capture
+            finally:
+                cls._captured = False
 
 
 if hasattr(os, "register_at_fork"):

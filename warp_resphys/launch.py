@@ -54,7 +54,7 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
     reported: list[BaseException] = []
     started = False
     shown: str | None
-    late: list[LateOverride]
+    late = list[LateOverride]()
 
     def job(config: DictConfig) -> Any:
         nonlocal started
@@ -99,8 +99,9 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         rest, shown = [*_own_options(), *arguments], None
         if command in TYPED:
             rest, shown = _without_shown(rest)
-        settings = RunSettings if command in TYPED else _function(function)[1]
-        rest, late = readable(rest, settings.model_json_schema())
+        if any(argument[:1] != "-" for argument in rest):
+            settings = RunSettings if command in TYPED else _function(function)[1]
+            rest, late = readable(rest, settings.model_json_schema())
         OmegaConf.register_new_resolver("run_label", label, replace=True)
         sys.argv = [before[0], *rest, *(_SILENT if shown is not None else ())]
         place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}

@@ -158,7 +158,7 @@ class TestPicturesOfAFolder:
         assert outline["sysid"] < min(0.5, 0.2 * outline["undeformed"])
         modulus = identified(recorded / "run")["parameters"]["youngs_modulus@soft"]
         assert 100e3 < modulus < 180e3
-        assert "(none was kept back)" in out
+        assert "no pose was kept back" in out
         constants = read_law(str(recorded / "run" / "law_soft.json"))["constants"]
         assert (constants["youngs_modulus"], constants["density"]) == (modulus, 1100.0)
 

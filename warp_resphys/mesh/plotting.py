@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import meshio
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,6 +46,7 @@ class Picture:
             regions: cells by name; later ones cover earlier ones.
             options: of ``pyvista.Plotter.add_mesh``.
         """
+        import meshio
         import pyvista
 
         names, linear = list(regions), ELEMENTS[element.linear]

@@ -31,7 +31,7 @@ from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.imports import uncollected
 from .io.settings import Settings, parse
-from .option_files import names_are_texts
+from .option_files import names_are_texts, run_schema
 from .overrides import LateOverride, readable
 from .settings.run import RunSettings
 
@@ -100,8 +100,8 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
         if command in TYPED:
             rest, shown = _without_shown(rest)
         if any(argument[:1] != "-" for argument in rest):
-            settings = RunSettings if command in TYPED else _function(function)[1]
-            rest, late = readable(rest, settings.model_json_schema())
+            schema = run_schema() if command in TYPED else _function(function)[1].model_json_schema()
+            rest, late = readable(rest, schema)
         OmegaConf.register_new_resolver("run_label", label, replace=True)
         sys.argv = [before[0], *rest, *(_SILENT if shown is not None else ())]
         place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}

@@ -72,13 +72,14 @@ def names_are_texts() -> Iterator[None]:
 
 
 @cache
-def _schema() -> Schema:
+def run_schema() -> Schema:
+    """Returns the JSON Schema of the settings of a run."""
     return RunSettings.model_json_schema()
 
 
 def _with_quotes(text: str, package: tuple[str, ...], path: Path) -> io.StringIO:
     """The text of a YAML file with quotes around keys, and around values that are texts."""
-    schema, places = _schema(), set[tuple[int, int]]()
+    schema, places = run_schema(), set[tuple[int, int]]()
 
     def visit(node: yaml.Node | None, path: tuple[str | int, ...]) -> None:
         if isinstance(node, yaml.MappingNode):

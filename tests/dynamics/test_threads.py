@@ -71,10 +71,9 @@ def test_a_gradient_in_another_thread_does_not_disturb_a_step():
 
 
 FIRST_USE = """
-import sys, numpy as np
+import numpy as np
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
-sys.path.insert(0, {tests!r})
 from dynamics.test_threads import CLOSE, FLOOR, results, simulator
 together = Barrier(4)
 def first(number):
@@ -88,8 +87,9 @@ with ThreadPoolExecutor(4) as pool:
 
 def test_the_first_use_may_be_in_several_threads(pytestconfig):
     """Warp loads modules and captures graphs for the whole process: of one simulator and of several."""
-    script = FIRST_USE.format(tests=str(pytestconfig.rootpath / "tests"))
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    folder = pytestconfig.rootpath / "tests"
+    command = [sys.executable, "-c", FIRST_USE]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
@@ -131,7 +131,7 @@ WAYS = {"pickle": lambda x: pickle.loads(pickle.dumps(x)), "deepcopy": copy.deep
 
 @pytest.mark.parametrize("name", MOTIONS)
 def test_copies_of_a_used_simulator_move_as_it_does(name, recwarn):
-    """Of every kind of energy: buffers, factors and Warp's arrays stay behind, and nothing is warned of again."""
+    """Copies, for every kind of energy, leave buffers, factors and Warp's arrays behind, and repeat no warning."""
     sim = MOTIONS[name][0]()
     expected = positions(sim)
     copies = {way: make(sim) for way, make in WAYS.items()}

@@ -1,4 +1,4 @@
-"""How much other cells would change the deflection of a body of linear cells, estimated from one equilibrium.
+"""Estimated error of the deflection of a body of linear cells, from one equilibrium.
 
 The strain E of linear cells jumps between neighbours. With the smooth strain S, whose values at the vertices are means
 over the cells around them, the error of the energy is about the sum of c V |E - S|^2 (Zienkiewicz and Zhu 1987), with

@@ -39,7 +39,7 @@ def read_vtk(path: str) -> tuple[NDArray[np.float64], list[Block]]:
     reader.Update()
     grid, said = reader.GetOutput(), messages.GetOutput()
     said = said.decode(errors="replace") if isinstance(said, bytes) else said  # bytes if it quotes a damaged file
-    if "error" in said.lower() or grid is None or not grid.IsA("vtkDataSet"):
+    if "ERROR: In" in said or grid is None or not grid.IsA("vtkDataSet"):
         reason = re.sub(r"^.*?\): ", "", said, flags=re.DOTALL).partition("ERROR")[0].strip() or "no mesh"
         raise DecodingError(f"VTK cannot read the file ({reason}); is it whole, and of its extension's format?")
     if not grid.IsA("vtkUnstructuredGrid"):

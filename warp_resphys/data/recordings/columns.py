@@ -32,7 +32,7 @@ Place = tuple[str, str, int]  # label, axis and column of a coordinate
 
 @dataclass(frozen=True)
 class Turn:
-    """How a table gives the rotations of rigid bodies.
+    """Columns with the rotations of rigid bodies, and their convention.
 
     Attributes:
         axes: names of k columns of a rigid body.
@@ -62,7 +62,7 @@ QUATERNION = Turn(("qw", "qx", "qy", "qz"), lambda columns: columns)
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the numbers of a table are, and what they mean.
+    """Columns of a table with numbers: their places and their meaning.
 
     Attributes:
         first: number of the first line of numbers.

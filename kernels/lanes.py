@@ -21,11 +21,11 @@ from types import ModuleType, SimpleNamespace
 
 import warp as wp
 
+from .elasticity import add_viscous_tangent, solid_kernels, viscous_response
 from .materials.corotated import rotation_blocks
 from .matrices import HALLEY_ITERATIONS, HALLEY_TOLERANCE, LARGEST_TRACE
 from .modules import generated, named_module
 from .points import MatrixPoints, matrix_at
-from .solid import add_viscous_tangent, solid_kernels, viscous_response
 
 WIDTH = 8  # points: as many doubles as the widest vector instructions take
 FLATTEST = wp.float64(0.2)  # smallest J of points that are taken together; the others' errors would grow with 1 / J

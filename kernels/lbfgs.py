@@ -62,10 +62,10 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.kernel(module=module)
     def project(
-        progress: SolverProgress,
-        pairs: Pairs,
         vertex_at: wp.array[int],  # (F) vertices in the order of the linear solver
+        progress: SolverProgress,
         search: LineSearch,
+        pairs_out: Pairs,
         right_out: wp.array2d[vector],  # (B, F) g - Y^T a, with a = R^-1 S g
     ):
         """Computes the right-hand side of the solve in compact L-BFGS form; zero where no direction is needed."""
@@ -74,66 +74,66 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 right_out[b, p] = vector()
             return
-        k = pairs.count[b]
+        k = pairs_out.count[b]
         for i in range(k):
             total = wp.float64(0.0)
-            row = pairs.s[b, place(pairs, b, i)]
+            row = pairs_out.s[b, place(pairs_out, b, i)]
             for v in range(lane, search.gradient.shape[1], wp.block_dim()):
                 total += wp.dot(wp.vec3d(row[v]), search.gradient[b, v])
-            pairs.b[b, i] = block_sum(total)
-        substitute_backward(pairs, b, k)
+            pairs_out.b[b, i] = block_sum(total)
+        substitute_backward(pairs_out, b, k)
         for p in range(lane, vertex_at.shape[0], wp.block_dim()):
             v = vertex_at[p]
             value = search.gradient[b, v]
             for i in range(k):
-                value -= pairs.a[b, i] * wp.vec3d(pairs.y[b, place(pairs, b, i), v])
+                value -= pairs_out.a[b, i] * wp.vec3d(pairs_out.y[b, place(pairs_out, b, i), v])
             right_out[b, p] = vector(value)
 
     @wp.kernel(module=module)
     def set_direction(
-        progress: SolverProgress,
-        pairs: Pairs,
         vertex_at: wp.array[int],
-        search: LineSearch,
         solution: wp.array2d[vector],  # (B, F) z, solution for the right-hand side of `project` [m]
+        progress_out: SolverProgress,
+        search_out: LineSearch,
+        pairs_out: Pairs,
     ):
         """Sets the direction -(z + S^T b), with b = R^-T (D a - Y z), its slope and the first trial.
 
         If the slope is positive or not finite, the pairs are deleted; without pairs a new factor is requested, once.
         """
         b, lane = wp.tid()
-        if progress.phase[b] != NEED_DIRECTION:
+        if progress_out.phase[b] != NEED_DIRECTION:
             return
-        k = pairs.count[b]
+        k = pairs_out.count[b]
         for i in range(k):
             total = wp.float64(0.0)
-            row = pairs.y[b, place(pairs, b, i)]
+            row = pairs_out.y[b, place(pairs_out, b, i)]
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 total += wp.dot(wp.vec3d(row[vertex_at[p]]), wp.vec3d(solution[b, p]))
-            substitute_forward(pairs, b, i, block_sum(total))
+            substitute_forward(pairs_out, b, i, block_sum(total))
         slope = wp.float64(0.0)
         for p in range(lane, vertex_at.shape[0], wp.block_dim()):
             v = vertex_at[p]
             value = wp.vec3d(solution[b, p])
             for i in range(k):
-                value += pairs.b[b, i] * wp.vec3d(pairs.s[b, place(pairs, b, i), v])
-            search.direction[b, v] = -value
-            slope -= wp.dot(search.gradient[b, v], value)
+                value += pairs_out.b[b, i] * wp.vec3d(pairs_out.s[b, place(pairs_out, b, i), v])
+            search_out.direction[b, v] = -value
+            slope -= wp.dot(search_out.gradient[b, v], value)
         slope = block_sum(slope)
         if wp.isfinite(slope) and (slope <= ZERO or k == 0):
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 v = vertex_at[p]
-                search.origin[b, v] = search.positions[b, v]
-                search.positions[b, v] = search.positions[b, v] + search.direction[b, v]
+                search_out.origin[b, v] = search_out.positions[b, v]
+                search_out.positions[b, v] = search_out.positions[b, v] + search_out.direction[b, v]
             if lane == 0:
-                begin_search(progress, slope, b)
+                begin_search(progress_out, slope, b)
         elif lane == 0:
             if k > 0:
-                pairs.count[b] = 0
-            elif progress.factorisations[b] == 0:
-                progress.request[b] = FACTOR
+                pairs_out.count[b] = 0
+            elif progress_out.factorisations[b] == 0:
+                progress_out.request[b] = FACTOR
             else:
-                progress.phase[b] = FAILED
+                progress_out.phase[b] = FAILED
 
     @wp.func(module=module)
     def add_pair(

@@ -41,7 +41,7 @@ ROUNDING_UNIT = wp.constant(wp.float64(2.0**-52))
 def perturb(
     progress: SolverProgress,
     signs: wp.array2d[wp.vec3d],  # (draws, N) random signs
-    positions: wp.array2d[wp.vec3d],  # (B, N) [m]
+    positions_out: wp.array2d[wp.vec3d],  # (B, N) [m]
     kept_out: wp.array2d[wp.vec3d],  # (B, N) copy of the unperturbed positions [m]
 ):
     """Moves every coordinate by one rounding unit of the largest coordinate, where rounding is to be checked.
@@ -52,44 +52,44 @@ def perturb(
     if progress.check_rounding[b] == 0:
         return
     size = wp.float64(0.0)
-    for i in range(lane, positions.shape[1], wp.block_dim()):
-        kept_out[b, i] = positions[b, i]
-        size = wp.max(size, wp.max(wp.abs(positions[b, i])))
+    for i in range(lane, positions_out.shape[1], wp.block_dim()):
+        kept_out[b, i] = positions_out[b, i]
+        size = wp.max(size, wp.max(wp.abs(positions_out[b, i])))
     unit = ROUNDING_UNIT * block_max(size)
     draw = progress.iterations[b] % signs.shape[0]
-    for i in range(lane, positions.shape[1], wp.block_dim()):
-        positions[b, i] = positions[b, i] + unit * signs[draw, i]
+    for i in range(lane, positions_out.shape[1], wp.block_dim()):
+        positions_out[b, i] = positions_out[b, i] + unit * signs[draw, i]
 
 
 @wp.kernel
 def check_rounding(
-    progress: SolverProgress,
     kept: wp.array2d[wp.vec3d],  # (B, N) positions before `perturb` [m]
     residual: wp.array2d[wp.vec3d],  # (B, N) residual after `perturb` [N]
-    search: LineSearch,  # its positions are restored
-    history: History,
+    progress_out: SolverProgress,
+    search_out: LineSearch,  # its positions are restored
+    history_out: History,
 ):
     """Marks an environment as converged if its residual is not larger than its change by the perturbation."""
     b, lane = wp.tid()
-    if progress.check_rounding[b] == 0:
+    if progress_out.check_rounding[b] == 0:
         return
-    rounding = progress.rounding[b]
+    rounding = progress_out.rounding[b]
     change, size = wp.float64(0.0), wp.float64(0.0)
-    for i in range(lane, search.positions.shape[1], wp.block_dim()):
-        moved = residual[b, i] - search.gradient[b, i]
+    for i in range(lane, search_out.positions.shape[1], wp.block_dim()):
+        moved = residual[b, i] - search_out.gradient[b, i]
         change += wp.dot(moved, moved)
-        size += wp.dot(search.gradient[b, i], search.gradient[b, i])
-        search.positions[b, i] = kept[b, i]
+        size += wp.dot(search_out.gradient[b, i], search_out.gradient[b, i])
+        search_out.positions[b, i] = kept[b, i]
     change, size = wp.sqrt(block_sum(change)), wp.sqrt(block_sum(size))
     if rounding < INFINITE:
         change = wp.max(change, rounding)
     if size <= change:
-        record_solution(history, search.positions, b, lane)
+        record_solution(history_out, search_out.positions, b, lane)
     if lane == 0:
-        progress.check_rounding[b] = 0
-        progress.rounding[b] = change
+        progress_out.check_rounding[b] = 0
+        progress_out.rounding[b] = change
         if size <= change:
-            progress.phase[b] = DONE
+            progress_out.phase[b] = DONE
 
 
 @wp.func
@@ -145,66 +145,66 @@ def accept_kernel(scalar: Any) -> Any:
         inertia: wp.array2d[wp.float64],  # (B, N) [N/m]
         evaluation: Evaluation,  # at the positions
         clamped: wp.array[wp.bool],  # (B) whether the matrix of the global step is clamped
-        search: LineSearch,
-        progress: SolverProgress,
-        pairs: pairs_type,
-        history: History,
+        progress_out: SolverProgress,
+        search_out: LineSearch,
+        pairs_out: pairs_type,
+        history_out: History,
     ):
         """Accepts a trial that decreases the energy enough, or halves the step; tests convergence."""
         b, lane = wp.tid()
-        phase = progress.phase[b]
+        phase = progress_out.phase[b]
         lanes = wp.block_dim()
         n = inertia.shape[1]
         if phase != START and phase != LINE_SEARCH:
             return
         energy = evaluation.energy[b]
         norm = evaluation.norm[b]
-        before = progress.energy[b]
-        flat = ENERGY_ROUNDING * (progress.stiffness[b] + wp.float64(100.0) * evaluation.size[b])
-        iterations = progress.iterations[b]
-        stalls = progress.stalls[b]
+        before = progress_out.energy[b]
+        flat = ENERGY_ROUNDING * (progress_out.stiffness[b] + wp.float64(100.0) * evaluation.size[b])
+        iterations = progress_out.iterations[b]
+        stalls = progress_out.stalls[b]
         if phase == LINE_SEARCH:
-            step = progress.step[b]
-            slope = progress.slope[b]
-            halvings = progress.halvings[b]
+            step = progress_out.step[b]
+            slope = progress_out.slope[b]
+            halvings = progress_out.halvings[b]
             after = wp.float64(0.0)
             for i in range(lane, n, lanes):
-                after += wp.dot(evaluation.residual[b, i], search.direction[b, i])
+                after += wp.dot(evaluation.residual[b, i], search_out.direction[b, i])
             if not decreases_enough(before, energy, flat, step, slope, block_sum(after)):
                 step = HALF * step
                 given_up = halvings + 1 >= MAX_HALVINGS
                 if given_up:
                     step = wp.float64(0.0)
                 for i in range(lane, n, lanes):
-                    search.positions[b, i] = search.origin[b, i] + step * search.direction[b, i]
+                    search_out.positions[b, i] = search_out.origin[b, i] + step * search_out.direction[b, i]
                 at_rest = False
                 if given_up:
-                    scale = progress.scale[b]
-                    at_rest = within_rounding(progress, tolerances, inertia, search, scale, iterations, b, lane)
+                    scale = progress_out.scale[b]
+                    at_rest = within_rounding(progress_out, tolerances, inertia, search_out, scale, iterations, b, lane)
                 if lane == 0:
-                    progress.step[b] = step
-                    progress.halvings[b] = halvings + 1
+                    progress_out.step[b] = step
+                    progress_out.halvings[b] = halvings + 1
                     if at_rest:
-                        progress.phase[b] = DONE
-                        history.stored[b] = 0
+                        progress_out.phase[b] = DONE
+                        history_out.stored[b] = 0
                     elif given_up:
-                        abandon_search(progress, tolerances, clamped, b)
+                        abandon_search(progress_out, tolerances, clamped, b)
                 return
             if keeps_pairs == 1:
-                add_pair(pairs, b, lane, step, search, evaluation.residual)
+                add_pair(pairs_out, b, lane, step, search_out, evaluation.residual)
         for i in range(lane, n, lanes):
-            search.gradient[b, i] = evaluation.residual[b, i]
-        scale = evaluation.balance[b] + progress.force[b]
+            search_out.gradient[b, i] = evaluation.residual[b, i]
+        scale = evaluation.balance[b] + progress_out.force[b]
         stalls += 1
-        if norm < HALF * progress.smallest_norm[b]:
+        if norm < HALF * progress_out.smallest_norm[b]:
             stalls = 0
         done = norm <= tolerances.relative * scale or norm <= tolerances.absolute
         done = done and norm + scale < INFINITE
-        done = done or within_rounding(progress, tolerances, inertia, search, scale, iterations, b, lane)
+        done = done or within_rounding(progress_out, tolerances, inertia, search_out, scale, iterations, b, lane)
         block_max(ZERO)  # A barrier: every thread has read the values of this environment before they are written.
         if done:
-            record_solution(history, search.positions, b, lane)
+            record_solution(history_out, search_out.positions, b, lane)
         if lane == 0:
-            accept_trial(progress, tolerances, evaluation, scale, stalls, flat, done, b)
+            accept_trial(progress_out, tolerances, evaluation, scale, stalls, flat, done, b)
 
     return accept

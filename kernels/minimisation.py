@@ -149,62 +149,62 @@ def record_solution(history: History, positions: wp.array2d[wp.vec3d], b: int, l
 
 @wp.kernel
 def begin(
+    tolerances: Tolerances,
     force: wp.array2d[wp.vec3d],  # (B, N) [N]
     stiffness: wp.array[wp.float64],  # (B) sum over the solids' points [J]
-    tolerances: Tolerances,
-    search: LineSearch,  # its positions are where inertia alone would lead, and become the start
-    progress: SolverProgress,
-    history: History,
+    progress_out: SolverProgress,
+    search_out: LineSearch,  # its positions are where inertia alone would lead, and become the start
+    history_out: History,
 ):
     """Sets the extrapolated starting point, and sums the quantities that stay constant during this solve."""
     b, lane = wp.tid()
     square = wp.float64(0.0)
-    count = history.stored[b]
-    if progress.phase[b] != DONE:  # The last solve failed.
+    count = history_out.stored[b]
+    if progress_out.phase[b] != DONE:  # The last solve failed.
         count = 0
-    order = wp.min(history.order[b], count)
+    order = wp.min(history_out.order[b], count)
     for i in range(lane, force.shape[1], wp.block_dim()):
         square += wp.dot(force[b, i], force[b, i])
-        start = search.positions[b, i]
-        history.start[b, i] = start
-        start = start + extrapolated(history, b, i, order)
-        search.positions[b, i] = start
-        search.origin[b, i] = start
+        start = search_out.positions[b, i]
+        history_out.start[b, i] = start
+        start = start + extrapolated(history_out, b, i, order)
+        search_out.positions[b, i] = start
+        search_out.origin[b, i] = start
     square = block_sum(square)
     if lane == 0:
-        history.stored[b] = count
-        progress.phase[b] = START
-        progress.request[b] = 0
-        if progress.factored[b] == 0 or progress.iterations[b] > tolerances.refactor_after:
-            progress.request[b] = FACTOR
-        progress.check_rounding[b] = 0
-        progress.iterations[b] = 0
-        progress.since_factor[b] = 0
-        progress.factorisations[b] = 0
-        progress.stalls[b] = 0
-        progress.energy[b] = INFINITE
-        progress.smallest_norm[b] = INFINITE
-        progress.rounding[b] = INFINITE
-        progress.force[b] = wp.sqrt(square)
-        progress.stiffness[b] = stiffness[b]
+        history_out.stored[b] = count
+        progress_out.phase[b] = START
+        progress_out.request[b] = 0
+        if progress_out.factored[b] == 0 or progress_out.iterations[b] > tolerances.refactor_after:
+            progress_out.request[b] = FACTOR
+        progress_out.check_rounding[b] = 0
+        progress_out.iterations[b] = 0
+        progress_out.since_factor[b] = 0
+        progress_out.factorisations[b] = 0
+        progress_out.stalls[b] = 0
+        progress_out.energy[b] = INFINITE
+        progress_out.smallest_norm[b] = INFINITE
+        progress_out.rounding[b] = INFINITE
+        progress_out.force[b] = wp.sqrt(square)
+        progress_out.stiffness[b] = stiffness[b]
 
 
 @wp.kernel
 def select_for_factorisation(
-    progress: SolverProgress, active_out: wp.array[int], clamp_out: wp.array[int], pairs: wp.array[int]
+    progress_out: SolverProgress, pairs_out: wp.array[int], active_out: wp.array[int], clamp_out: wp.array[int]
 ):
     """Selects the environments to factorise next, clamped or not, and deletes their L-BFGS pairs."""
     b = wp.tid()
-    request = progress.request[b]
-    selected = progress.phase[b] == NEED_DIRECTION and request > 0
+    request = progress_out.request[b]
+    selected = progress_out.phase[b] == NEED_DIRECTION and request > 0
     active_out[b] = int(selected)
     clamp_out[b] = int(selected and request == CLAMPED_FACTOR)
     if selected:
-        progress.request[b] = 0
-        progress.factored[b] = 1
-        progress.since_factor[b] = 0
-        progress.factorisations[b] += 1
-        pairs[b] = 0
+        progress_out.request[b] = 0
+        progress_out.factored[b] = 1
+        progress_out.since_factor[b] = 0
+        progress_out.factorisations[b] += 1
+        pairs_out[b] = 0
 
 
 @wp.kernel
@@ -220,13 +220,13 @@ def mark_clamped(
 
 
 @wp.kernel
-def request_clamped(active: wp.array[int], clamp: wp.array[int], count_out: wp.array[int]):
+def request_clamped(active: wp.array[int], clamp_out: wp.array[int], count_out: wp.array[int]):
     """Requests clamping for all active environments, and counts them; launched as a single block."""
     _, lane = wp.tid()
     count = wp.float64(0.0)
     for b in range(lane, active.shape[0], wp.block_dim()):
         if active[b] != 0:
-            clamp[b] = 1
+            clamp_out[b] = 1
             count += ONE
     count = block_sum(count)
     if lane == 0:
@@ -339,25 +339,25 @@ def shorten_start(
     share: wp.array[wp.float64],  # (B) allowed share of the way from the feasible positions
     free: wp.array[wp.float64],  # (N) zero at fixed vertices, which keep their positions
     feasible: wp.array2d[wp.vec3d],  # (B, N) positions without penetration [m]
-    search: LineSearch,
+    search_out: LineSearch,
 ):
     """Draws a start back towards feasible positions."""
     b, i = wp.tid()
     if share[b] < ONE and free[i] > wp.float64(0.0):
-        x = feasible[b, i] + share[b] * (search.positions[b, i] - feasible[b, i])
-        search.positions[b, i] = x
-        search.origin[b, i] = x
+        x = feasible[b, i] + share[b] * (search_out.positions[b, i] - feasible[b, i])
+        search_out.positions[b, i] = x
+        search_out.origin[b, i] = x
 
 
 @wp.kernel
-def shorten_step(progress: SolverProgress, share: wp.array[wp.float64], search: LineSearch):
+def shorten_step(share: wp.array[wp.float64], progress_out: SolverProgress, search_out: LineSearch):
     """Shortens the first trial of a line search."""
     b, lane = wp.tid()
-    if progress.phase[b] != LINE_SEARCH or progress.halvings[b] > 0:
+    if progress_out.phase[b] != LINE_SEARCH or progress_out.halvings[b] > 0:
         return
     s = share[b]
     if s < ONE:
-        for i in range(lane, search.positions.shape[1], wp.block_dim()):
-            search.positions[b, i] = search.origin[b, i] + s * search.direction[b, i]
+        for i in range(lane, search_out.positions.shape[1], wp.block_dim()):
+            search_out.positions[b, i] = search_out.origin[b, i] + s * search_out.direction[b, i]
         if lane == 0:
-            progress.step[b] = s
+            progress_out.step[b] = s

@@ -27,15 +27,15 @@ def block_max(value: wp.float64) -> wp.float64:
 @wp.kernel
 def masked_norm(
     free: wp.array[wp.float64],  # (N) one at free vertices, zero at fixed ones
-    vectors: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices
+    vectors_out: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices
     norm_out: wp.array[wp.float64],  # (B)
 ):
     """The norm over all free vertices."""
     b, lane = wp.tid()
     total = wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):
-        value = free[i] * vectors[b, i]
-        vectors[b, i] = value
+        value = free[i] * vectors_out[b, i]
+        vectors_out[b, i] = value
         total += wp.dot(value, value)
     total = block_sum(total)
     if lane == 0:
@@ -48,7 +48,7 @@ def totals(
     free: wp.array[wp.float64],
     vertex_energy: wp.array2d[wp.float64],  # (B, N) [J]
     point_energy: wp.array2d[wp.float64],  # (B, P) [J]
-    residual: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices [N]
+    residual_out: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices [N]
     energy_out: wp.array[wp.float64],  # (B) [J]
     size_out: wp.array[wp.float64],  # (B) sum of the energies' absolute values [J]
     norm_out: wp.array[wp.float64],  # (B) of the residual [N]
@@ -57,8 +57,8 @@ def totals(
     b, lane = wp.tid()
     energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):
-        value = free[i] * residual[b, i]
-        residual[b, i] = value
+        value = free[i] * residual_out[b, i]
+        residual_out[b, i] = value
         square += wp.dot(value, value)
         energy += vertex_energy[b, i]
         size += wp.abs(vertex_energy[b, i])

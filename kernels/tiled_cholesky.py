@@ -54,8 +54,8 @@ _FACTOR: Final = (
     struct alignas(16) Some { S v[V]; };
     RESPHYS_SHARED alignas(16) S pivot[T][T + V];
     RESPHYS_SHARED alignas(16) S inverse[T][T + V];
-    S* const all = matrix.data;
-    const int stride = matrix.shape[1], tiles = matrix.shape[0] / T, width = stride / T - 1;
+    S* const all = matrix_out.data;
+    const int stride = matrix_out.shape[1], tiles = matrix_out.shape[0] / T, width = stride / T - 1;
     for (int j = 0; j < tiles; ++j) {
         const int below = (tiles - j - 1 < width ? tiles - j - 1 : width);  // tiles of this column under the diagonal
         // What the columns before leave of this one, in pieces of 4 x 4 entries.
@@ -133,8 +133,8 @@ _SOLVE: Final = (
     using S = SCALAR;
     RESPHYS_SHARED S rest[T];
     const S* const all = factor.data;
-    S* const x = column.data;
-    const int n = column.shape[0];
+    S* const x = column_out.data;
+    const int n = column_out.shape[0];
     const int stride = factor.shape[1], tiles = factor.shape[0] / T, width = stride / T - 1;
     const int h = lane % Q;
     int some = 0;
@@ -204,62 +204,62 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
     name = "double" if scalar is wp.float64 else "float"
 
     @wp.func_native(_FACTOR.replace("SCALAR", name))
-    def factorise(matrix: wp.array2d[scalar]): ...
+    def factorise(matrix_out: wp.array2d[scalar]): ...
 
     @wp.func_native(_SOLVE.replace("SCALAR", name))
-    def substitute(factor: wp.array2d[scalar], column: wp.array[scalar]): ...
+    def substitute(factor: wp.array2d[scalar], column_out: wp.array[scalar]): ...
 
     @wp.kernel(module=module)
     def clear(
         active: wp.array[int],  # (B) zero: skip the environment
         unit: wp.array[scalar],  # (n rounded up to tiles times (W + 1) T) zero, but one on the diagonal beyond n
-        matrices: wp.array2d[scalar],  # (B, length of unit)
+        matrices_out: wp.array2d[scalar],  # (B, length of unit)
     ):
         """Resets active matrices; one block per matrix, as one thread per entry would be slow for inactive ones."""
         b, lane = wp.tid()
         if active[b] != 0:
             for k in range(lane, unit.shape[0], wp.block_dim()):
-                matrices[b, k] = unit[k]
+                matrices_out[b, k] = unit[k]
 
     @wp.kernel(module=module)
     def check(
-        active: wp.array[int],  # (B) becomes zero, except for unclamped matrices that failed
         clamped: wp.array[wp.bool],  # (B) matrices with clamped eigenvalues
-        factors: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped matrices failed
+        active_out: wp.array[int],  # (B) becomes zero, except for unclamped matrices that failed
+        factors_out: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) NaN where clamped matrices failed
     ):
         """Finds matrices that were not positive definite, one block per matrix."""
         b, lane = wp.tid()
-        if active[b] == 0:
+        if active_out[b] == 0:
             return
-        last = factors.shape[2] - T  # where the diagonal tiles begin
+        last = factors_out.shape[2] - T  # where the diagonal tiles begin
         bad = wp.float64(0.0)
-        for i in range(lane, factors.shape[1], wp.block_dim()):
-            if not factors[b, i, last + i % T] > scalar(0.0):
+        for i in range(lane, factors_out.shape[1], wp.block_dim()):
+            if not factors_out[b, i, last + i % T] > scalar(0.0):
                 bad = wp.float64(1.0)
         failed = block_max(bad) > wp.float64(0.0)
         again = failed and not clamped[b]
         if failed and not again:
-            for i in range(lane, factors.shape[1], wp.block_dim()):
-                factors[b, i, last + i % T] = scalar(wp.nan)
+            for i in range(lane, factors_out.shape[1], wp.block_dim()):
+                factors_out[b, i, last + i % T] = scalar(wp.nan)
         if lane == 0:
-            active[b] = int(again)
+            active_out[b] = int(again)
 
     @wp.kernel(module=module)
     def factor(
         active: wp.array[int],  # (B) zero: skip the environment
-        matrices: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
+        matrices_out: wp.array3d[scalar],  # (B, n rounded up to tiles, (W + 1) T) overwritten by the factors
     ):
         b, _ = wp.tid()
         if active[b] != 0:
-            factorise(matrices[b])
+            factorise(matrices_out[b])
 
     @wp.kernel(module=module)
     def solve(
         factors: wp.array3d[scalar],  # (B or 1, n rounded up to tiles, (W + 1) T)
-        columns: wp.array3d[scalar],  # (B, m, n) right-hand sides, overwritten by the solutions
+        columns_out: wp.array3d[scalar],  # (B, m, n) right-hand sides, overwritten by the solutions
     ):
         """Forward and backward substitution, one block per right-hand side."""
         b, m, _ = wp.tid()
-        substitute(factors[wp.min(b, factors.shape[0] - 1)], columns[b, m])
+        substitute(factors[wp.min(b, factors.shape[0] - 1)], columns_out[b, m])
 
     return SimpleNamespace(clear=clear, factor=factor, check=check, solve=solve)

@@ -2,7 +2,7 @@
 
 The energy of a point is V_s W(F, p) + V_v U(F, p): W at the points of the shape term, U at the fewer points of the
 volume term. Its "moduli" are (V_s, V_v, mu V_s, lambda V_v, p_1, ..., p_n); the third and fourth serve viscosity.
-`kernels.pointwise` describes the derivatives and their accuracy.
+`kernels.energy_functions` describes the derivatives and their accuracy.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from typing import Any
 
 import warp as wp
 
+from ..energy_functions import OFFSETS, SHARES, STEP, TWELVE, mat99, write_blocks
 from ..modules import named_module
-from ..pointwise import OFFSETS, SHARES, STEP, TWELVE, mat99, write_blocks
 
 ZERO = wp.float64(0.0)
 FIRST = 4  # index of the first parameter among the moduli

@@ -30,7 +30,8 @@ from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.environments.making import ball_mesh
 from warp_resphys.io.errors import InputError
-from warp_resphys.kernels import surfaces as kernels
+from warp_resphys.kernels.contact import nearest_points
+from warp_resphys.kernels.contact import surface_pairs as kernels
 from warp_resphys.mesh.mesh import join, select_cells
 
 CPU = torch.device("cpu")
@@ -51,7 +52,7 @@ def turned(mesh, angles, place):
 
 def pairs_of(kind, x, area, degree, parallel):
     """Pairs with their own vertices, and those as a batch of one."""
-    launcher, pairs = Launcher(1, CPU), kernels.Pairs()
+    launcher, pairs = Launcher(1, CPU), nearest_points.Pairs()
     pairs.environment = launcher.upload(np.zeros(len(x), np.int32), int)
     pairs.kind = launcher.upload(kind.astype(np.int32), int)
     pairs.nodes = launcher.upload(np.arange(4 * len(x), dtype=np.int32).reshape(-1, 4), wp.vec4i)
@@ -67,7 +68,7 @@ def pair_forces(launcher, pairs, x, stiffness, reach):
     near = torch.zeros(count, dtype=torch.int32)
     kappa = torch.tensor([[stiffness]], dtype=torch.float64)
     inputs = [warp_view(launcher.active, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
-    out = [warp_view(force, kernels.Corners), warp_view(energy, wp.float64), warp_view(near, wp.int32)]
+    out = [warp_view(force, nearest_points.Corners), warp_view(energy, wp.float64), warp_view(near, wp.int32)]
     launcher.launch(launcher.record(kernels.pair_forces, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
     return energy.numpy(), force.numpy()
 
@@ -163,7 +164,7 @@ def test_pairs_are_all_pairs_within_reach():
         at = x[b, nodes.reshape(-1)][None].contiguous()
         launcher.launch(
             launcher.record(
-                kernels.distances, (len(nodes),), [every, warp_view(at, wp.vec3d)], [warp_view(d, wp.float64)]
+                nearest_points.distances, (len(nodes),), [every, warp_view(at, wp.vec3d)], [warp_view(d, wp.float64)]
             )
         )
         near = {(int(k), *map(int, n)) for k, n in zip(kind[d < reach], nodes[d < reach], strict=True)}

@@ -28,8 +28,8 @@ def test_a_script_whose_kernels_are_compiled_prints_nothing():
     ("message", "shown"),
     [
         ("Warp 1.19.0 initialized:\n   CUDA Toolkit 13.4", False),
-        ("Module warp_resphys.kernels.solid d4f30f6 load on device 'cpu' took 0.26 ms  (cached)", False),
-        ("Module warp_resphys.kernels.solid d4f30f6 load on device 'cpu' took 5120.26 ms  (compiled)", True),
+        ("Module warp_resphys.kernels.elasticity d4f30f6 load on device 'cpu' took 0.26 ms  (cached)", False),
+        ("Module warp_resphys.kernels.elasticity d4f30f6 load on device 'cpu' took 5120.26 ms  (compiled)", True),
         ("Module my_kernels d4f30f6 load on device 'cpu' took 0.26 ms  (cached)", True),
     ],
 )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..fem.elements import Points
-from ..kernels import assembly as kernels
+from ..kernels import hessian_blocks as kernels
 from ..linalg.linear_solver import LinearSolver
 
 

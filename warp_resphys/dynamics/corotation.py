@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..fem.elements import SolidPoints
-from ..kernels import corotation as kernels
+from ..kernels import vertex_rotations as kernels
 
 
 class Corotation:

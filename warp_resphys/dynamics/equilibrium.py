@@ -17,7 +17,7 @@ from ..energies.solid import Solid
 from ..fem.coordinates import Coordinates
 from ..io.errors import ConvergenceError
 from ..io.kernel_cache import start_quietly
-from ..kernels import assembly, line_search, minimisation, points, reductions
+from ..kernels import hessian_blocks, line_search, minimisation, points, reductions
 from ..kernels.lbfgs import lbfgs_kernels
 from ..kernels.modules import compile_together
 from ..linalg.choice import make_linear_solver
@@ -43,7 +43,12 @@ def _kernels(energies: Sequence[PlacedEnergy], device: torch.device, dtype: torc
     return [
         *(points.gather_cells, points.gather_kernels(3).gather, reductions.masked_norm),
         *(solid.kernel(device) for solid in solids),
-        *(assembly.cell_blocks, assembly.scatter_kernel(scalar), minimisation.begin, lbfgs_kernels(scalar).project),
+        *(
+            hessian_blocks.cell_blocks,
+            hessian_blocks.scatter_kernel(scalar),
+            minimisation.begin,
+            lbfgs_kernels(scalar).project,
+        ),
         *(line_search.perturb, line_search.accept_kernel(scalar)),
     ]
 

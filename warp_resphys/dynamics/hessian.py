@@ -13,7 +13,7 @@ from ..energies.base import PairTangents
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..io.errors import InputError
-from ..kernels.assembly import sum_blocks
+from ..kernels.hessian_blocks import sum_blocks
 from ..linalg.conjugate_gradients import conjugate_gradients
 from ..linalg.coupling import Coupling, CouplingSolver, VertexCouplings, coordinates
 from ..linalg.linear_solver import Factor, LinearSolver, numbered
@@ -277,7 +277,7 @@ class ExactHessian(HessianApproximation):
     def _summed(
         self, blocks: torch.Tensor, local: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor, size: int
     ) -> torch.Tensor:
-        """Returns the values of the matrices (``kernels.assembly.sum_blocks``).
+        """Returns the values of the matrices (``kernels.hessian_blocks.sum_blocks``).
 
         Args:
             blocks: (A, 12, 12) second derivatives of pairs.

@@ -77,15 +77,14 @@ class Minimiser:
         search = struct_of(kernels.LineSearch, positions=p.positions, **fields)
         right, vertex_at = warp_view(self._right, vector), p.upload(hessian.vertex_at.astype(np.int32), int)
         loads = [warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
-        begin = p.record_blocks(kernels.begin, b, [*loads, tolerances, search, progress, history], [])
+        begin = p.record_blocks(kernels.begin, b, [tolerances, *loads], [progress, search, history])
         masks = [warp_view(mask, wp.int32) for mask in (p.tangent_active, p.clamp)]
-        self._select = p.record(kernels.select_for_factorisation, (b,), [progress, *masks, pairs.count], [])
-        shared = [progress, pairs, vertex_at, search]
-        self._project = p.record_blocks(own.project, b, shared, [right])
-        set_direction = p.record_blocks(own.set_direction, b, [*shared, right], [])
+        self._select = p.record(kernels.select_for_factorisation, (b,), [], [progress, pairs.count, *masks])
+        self._project = p.record_blocks(own.project, b, [vertex_at, progress, search], [pairs, right])
+        set_direction = p.record_blocks(own.set_direction, b, [vertex_at, right], [progress, search, pairs])
         inputs = [int(memory > 0), tolerances, warp_view(p.inertia, wp.float64), evaluation]
-        inputs += [warp_view(hessian.clamped, wp.bool), search, progress, pairs, history]
-        accept = p.record_blocks(line_search.accept_kernel(scalar), b, inputs, [])
+        inputs += [warp_view(hessian.clamped, wp.bool)]
+        accept = p.record_blocks(line_search.accept_kernel(scalar), b, inputs, [progress, search, pairs, history])
         seen = [warp_view(summary, wp.int32), warp_view(p.active, wp.int32)]
         summarise = p.record_blocks(kernels.summarise, 1, [progress], seen)
         evaluate = [*p.evaluation, accept, summarise]
@@ -95,9 +94,9 @@ class Minimiser:
         self._first_trial = p.capture(*first_trial, *evaluate)
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (_PERTURBATIONS, n, 3))
         kept, drawn = warp_view(p.zeros(n, 3), wp.vec3d), p.upload(signs, wp.vec3d)
-        perturb = p.record_blocks(line_search.perturb, b, [progress, drawn, search.positions], [kept])
-        compared = [progress, kept, evaluation.residual, search, history]
-        check = p.record_blocks(line_search.check_rounding, b, compared, [])
+        perturb = p.record_blocks(line_search.perturb, b, [progress, drawn], [search.positions, kept])
+        compared = [kept, evaluation.residual]
+        check = p.record_blocks(line_search.check_rounding, b, compared, [progress, search, history])
         self._check_rounding = p.capture(perturb, *p.evaluation, check, summarise)
         self._parts = SimpleNamespace(begin=start, set_direction=first_trial, evaluate=evaluate)
         self._loop: CapturedGraph | None = None
@@ -112,8 +111,8 @@ class Minimiser:
         share = warp_view(p.zeros(), wp.float64)
         allow = p.record(kernels.allow_all, (p.batch,), [], [share])
         given, free = warp_view(feasible, wp.vec3d), warp_view(p.free_mask, wp.float64)
-        start = p.record(kernels.shorten_start, (p.batch, p.n_vertices), [share, free, given, search], [])
-        step = p.record_blocks(kernels.shorten_step, p.batch, [progress, share, search], [])
+        start = p.record(kernels.shorten_start, (p.batch, p.n_vertices), [share, free, given], [search])
+        step = p.record_blocks(kernels.shorten_step, p.batch, [share], [progress, search])
         return (
             [allow, *p.bounds(given, search.positions, share), start],
             [allow, *p.bounds(search.origin, search.positions, share), step],
@@ -137,7 +136,7 @@ class Minimiser:
         mark = p.record(kernels.mark_clamped, (p.batch,), masks, [warp_view(h.clamped, wp.bool)])
         solver = h.linear.record_factor(h.assembly.values, p.tangent_active, h.clamped)
         factors = [mark, p.tangent_launches, solver.clear, h.assembly.launches, solver.factor, solver.check]
-        repeat = p.record_blocks(kernels.request_clamped, 1, masks, [again])
+        repeat = p.record_blocks(kernels.request_clamped, 1, masks[:1], [masks[1], again])
         solve_factor = h.linear.record_solve(h.assembly.values, self._right.flatten(1))
         conditions = (warp_view(self._summary[k : k + 1], wp.int32) for k in range(len(Summary._fields)))
         active, directions, requests, checks = conditions

@@ -38,7 +38,7 @@ from typing_extensions import override
 
 from ..fem.elements import Points
 from ..io.errors import InputError, listed, naming
-from ..kernels import contact as kernels
+from ..kernels.contact import barriers as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces, face_triangles
 from ..stepping.inputs import Inputs

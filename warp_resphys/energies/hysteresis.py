@@ -37,7 +37,7 @@ import warp as wp
 from typing_extensions import override
 
 from ..fem.elements import Points
-from ..kernels import hysteresis as kernels
+from ..kernels import plastic_sliders as kernels
 from ..mesh.mesh import Mesh
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher, warp_view

@@ -22,7 +22,7 @@ from typing_extensions import override
 
 from ..fem.elements import Points
 from ..io.errors import InputError
-from ..kernels import medium as kernels
+from ..kernels import fluid_drag as kernels
 from ..mesh.elements import FACES
 from ..mesh.mesh import Mesh, boundary_faces
 from ..stepping.inputs import Inputs
@@ -195,7 +195,7 @@ class MediumTerm(Term):
 def _forces(
     x: torch.Tensor, reference: torch.Tensor, target: torch.Tensor, area: torch.Tensor, coefficients: torch.Tensor
 ) -> torch.Tensor:
-    """Returns the derivative (B, P, 3) of the energy in `kernels.medium` by the positions of the points."""
+    """Returns the derivative (B, P, 3) of the energy in `kernels.fluid_drag` by the positions of the points."""
     size = area.norm(dim=-1, keepdim=True)
     n, d = area / size.clamp_min(1e-30), x - reference
     across, inertial = ((way * n).sum(-1, keepdim=True) for way in (d, x - target))

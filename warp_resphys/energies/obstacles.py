@@ -17,9 +17,8 @@ from typing_extensions import override
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.kernel_cache import start_quietly
-from ..kernels import obstacles as kernels
+from ..kernels.contact import signed_distances as kernels
 from ..kernels.modules import shareable
-from ..kernels.triangles import from_surface
 from ..mesh.motion_files import MovingSurface
 from ..mesh.readers import METRES
 from ..mesh.tetrahedra import read_shells
@@ -72,7 +71,7 @@ class Obstacle:
 
     @property
     def size(self) -> Vector:
-        """Sizes as in `kernels.obstacles` [m]."""
+        """Sizes as in `kernels.contact.signed_distances` [m]."""
         return (0.0, 0.0, 0.0)
 
     @property
@@ -285,7 +284,7 @@ def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLik
         indices: Any = wp.array(np.asarray(triangles).ravel(), dtype=int, device="cpu")
         surface = wp.Mesh(corners, indices, support_winding_number=True)
         out = wp.zeros(len(arrays[1]), dtype=float, device="cpu")
-        wp.launch(from_surface, out.size, [surface.id, points], [out], device="cpu")
+        wp.launch(kernels.from_surface, out.size, [surface.id, points], [out], device="cpu")
     return np.asarray(out.numpy(), dtype=np.float64)
 
 
@@ -352,7 +351,7 @@ class ObstacleSet:
 
 
 class _Measurement(Launcher):
-    """Buffers and launches of `kernels.obstacles.measure` and its adjoint for one size of a batch."""
+    """Buffers and launches of `kernels.contact.signed_distances.measure` and its adjoint for one size of a batch."""
 
     def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
         super().__init__(batch, device)

@@ -11,8 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ..io.errors import InputError
-from ..kernels import broad_phase
-from ..kernels import surfaces as kernels
+from ..kernels.contact import broad_phase, nearest_points
 from ..kernels.modules import launch_stream, shareable
 from ..mesh.mesh import Mesh, boundary_triangles
 from .launcher import Launcher, struct_of, warp_view
@@ -133,13 +132,13 @@ class PairList:
     Attributes:
         count: number of pairs C.
         version: number of lists so far.
-        pairs: the pairs, a ``kernels.surfaces.Pairs``.
+        pairs: the pairs, a ``kernels.contact.nearest_points.Pairs``.
         environment: (C,) environments of the pairs.
         nodes: (C, 4) vertices.
         kind: (C,) kind.
         vertex_array: (P,) vertices of the surface, a Warp array.
-        start: (B P + 1) first entry of every vertex of the surface in `incident`, for ``kernels.surfaces.gather``.
-        incident: pair 4 + number of the vertex in it.
+        start: (B P + 1) first entry of every vertex of the surface in `incident`.
+        incident: pair 4 + number of the vertex in it (``kernels.contact.surface_pairs.gather``).
     """
 
     def __init__(self, launcher: Launcher, surface: Surface, reach: float) -> None:
@@ -205,7 +204,7 @@ class PairList:
         size = len(surface.vertices) * len(surface.triangles)
         total, vertices = size + len(surface.edges) ** 2, self.vertex_array.reshape((-1, 1))
         faces, edges = self._triangle_array, self._edge_array
-        searches = (  # by `kernels.surfaces.VERTEX_TRIANGLE` and `EDGE_EDGE`
+        searches = (  # by `kernels.contact.nearest_points.VERTEX_TRIANGLE` and `EDGE_EDGE`
             (self._hierarchy(motion, faces), vertices, faces, 0),
             (self._hierarchy(motion, edges), edges, edges, size),
         )
@@ -214,8 +213,8 @@ class PairList:
             keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
             pair_keys = struct_of(broad_phase.PairKeys, count=count, keys=keys)
             for kind, (tree, first, second, offset) in enumerate(searches):
-                inputs = [kind, tree.id, motion, first, second, wp.int64(offset), wp.int64(total), pair_keys]
-                own.launch(own.record(broad_phase.close_pairs, (own.batch, first.shape[0]), inputs, []))
+                inputs = [kind, tree.id, motion, first, second, wp.int64(offset), wp.int64(total)]
+                own.launch(own.record(broad_phase.close_pairs, (own.batch, first.shape[0]), inputs, [pair_keys]))
             if (needed := int(count)) <= self._capacity:
                 break
             self._capacity = 2 * needed  # The list is made again.
@@ -255,7 +254,9 @@ class PairList:
         self.count, self.version = len(keys), self.version + 1
         whole = {"environment": self.environment, "kind": self.kind, "nodes": self.nodes}
         whole = {name: value.to(torch.int32).contiguous() for name, value in whole.items()}
-        self.pairs = struct_of(kernels.Pairs, **whole, area=self.area, degree=self.degree, parallel=self.parallel)
+        self.pairs = struct_of(
+            nearest_points.Pairs, **whole, area=self.area, degree=self.degree, parallel=self.parallel
+        )
 
     def incidence(self, environment: torch.Tensor, nodes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns `start` and `incident` of pairs (C,) and (C, 4)."""
@@ -271,7 +272,7 @@ class PairList:
         out = torch.zeros(self.count, device=own.device, dtype=torch.float64)
         if self.count:
             inputs = [self.pairs, warp_view(kept, wp.vec3d)]
-            own.launch(own.record(kernels.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
+            own.launch(own.record(nearest_points.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
         return out
 
     def check_apart(self, positions: torch.Tensor, when: str, advice: str) -> None:

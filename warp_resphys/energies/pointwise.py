@@ -11,7 +11,7 @@ For example::
 
 The function takes the kinematic variable of a point, a vector (a position, a difference of positions) or a matrix (a
 deformation gradient), and the values at the point: parameters and inputs, in the order of their declaration.
-`kernels.pointwise` describes the accuracy of the derivatives.
+`kernels.energy_functions` describes the accuracy of the derivatives.
 """
 
 from abc import abstractmethod
@@ -27,8 +27,8 @@ from typing_extensions import override
 
 from ..fem.elements import Points, physical_gradients
 from ..io.errors import InputError
+from ..kernels.energy_functions import pointwise_kernels
 from ..kernels.points import PartValues
-from ..kernels.pointwise import pointwise_kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter
 from .base import Adjoint, Energy, PointSet, Term, Values, value_of

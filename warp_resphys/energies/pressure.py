@@ -16,7 +16,7 @@ import warp as wp
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels import pressure as kernels
+from ..kernels import follower_pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers, face_rule
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Quantity

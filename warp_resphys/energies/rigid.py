@@ -24,7 +24,7 @@ from typing_extensions import override
 from ..fem.body import Body, Rigid
 from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.elements import Points, SolidPoints, volume_points
-from ..kernels import rigid as kernels
+from ..kernels import vertex_rotations as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Mass

@@ -15,8 +15,8 @@ from typing_extensions import override
 from ..fem.body import Body
 from ..fem.elements import Discretisation, Points, SolidPoints
 from ..io.errors import InputError
+from ..kernels import elasticity as kernels
 from ..kernels import lanes
-from ..kernels import solid as kernels
 from ..mesh.mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Constants, Mass

@@ -12,7 +12,8 @@ from typing_extensions import override
 
 from ..fem.elements import Points
 from ..io.errors import InputError
-from ..kernels import surfaces as kernels
+from ..kernels.contact import nearest_points
+from ..kernels.contact import surface_pairs as kernels
 from ..stepping.quantity import Quantity
 from .barrier import barrier_pressure, friction_over_slide
 from .base import Adjoint, PairTangents, PointSet, Term, Values, value_of
@@ -21,7 +22,7 @@ from .pairs import PairList, Surface
 
 STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
 FRICTION = Quantity("surface_friction", "", 0.0, closed=True, per="coefficient")
-_FEATURES = int(kernels.EDGE_FEATURES)
+_FEATURES = int(nearest_points.EDGE_FEATURES)
 _TINY = 1e-300  # keeps a division by a length defined
 
 
@@ -185,7 +186,7 @@ class SurfaceTerm(Term):
             self._size(ours.count)
         stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
         inputs = [active, ours.pairs, stiffness, wp.float64(self._reach), positions]
-        pair_out = [warp_view(self._pair_force, kernels.Corners), warp_view(self._pair_energy, wp.float64)]
+        pair_out = [warp_view(self._pair_force, nearest_points.Corners), warp_view(self._pair_energy, wp.float64)]
         sums = [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
         incidence = [warp_view(x, wp.int32) for x in (ours.start, ours.incident)]
         size, near = (own.batch, self.n_points), warp_view(self._near, wp.int32)
@@ -266,7 +267,7 @@ class SurfaceTerm(Term):
         """Returns the launch that bounds the way between positions (B, N, 3)."""
         ends = (warp_view(x.contiguous(), wp.vec3d) for x in (start, end))
         inputs = [warp_view(self.launcher.active, wp.int32), self._list.pairs, *ends]
-        return self.launcher.record(kernels.bound, (self._list.count,), inputs, [share])
+        return self.launcher.record(nearest_points.bound, (self._list.count,), inputs, [share])
 
     @override
     def curvature(self, values: Values) -> torch.Tensor:
@@ -286,9 +287,9 @@ class SurfaceTerm(Term):
         indices = chosen.to(torch.int32)
         w, t, s = (self._force.new_zeros(len(chosen), _FEATURES, 4) for _ in range(3))
         part = self._force.new_zeros(len(chosen), _FEATURES)
-        features = struct_of(kernels.Features, coefficient=part, w=w, t=t, s=s)
-        inputs = [warp_view(indices, wp.int32), ours.pairs, wp.float64(self._reach), warp_view(x, wp.vec3d), features]
-        own.launch(own.record(kernels.pair_features, (len(chosen), _FEATURES), inputs, []))
+        features = struct_of(nearest_points.Features, coefficient=part, w=w, t=t, s=s)
+        inputs = [warp_view(indices, wp.int32), ours.pairs, wp.float64(self._reach), warp_view(x, wp.vec3d)]
+        own.launch(own.record(nearest_points.pair_features, (len(chosen), _FEATURES), inputs, [features]))
         environment, nodes = ours.environment[chosen], ours.nodes[chosen]
         ends = x[environment[:, None], nodes]
         # Weights that do not change here, but whose derivatives are those of the nearest points.
@@ -398,7 +399,7 @@ class _Near(NamedTuple):
 
     environment: torch.Tensor  # (A,)
     nodes: torch.Tensor  # (A, 4)
-    weights: torch.Tensor  # (A, 9, 4) of the nearest points, by feature (``kernels.surfaces.nearest``)
+    weights: torch.Tensor  # (A, 9, 4) of the nearest points, by feature (``kernels.contact.nearest_points.nearest``)
     r: torch.Tensor  # (A, 9, 3) from the nearest point of the second part to that of the first [m]
     d: torch.Tensor  # (A, 9) its length [m]
     part: torch.Tensor  # (A, 9) coefficients of the features
@@ -414,7 +415,7 @@ class Grips:
         nodes: (G, 4) vertices.
         struct: arrays for the kernels.
         outputs: arrays of gradients and energies.
-        incidence: for ``kernels.surfaces.gather``.
+        incidence: for ``kernels.contact.surface_pairs.gather``.
     """
 
     environment: torch.Tensor
@@ -430,7 +431,7 @@ class Grips:
 
     @classmethod
     def of(cls, pairs: PairList, sliding: Sliding) -> "Grips":
-        """Returns friction of pairs (G, ...) (`kernels.surfaces.FrictionPairs`)."""
+        """Returns friction of pairs (G, ...) (`kernels.contact.surface_pairs.FrictionPairs`)."""
         environment, nodes, load = sliding.environment, sliding.nodes, sliding.load
         kept = {
             name: (value if value.is_floating_point() else value.to(torch.int32)).contiguous()
@@ -439,6 +440,6 @@ class Grips:
         struct = struct_of(kernels.FrictionPairs, **kept)
         sums = load.new_zeros(len(load), 4, 3), torch.zeros_like(load)
         incidence = pairs.incidence(environment, nodes)
-        outputs = [warp_view(sums[0], kernels.Corners), warp_view(sums[1], wp.float64)]
+        outputs = [warp_view(sums[0], nearest_points.Corners), warp_view(sums[1], wp.float64)]
         own = [warp_view(x, wp.int32) for x in incidence]
         return cls(environment, nodes, struct, outputs, own)

@@ -32,7 +32,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..kernels import tendons as kernels
+from ..kernels import tendon_segments as kernels
 from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
@@ -55,14 +55,14 @@ _STRAIGHT = 1e-4  # rad: angles are rounded off below it, so that they have a de
 
 @dataclass(frozen=True)
 class TendonPoints(PartPoints):
-    """Segments of tendons between guides, tendon after tendon, with the operators of F (`kernels.tendons`)."""
+    """Segments of tendons between guides, tendon after tendon, with the operators of F (`kernels.tendon_segments`)."""
 
     rest: NDArray[np.float64]  # (P, 3, 3) F of the undeformed body [m]
     anchors: NDArray[np.float64]  # (P, 3, 3) part of F due to guides that are fixed in the world [m]
 
 
 def offset_vector(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
-    """Returns the vectors c (1 or B, T, 3) of `kernels.tendons` for offsets by name."""
+    """Returns the vectors c (1 or B, T, 3) of `kernels.tendon_segments` for offsets by name."""
     first, second = torch.broadcast_tensors(*(values[offset.name] / kernels.OFFSET_UNIT for offset in OFFSETS))
     return torch.stack([torch.ones_like(first), first, second], -1)
 
@@ -70,7 +70,7 @@ def offset_vector(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
 def friction_after(
     slide: torch.Tensor, hold: torch.Tensor, drop: torch.Tensor, rise: torch.Tensor, length: torch.Tensor
 ) -> torch.Tensor:
-    """Returns the friction f(s) of guides (B, P) after a slide [N]; for the arguments, see ``kernels.tendons``."""
+    """Returns the friction f(s) of guides (B, P) after a slide [N] (``kernels.tendon_segments.bristle``)."""
     most = torch.where(slide < 0.0, -drop, rise)
     return most + (hold - most) * torch.exp(-slide.abs() / length)
 
@@ -188,7 +188,7 @@ class BoundTendons(BoundEnergy):
 
 
 class _Stick(AdjointFunction):
-    """Tensions (B, P) of the segments where guides stick or slide (`kernels.tendons.stick`)."""
+    """Tensions (B, P) of the segments where guides stick or slide (`kernels.tendon_segments.stick`)."""
 
     @override
     @staticmethod

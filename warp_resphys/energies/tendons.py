@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels import tendons as kernels
+from ..kernels import tendon_segments as kernels
 from ..mesh.mesh import Mesh
 from ..mesh.surface import locate
 from ..stepping.quantity import Parameter, Quantity

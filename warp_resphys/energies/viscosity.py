@@ -30,7 +30,7 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from ..kernels import solid as kernels
+from ..kernels import elasticity as kernels
 from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.state import ImplicitStage
 from .base import Term

@@ -78,7 +78,7 @@ class TiledSolver(LinearSolver):
         return SimpleNamespace(
             clear=self._record(self.kernels.clear, (batch,), active, unit, values),
             factor=self._record(self.kernels.factor, (batch,), active, tiles),
-            check=self._record(self.kernels.check, (batch,), active, clamped, tiles),
+            check=self._record(self.kernels.check, (batch,), clamped, active, tiles),
         )
 
     def record_solve(self, factors: torch.Tensor, columns: torch.Tensor) -> Any:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ..io.arrays import FloatArray
 from ..io.errors import MeshError
 from ..io.kernel_cache import ensure_kernel_cache, start_quietly
+from ..kernels.contact.signed_distances import blocked
 from ..kernels.modules import shareable
-from ..kernels.triangles import blocked
 from .elements import FACES, Rule, Shape
 from .mesh import Mesh, boundary_faces, boundary_triangles, connected_parts, face_triangles
 

@@ -5,8 +5,8 @@ Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of
 
 import warp as wp
 
-from .obstacles import GRID, Obstacles, distance, turn_slope
-from .points import VectorPoints, vector_at
+from ..points import VectorPoints, vector_at
+from .signed_distances import GRID, Obstacles, distance, turn_slope
 
 wp.set_module_options({"enable_backward": False})
 
@@ -163,7 +163,7 @@ def adjoint(
     f: Friction,
     positions: wp.array2d[wp.vec3d],
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-    out: Slopes,
+    slopes_out: Slopes,
 ):
     """-z . d force / d value, at fixed positions."""
     b, p, k = wp.tid()
@@ -174,19 +174,19 @@ def adjoint(
     factor = stiffness[b, k] * area[p]
     # The loss is a phi + w . n, linearised in the distance phi and the normal n.
     a, w = -(factor * e[2] / o.reach) * wp.dot(at.n, z), -(factor * e[1]) * z
-    out.stiffness[b, p, k] = -area[p] * e[1] * wp.dot(at.n, z)
-    out.growth[b, p, k] = -a
-    out.place[b, p, k] = -(a * at.n + at.h * w)
-    out.turn[b, p, k] = turn_slope(o, b, k, x, at, a, w)
+    slopes_out.stiffness[b, p, k] = -area[p] * e[1] * wp.dot(at.n, z)
+    slopes_out.growth[b, p, k] = -a
+    slopes_out.place[b, p, k] = -(a * at.n + at.h * w)
+    slopes_out.turn[b, p, k] = turn_slope(o, b, k, x, at, a, w)
     mu, load, m = f.coefficient[b, k], f.load[b, p, k], f.normal[b, p, k]
     u, way = slide(f, b, p, k, x), x - f.reference[b, p, k]
     v = smoothed(wp.length(u), f.slip[b, 0])
     work = -v[1] * wp.dot(u, z)
-    out.coefficient[b, p, k] = load * work
-    out.load[b, p, k] = mu * work
+    slopes_out.coefficient[b, p, k] = load * work
+    slopes_out.load[b, p, k] = mu * work
     q = -(mu * load) * (v[1] * z + (v[2] * wp.dot(u, z)) * u)
-    out.normal[b, p, k] = -wp.dot(m, way) * q - wp.dot(q, m) * way
-    out.reference[b, p, k] = (mu * load) * (friction_tangent(f, b, p, k, x) * z)
+    slopes_out.normal[b, p, k] = -wp.dot(m, way) * q - wp.dot(q, m) * way
+    slopes_out.reference[b, p, k] = (mu * load) * (friction_tangent(f, b, p, k, x) * z)
 
 
 @wp.kernel
@@ -196,7 +196,7 @@ def bound(
     o: Obstacles,
     origin: wp.array2d[wp.vec3d],  # (B, N) without penetration [m]
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
-    share: wp.array[wp.float64],  # (B) is lowered to the share of the way from origin that leaves `KEPT` of every gap
+    share_out: wp.array[wp.float64],  # (B) lowered to the share of the way from origin that leaves `KEPT` of every gap
 ):
     """Bounds a step.
 
@@ -213,7 +213,7 @@ def bound(
     if o.kind[k] != GRID:
         fall = -wp.dot(at.n, way)
         if fall > at.d - kept:
-            wp.atomic_min(share, b, (at.d - kept) / fall)
+            wp.atomic_min(share_out, b, (at.d - kept) / fall)
         return
     most = o.size[k][1] * wp.length(way)
     t = wp.float64(0.0)
@@ -225,4 +225,4 @@ def bound(
         if gap < kept:
             break
         at = distance(o, b, k, x + t * way)
-    wp.atomic_min(share, b, t)
+    wp.atomic_min(share_out, b, t)

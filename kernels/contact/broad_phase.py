@@ -6,7 +6,7 @@ by one around the mean motion of the piece, other pairs by another around the me
 
 import warp as wp
 
-from .surfaces import EDGE_EDGE, Corners, apart, nearest
+from .nearest_points import EDGE_EDGE, Corners, apart, nearest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -108,7 +108,7 @@ def close_pairs(
     second: wp.array2d[int],  # (T, 3) triangles, or (E, 2) edges
     offset: wp.int64,  # number of pairs of another kind, which come before
     per_environment: wp.int64,  # number of all conceivable pairs of an environment
-    pair_keys: PairKeys,
+    pairs_out: PairKeys,
 ):
     """Pairs of a vertex and a triangle, or of edges, without a vertex in common."""
     b, i = wp.tid()
@@ -126,10 +126,10 @@ def close_pairs(
             v = wp.vec4i(own[0], own[1], other[0], other[1])
             distinct = j > i and v[0] != v[2] and v[0] != v[3] and v[1] != v[2] and v[1] != v[3]
         if distinct and may_touch(sweep, b, kind, v):
-            slot = wp.atomic_add(pair_keys.count, 0, 1)
-            if slot < pair_keys.keys.shape[0]:
+            slot = wp.atomic_add(pairs_out.count, 0, 1)
+            if slot < pairs_out.keys.shape[0]:
                 key = wp.int64(i) * wp.int64(count) + wp.int64(j)
-                pair_keys.keys[slot] = wp.int64(b) * per_environment + offset + key
+                pairs_out.keys[slot] = wp.int64(b) * per_environment + offset + key
 
 
 @wp.func

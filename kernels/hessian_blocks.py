@@ -19,7 +19,7 @@ def sum_blocks(
     rows: wp.array[wp.vec3i],  # (R) first value of the matrix of a row, its size, and the number of the row's vertex
     columns: wp.array[wp.vec4i],  # (A) numbers of the vertices of a pair, -1: left out
     blocks: wp.array3d[wp.float64],  # (A, 12, 12) [N/m]
-    out: wp.array[wp.float64],  # matrices, one after another, zero before
+    matrices_out: wp.array[wp.float64],  # matrices, one after another, zero before
 ):
     """Sums matrices of pairs into those of environments."""
     r = wp.tid()
@@ -33,7 +33,7 @@ def sum_blocks(
                 column = columns[pair][j]
                 if column >= 0:
                     for m in range(3):
-                        out[to + 3 * column + m] += blocks[pair, first + k, 3 * j + m]
+                        matrices_out[to + 3 * column + m] += blocks[pair, first + k, 3 * j + m]
 
 
 @wp.kernel

@@ -1,4 +1,4 @@
-"""Signed distances of obstacles, with their first two derivatives, and the pull-back of derivatives by them.
+"""Signed distances of obstacles with their first two derivatives, their pull-back, and queries of closed surfaces.
 
 A point is at y = R^T (x - c) in the axes of an obstacle with place c and rotation R. The signed distance phi(y) of a
 convex obstacle is convex, so that it is d + n . w or more after a way w from a point with the distance d and the normal
@@ -238,3 +238,20 @@ def measure_adjoint(
     a, w = by_distance[b, p, k], by_normal[b, p, k]
     position_out[b, p, k] = a * at.n + at.h * w
     turn_out[b, p, k] = turn_slope(o, b, k, x, at, a, w)
+
+
+@wp.kernel(module="unique")
+def from_surface(surface: wp.uint64, places: wp.array[wp.vec3], distance_out: wp.array[float]):
+    """Signed distances of places from a closed surface [m]."""
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(surface, places[i], 1.0e6)
+    nearest = wp.mesh_eval_position(surface, query.face, query.u, query.v)
+    distance_out[i] = query.sign * wp.length(places[i] - nearest)
+
+
+@wp.kernel(module="unique")
+def blocked(surface: wp.uint64, starts: wp.array[wp.vec3], directions: wp.array[wp.vec3], blocked_out: wp.array[float]):
+    """Marks rays that hit a surface with one."""
+    i = wp.tid()
+    if wp.mesh_query_ray(surface, starts[i], directions[i], 1.0e6).result:
+        blocked_out[i] = 1.0

@@ -2,8 +2,8 @@
 
 import warp as wp
 
+from .elasticity import add_square, add_strain_tangent
 from .points import MatrixPoints, green_strain, matrix_at
-from .solid import add_square, add_strain_tangent
 
 wp.set_module_options({"enable_backward": False})
 

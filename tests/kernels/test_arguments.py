@@ -1,0 +1,167 @@
+"""The order and the names of kernels' arguments: constants, in, out; what a kernel writes ends in `_out`."""
+
+import ast
+import functools
+import importlib
+import inspect
+import pkgutil
+import re
+import textwrap
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import warp as wp
+
+import warp_resphys.kernels
+from warp_resphys.kernels.axial import LAWS, axial_kernels
+from warp_resphys.kernels.elasticity import solid_kernels
+from warp_resphys.kernels.energy_functions import pointwise_kernels
+from warp_resphys.kernels.hessian_blocks import projection_kernel, scatter_kernel
+from warp_resphys.kernels.lanes import cell_kernels
+from warp_resphys.kernels.lbfgs import lbfgs_kernels
+from warp_resphys.kernels.line_search import accept_kernel
+from warp_resphys.kernels.materials import corotated
+from warp_resphys.kernels.materials.convex import convex_law
+from warp_resphys.kernels.points import gather_kernels
+from warp_resphys.kernels.tiled_cholesky import tiled_kernels
+
+wp.set_module_options({"enable_backward": False})
+FOLDER = Path(warp_resphys.kernels.__file__).parent
+
+
+@wp.func
+def square(x: wp.vec3d, v: wp.vec2d) -> wp.float64:
+    return v[0] * wp.dot(x, x)
+
+
+def kernels_in(holder):
+    return [value for value in vars(holder).values() if isinstance(value, wp.Kernel)]
+
+
+@functools.cache
+def kernels():
+    """One of every kernel of the package, by file and name."""
+    names = [info.name for info in pkgutil.walk_packages([str(FOLDER)], "warp_resphys.kernels.")]
+    made = [*map(importlib.import_module, names), *map(axial_kernels, LAWS), *map(gather_kernels, (1, 3))]
+    made += [make(wp.float64) for make in (lbfgs_kernels, tiled_kernels)]
+    made += [solid_kernels(corotated), solid_kernels(convex_law((3,), 1)), cell_kernels(corotated)]
+    made += [pointwise_kernels(square)]
+    made += [SimpleNamespace(kernel=make(wp.float64)) for make in (accept_kernel, projection_kernel, scatter_kernel)]
+    found = [kernel for holder in made for kernel in kernels_in(holder)]
+    return {(Path(inspect.getsourcefile(kernel.func)).name, kernel.func.__name__): kernel for kernel in found}
+
+
+def definition(function):
+    """The syntax tree of a function, and the values of the names in it."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
+    cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+    return tree, {**function.__globals__, **{name: cell.cell_contents for name, cell in cells}}
+
+
+def is_array(kind):
+    return hasattr(kind, "ndim")
+
+
+class Reader(ast.NodeVisitor):
+    """Finds which arguments of a function it writes: arrays, also those of structs and rows that have a name."""
+
+    def __init__(self, types, names):
+        self.places = {name: (name, kind) for name, kind in types.items()}
+        self.names, self.written = names, set()
+
+    def place(self, node):
+        """The argument that an expression is a part of, its type, and whether it is an entry of an array."""
+        if isinstance(node, ast.Name):
+            return (*self.places.get(node.id, (None, None)), False)
+        if not isinstance(node, ast.Attribute | ast.Subscript):
+            return None, None, False
+        root, kind, entry = self.place(node.value)
+        if isinstance(node, ast.Attribute):
+            return root, kind.vars[node.attr].type if hasattr(kind, "vars") else None, entry
+        if not is_array(kind):
+            return root, None, entry
+        left = kind.ndim - (len(node.slice.elts) if isinstance(node.slice, ast.Tuple) else 1)
+        return root, SimpleNamespace(ndim=left, dtype=kind.dtype) if left else kind.dtype, not left
+
+    def visit_Assign(self, node):
+        for target in node.targets:
+            self.store(target)
+            root, kind, _ = self.place(node.value)
+            if isinstance(target, ast.Name) and is_array(kind):
+                self.places[target.id] = root, kind
+        self.generic_visit(node)
+
+    def visit_AugAssign(self, node):
+        self.store(node.target)
+        self.generic_visit(node)
+
+    def store(self, target):
+        root, _, entry = self.place(target)
+        if entry and root:
+            self.written.add(root)
+
+    def visit_Call(self, node):
+        self.generic_visit(node)
+        text = ast.unparse(node.func)
+        if text.startswith("wp."):  # wp.grad(energy)(f, v) writes nothing
+            self.written |= {self.place(node.args[0])[0]} if "atomic" in text else set()
+            return
+        called = eval(text, dict(self.names))
+        if isinstance(called, wp.Function) and not called.is_builtin():
+            arguments = dict(zip(called.input_types, node.args, strict=True))
+            self.written |= {self.place(arguments[name])[0] for name in written_by(called)}
+
+
+@functools.cache
+def written_by(function):
+    """Names of the arguments that a kernel or a Warp function writes."""
+    if code := getattr(function, "native_snippet", None):
+        return set(re.findall(r"(?<!const )S\* const \w+ = (\w+)\.data", code))
+    tree, names = definition(function.func)
+    reader = Reader({arg.label: arg.type for arg in function.adj.args}, names)
+    for _ in range(2):  # A row may have its name in a loop.
+        for statement in tree.body:
+            reader.visit(statement)
+    return reader.written - {None}
+
+
+def test_every_kernel_of_the_folder_is_read():
+    decorated = set()
+    for path in FOLDER.rglob("*.py"):
+        functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
+        marked = [n for n in functions if any("wp.kernel" in ast.unparse(mark) for mark in n.decorator_list)]
+        decorated |= {(path.name, n.name) for n in marked}
+    assert decorated == set(kernels())
+    assert len(decorated) > 60
+
+
+@wp.func
+def count(sums: wp.array2d[int], b: int):
+    sums[b, 0] += 1
+
+
+@wp.kernel
+def example(
+    named: wp.array2d[float], added: wp.array[int], through: wp.array2d[int], only_read: wp.array[wp.vec3], x: wp.vec3
+):
+    i = wp.tid()
+    row = named[i]
+    copied = only_read[i]
+    copied[0] = 1.0
+    x[1] = copied[0]
+    row[0] = x[0]
+    wp.atomic_add(added, 0, 1)
+    count(through, i)
+
+
+def test_what_a_kernel_writes_is_found():
+    assert written_by(example) == {"named", "added", "through"}
+
+
+@pytest.mark.parametrize("name", sorted(kernels()), ids="/".join)
+def test_outputs_come_last_and_end_in_out(name):
+    arguments = [arg.label for arg in kernels()[name].adj.args]
+    written = written_by(kernels()[name])
+    assert {argument for argument in arguments if argument.endswith("_out")} == written
+    assert set(arguments[len(arguments) - len(written) :]) == written

@@ -161,7 +161,7 @@ with torch.no_grad():
     front = None
     for number in range(STEPS):
         inputs = Inputs(muscle_stress=applied[number])
-        after, _ = simulator.step(state, inputs)
+        after = simulator.step(state, inputs)
         contact = simulator.contacts(state, after, inputs)["obstacles"]
         if front is None:
             front = torch.as_tensor(mesh.vertices[contact.vertices, 0] > LENGTH / 2)

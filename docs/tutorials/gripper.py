@@ -190,7 +190,7 @@ with torch.no_grad():
     for step in range(57):
         own = scene.inputs({name: Inputs(tendon_tension=pull[step]) for name in ("left", "right")})
         inputs = Inputs(fixed_positions=base[step], **own.fields)
-        before, (state, _) = state, simulator.step(state, inputs)
+        before, state = state, simulator.step(state, inputs)
     forces = simulator.contacts(before, state, inputs)["surfaces"]
 on_ball = forces.vertices >= ball.start
 press = forces.normal[0, on_ball, 1].abs().sum() / 2.0

@@ -42,8 +42,8 @@ def test_it_saves_iterations_and_changes_no_state(integrator, time_step, device)
     followed = pair[0].rollout(start, steps)
     state, alone = start, []
     for k in range(steps):  # In turns, so that neither goes on where its own last step has led.
-        state, report = pair[k % 2].step(state)
-        alone.append(report)
+        state = pair[k % 2].step(state)
+        alone.append(state.report)
     sums = [sum(sum(counts) for counts in iterations(reports)) for reports in (followed.reports, alone)]
     assert sums[0] < (1.02 if time_step == 0.01 else 0.9) * sums[1]
     torch.testing.assert_close(followed.q[-1], state.q, rtol=0.0, atol=2e-9)
@@ -62,14 +62,13 @@ def test_a_failure_is_not_extrapolated(device):
     s = simulator(device=device, solver={"on_failure": "count", "max_iterations": 30})
     state = s.rollout(pose(s, "bent", 2), 4).final
     state.v[0] += 1e4  # in place: the next step still follows
-    failed, report = s.step(state)
-    assert report.converged.tolist() == [False, True]
+    failed = s.step(state)
+    assert failed.converged.tolist() == [False, True]
     counts = s.workspace(2).solver("dynamics", s.settings)._minimiser._history_counts[0]
     before = counts.tolist()
     assert min(before) == 3
     calm = State(pose(s, "bent", 2).q, torch.zeros_like(failed.v))
     failed.q.copy_(calm.q)
     failed.v.copy_(calm.v)
-    report = s.step(failed)[1]
-    assert bool(report.converged.all())
+    assert bool(s.step(failed).converged.all())
     assert counts.tolist() == [1, 3]  # only the correction of the last step

@@ -41,12 +41,12 @@ def of_equilibrium(sim, scale):
 
 def of_state(sim, shift):
     rest = sim.rest_state()
-    return sim.step(State(rest.q + 1e-4 * shift, rest.v + shift))[0].v.sum()
+    return sim.step(State(rest.q + 1e-4 * shift, rest.v + shift)).v.sum()
 
 
 def of_clamp(sim, shift):
     held = sim.rest_positions[sim.fixed][None] + 1e-4 * shift
-    return sim.step(sim.rest_state(), Inputs(fixed_positions=held))[0].q.sum()
+    return sim.step(sim.rest_state(), Inputs(fixed_positions=held)).q.sum()
 
 
 CASES = [
@@ -57,7 +57,7 @@ CASES = [
     ((), lambda sim, scale: 0.0 * of_modulus(sim, scale)),
     ((FLOOR,), of_modulus),
     ((FLOOR,), of_state),
-    ((TENDON,), lambda sim, scale: sim.step(sim.rest_state(), Inputs(tendon_tension=0.3 * scale[None]))[0].q.sum()),
+    ((TENDON,), lambda sim, scale: sim.step(sim.rest_state(), Inputs(tendon_tension=0.3 * scale[None])).q.sum()),
 ]
 
 

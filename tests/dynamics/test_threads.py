@@ -105,7 +105,7 @@ def test_a_forked_process_uses_the_simulator(divisions, monkeypatch):
     batch = 4 if len(mesh.vertices) < 1000 else 1
 
     def motion():
-        return sim.step(sim.rest_state(batch))[0].q
+        return sim.step(sim.rest_state(batch)).q
 
     here = motion()
     (end, other), context = multiprocessing.Pipe(duplex=False), multiprocessing.get_context("fork")
@@ -150,4 +150,4 @@ def test_copies_of_bodies_states_and_motions(way):
     assert torch.equal(copied.q, motion.q)
     assert list(final.memory) == list(motion.final.memory)
     again = Simulator(body, sim.material)
-    torch.testing.assert_close(again.step(final)[0].q, sim.step(motion.final)[0].q, rtol=0.0, atol=1e-12)
+    torch.testing.assert_close(again.step(final).q, sim.step(motion.final).q, rtol=0.0, atol=1e-12)

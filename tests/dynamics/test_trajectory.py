@@ -107,8 +107,8 @@ def test_a_batch_of_one_needs_no_axis():
     force[TIP, 1] = 0.01
     rest, velocity = SIMULATOR.rest_positions, torch.full((20, 3), 0.01, dtype=torch.float64)
     velocity[SIMULATOR.fixed] = 0.0
-    bare, _ = SIMULATOR.step(SIMULATOR.state(rest, velocity), Inputs(force, tendon_tension=tension))
-    batched, _ = SIMULATOR.step(
+    bare = SIMULATOR.step(SIMULATOR.state(rest, velocity), Inputs(force, tendon_tension=tension))
+    batched = SIMULATOR.step(
         SIMULATOR.state(rest[None].numpy(), velocity[None]), Inputs(force[None], tendon_tension=tension[None])
     )
     assert torch.equal(bare.q, batched.q)

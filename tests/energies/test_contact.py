@@ -119,7 +119,7 @@ def test_forces_of_contact_balance_a_block_that_sticks_or_slides(integrator):
     start = State(start.q, start.v + vector([0.0, 0.0, 0.0], [0.02, 0.0, 0.0])[:, None])
     states = [start]
     for _ in range(30):
-        states.append(s.step(states[-1], None, given)[0])
+        states.append(s.step(states[-1], None, given))
     earlier, before, after = states[-3:]
     old, new = (s.contacts(*pair, None, given)["obstacles"] for pair in ((earlier, before), (before, after)))
     assert new.obstacles == ("obstacle",)
@@ -162,7 +162,7 @@ def test_friction_of_a_region_of_the_body():
     start = s.rest_state()
     states = [State(start.q, start.v + vector(0.5, 0.0, 0.0))]
     for _ in range(3):
-        states.append(s.step(states[-1])[0])
+        states.append(s.step(states[-1]))
     earlier, before, after = states[-3:]
     old, new = (s.contacts(*pair)["obstacles"] for pair in ((earlier, before), (before, after)))
     normal, friction = old.normal[0, :, 0, 2].numpy(), new.friction[0, :, 0].norm(dim=-1).numpy()
@@ -389,7 +389,7 @@ def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused():
     plate = Box(position=(0.01, 0.01, SIDE + 0.01), edges=(0.05, 0.05, thickness), moves=True)
     simulator = Simulator(Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
     still = torch.zeros(1, 1, dtype=torch.float64)
-    state, _ = simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=still))
+    state = simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=still))
     for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 6):
         with pytest.raises(InputError, match="'plate' pass through one another"):
             simulator.step(state, Inputs(obstacle_move_z=still - way))

@@ -118,7 +118,7 @@ def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
         residual = here.residual(x)
         here.update(x)
         product = here.product(torch.sin(50.0 * x))
-        end, _ = s.step(state, inputs, {"muscle_stiffness": stiffness})
+        end = s.step(state, inputs, {"muscle_stiffness": stiffness})
         leaves = [*inputs.actuation.values(), stiffness]
         results.append([residual, product, *torch.autograd.grad((end.q**2).sum() + end.q[..., 2].sum(), leaves)])
     for one, other in zip(*results, strict=True):

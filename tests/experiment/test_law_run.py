@@ -154,7 +154,7 @@ def test_weights_in_their_directions_at_their_places_hold_the_beam():
         state = initial_state(simulator, run.data, [all_trials(run)[name] for name in held])
         assert not state.v.any()
         still = State(state.q, torch.zeros_like(state.q))
-        balanced, released = (simulator.step(still, inputs)[0].q for inputs in (Inputs(force), Inputs()))
+        balanced, released = (simulator.step(still, inputs).q for inputs in (Inputs(force), Inputs()))
     moved = (released - state.q).abs().amax((1, 2))
     assert float(moved.min()) > 1e-4
     assert ((balanced - state.q).abs().amax((1, 2)) < 1e-4 * moved).all()

@@ -274,7 +274,7 @@ class TestWindows:
         for first in range(0, self.STEPS, self.WINDOW):
             state = State(windows.q[:, first], windows.v[:, first])
             for k in range(first, min(first + self.WINDOW, self.STEPS)):
-                state, _ = real.step(state, Inputs(model(state.q, state.v, None)))
+                state = real.step(state, Inputs(model(state.q, state.v, None)))
                 squares = (state.q - windows.q[:, k + 1]).square().sum((1, 2))
                 total = total + (squares * trials.loss_weight).sum()
         total.backward()

@@ -30,9 +30,9 @@ class Watched(Simulator):
     steps, iterations = 0, 0
 
     def step(self, *arguments):
-        new, report = super().step(*arguments)
-        Watched.steps, Watched.iterations = Watched.steps + 1, Watched.iterations + int(report.iterations.sum())
-        return new, report
+        new = super().step(*arguments)
+        Watched.steps, Watched.iterations = Watched.steps + 1, Watched.iterations + int(new.report.iterations.sum())
+        return new
 
 
 def counted(function, *arguments):

@@ -83,7 +83,7 @@ class TestGaussNewton:
         np.testing.assert_allclose(result.state.v.cpu(), speed, rtol=0, atol=1e-12)
         assert float(result.force.abs().max()) > 0.01
         assert not result.force[:, BODY.fixed_vertices].any()
-        replayed, _ = sim.step(on_device, Inputs(result.force))
+        replayed = sim.step(on_device, Inputs(result.force))
         np.testing.assert_allclose(replayed.q.cpu(), observed[1], rtol=0, atol=1e-12)
 
     @pytest.mark.parametrize(("regularisation", "most"), [(1e-8, 5), (1e-3, 14)])
@@ -133,7 +133,7 @@ class TestGaussNewton:
 
         def residuals(coefficients):
             force = basis @ torch.as_tensor(coefficients)
-            new, _ = sim.step(start, Inputs(force.view(1, 12, 3)))
+            new = sim.step(start, Inputs(force.view(1, 12, 3)))
             misfit = (markers(new.q) - markers(observed[1])).ravel()
             return np.concatenate([misfit, np.sqrt(regularisation) * force])
 
@@ -246,7 +246,7 @@ class TestLevenbergMarquardt:
         solver = make_reconstructor(sim, "levenberg_marquardt", 1e-5, 1e-10, 200, observation=markers)
         result = solver.step(start, target)
         force = result.force.clone().requires_grad_(True)
-        new, _ = sim.step(start, Inputs(force))
+        new = sim.step(start, Inputs(force))
         objective = (markers(new.q) - target).square().sum() + 1e-5 * force.square().sum()
         (gradient,) = torch.autograd.grad(objective, force)
         np.testing.assert_allclose(new.q.detach(), result.state.q, rtol=0, atol=1e-9)

@@ -1,7 +1,7 @@
 """Differentiable minimisation of an incremental potential, with an implicit adjoint."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,9 +24,10 @@ from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
 from ..linalg.threads import in_threads, threads_for
 from ..stepping.adjoints import AdjointFunction, first_derivatives
+from ..stepping.state import SolveReport
 from .assembly import BlockPattern
 from .hessian import ExactHessian
-from .nonlinear_solver import NonlinearSolver, SolveReport, SolverSettings
+from .nonlinear_solver import NonlinearSolver, SolverSettings
 
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
@@ -190,7 +191,7 @@ class _Solve:
             with threads_for(tensors[0][0].numel(), len(parts)):
                 results = in_threads(solve, parts)
         x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
-        self.report = SolveReport.of([report for _, report in results])
+        self.report = _joined([report for _, report in results])
         return x, self.report
 
 
@@ -246,6 +247,12 @@ class _Equilibrium(AdjointFunction):
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
     """Returns the values of some environments; values shared by all are returned unchanged."""
     return values if values is None or len(values) == 1 else values[rows]
+
+
+def _joined(reports: Sequence[SolveReport]) -> SolveReport:
+    """Returns the report of a batch from those of its shards."""
+    names = [item.name for item in fields(SolveReport)]
+    return SolveReport(*(torch.cat([getattr(report, name) for report in reports]) for name in names))
 
 
 def _join_gradients(value: torch.Tensor | None, slopes: tuple[torch.Tensor | None, ...]) -> torch.Tensor | None:

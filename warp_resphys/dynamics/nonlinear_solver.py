@@ -21,8 +21,7 @@ Kernels make all decisions for an environment (`minimiser`); the host launches t
 that does both.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
@@ -32,6 +31,7 @@ from ..energies.potential import IncrementalPotential
 from ..io.errors import ConvergenceError, InputError
 from ..kernels.minimisation import NEVER, Tolerances
 from ..linalg.choice import LINEAR_SOLVERS, make_linear_solver
+from ..stepping.state import SolveReport
 from .assembly import BlockPattern
 from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
 from .minimiser import Minimiser
@@ -76,27 +76,9 @@ class SolverSettings:
             raise InputError(f"solver.absolute_tolerance is {self.absolute_tolerance}: it must be zero or more.")
 
 
-@dataclass(frozen=True)
-class SolveReport:
-    """Outcome of a solve, by environment."""
-
-    iterations: torch.Tensor  # (B,) number of global steps
-    relative_residual: torch.Tensor  # (B,) last residual over balancing forces
-    converged: torch.Tensor  # (B,) bool
-    factorisations: torch.Tensor  # (B,) number of factorisations
-
-    @staticmethod
-    def of(shards: "Sequence[SolveReport]") -> "SolveReport":
-        """Returns the report of a batch from those of its shards."""
-        if len(shards) == 1:
-            return shards[0]
-        names = [item.name for item in fields(SolveReport)]
-        return SolveReport(*(torch.cat([getattr(report, name) for report in shards]) for name in names))
-
-
-def check_converged(settings: SolverSettings, report: SolveReport, positions: torch.Tensor) -> None:
+def check_converged(settings: SolverSettings, report: SolveReport | None, positions: torch.Tensor) -> None:
     """Raises ConvergenceError with the last positions (B, N, 3) if a solve failed and failures are not counted."""
-    if settings.on_failure != "raise" or bool(report.converged.all()):
+    if settings.on_failure != "raise" or report is None or bool(report.converged.all()):
         return
     worst = int((~report.converged).nonzero()[0])
     other = "or raise solver.max_iterations."

@@ -23,13 +23,13 @@ from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
 from ..stepping.quantity import Quantity
-from ..stepping.state import Constants, State
+from ..stepping.state import Constants, SolveReport, State
 from .assembly import BlockPattern
 from .energy_set import EnergySet
 from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
 from .mesh_error import CHECKED, warn_of_cells
-from .nonlinear_solver import SolveReport, SolverSettings, check_converged
+from .nonlinear_solver import SolverSettings, check_converged
 from .plausibility import warn_of_implausible
 from .statics import MOST_ITERATIONS, find_equilibrium, progress_of, settle
 from .trajectory import Trajectory
@@ -250,7 +250,7 @@ class Simulator:
         inputs: Inputs | None = None,
         parameters: Parameters | Constants | None = None,
         near: torch.Tensor | None = None,
-    ) -> tuple[State, SolveReport]:
+    ) -> State:
         """Advances a batch by one time step.
 
         If the state has the positions at the end of the last step, the solver starts from an extrapolation of the last
@@ -264,7 +264,7 @@ class Simulator:
                 parameters; they affect the result only within the solver's tolerance [m].
 
         Returns:
-            The new state, differentiable, and the solver's report.
+            The new state, differentiable, with the solver's report.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
@@ -273,22 +273,20 @@ class Simulator:
         inputs, constants = self._checked(state, inputs, parameters)
         if near is not None:
             check_tensor("near", near, tuple(state.q.shape), "m", "vertex", state.q)
-        new, report, x = self._advance(state, inputs, constants, near)
-        check_converged(self.settings, report, x)
-        return new, report
+        new = self._advance(state, inputs, constants, near)
+        check_converged(self.settings, new.report, new.q)
+        return new
 
-    def _advance(
-        self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None = None
-    ) -> tuple[State, SolveReport, torch.Tensor]:
-        """Returns the next state, and report and solution (B, N, 3) of its solve [m]."""
+    def _advance(self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None = None) -> State:
+        """Returns the next state, whose solve may have failed."""
         step, workspace = self._step(state, inputs, constants), self.workspace(state.batch)
         terms, clamped, follows = self._energies.step_terms(step), self._fixed_at(step), workspace.follows(state.q)
         start = step.stage.target if near is None else self.method.solution_for(state, near).detach()
         x, report = equilibrium(workspace, "dynamics", self.settings, terms, start, clamped, follows)
         x = self._coordinates.expand(x)
-        new = self._finish(step, x)
+        new = replace(self._finish(step, x), report=report)
         workspace.record_positions(new.q)
-        return new, report, x
+        return new
 
     def _step(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
         """Returns a time step from a state."""
@@ -544,23 +542,23 @@ class Simulator:
         inputs = self._fitted(inputs, state.batch)
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
-        states, reports, unchecked = [state], [], []
+        states, unchecked = [state], list[State]()
         together = 1 if state.q.device.type == "cpu" else _STEPS_TO_CHECK
         for t, current in enumerate(inputs.by_step(steps)):
             if t == 0:
                 self._checked(state, current, constants)
             elif current is not inputs:
                 self._check_inputs(current, state.batch)
-            state, report, x = self._advance(state, current, constants)
+            state = self._advance(state, current, constants)
             states.append(state)
-            reports.append(report)
-            unchecked.append((report, x))
+            unchecked.append(state)
             if len(unchecked) == together or t == steps - 1:
                 for solved in unchecked:
-                    check_converged(self.settings, *solved)
+                    check_converged(self.settings, solved.report, solved.q)
                 unchecked.clear()
         q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
         obstacles = self.obstacle_motions(states, constants)
+        reports = [after.report for after in states if after.report is not None]
         return Trajectory(q, v, reports, state, self.body, self.time_step, obstacles)
 
     def _checked(

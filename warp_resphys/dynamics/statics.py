@@ -10,7 +10,7 @@ import torch
 from ..energies.potential import IncrementalPotential
 from ..io.errors import ConvergenceError
 from ..io.progress import QUIET_SECONDS, Progress
-from .nonlinear_solver import SolveReport
+from ..stepping.state import SolveReport
 
 log = logging.getLogger(__name__)
 

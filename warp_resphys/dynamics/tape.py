@@ -22,8 +22,7 @@ import warp as wp
 
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
-from ..stepping.state import State
-from .nonlinear_solver import SolveReport
+from ..stepping.state import SolveReport, State
 from .simulator import Simulator
 
 _VECTOR_INPUTS = ("external_force", "fixed_positions")

@@ -14,8 +14,7 @@ from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create
 from ..mesh.motion_files import write_vtk
 from ..stepping.inputs import shapes
-from ..stepping.state import State
-from .nonlinear_solver import SolveReport
+from ..stepping.state import SolveReport, State
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
         acting = resting if replay.is_static else inputs.at(middle + k)
         begin = time.perf_counter()
         with torch.no_grad():
-            target = simulator.step(state, acting if method is None else acting.plus(support), constants)[0]
+            target = simulator.step(state, acting if method is None else acting.plus(support), constants)
         if method is not None:
             begin = time.perf_counter()
             target = method.step(state, replay.observe(target.q), acting).state.detach()

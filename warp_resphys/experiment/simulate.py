@@ -218,7 +218,7 @@ def played(
             share = (i - 0.5 * (simulator.integrator == "midpoint")) / substeps
             at = number * substeps + i
             inputs = inputs_at(number, share).replace(**{name: own[at] for name, own in moving.items()})
-            state = simulator.step(state, inputs, constants)[0]
+            state = simulator.step(state, inputs, constants)
         yield state
 
 

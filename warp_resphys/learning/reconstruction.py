@@ -173,7 +173,7 @@ class LBFGSB(Reconstructor):
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
             force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
-            end = sim.step(state, acting.plus(free * force), self._constants)[0].q
+            end = sim.step(state, acting.plus(free * force), self._constants).q
             residual = self.observation.residual(self.observation(end), observed)
             misfit = (free * residual if whole else residual).square().sum()
             value = misfit + self.regularisation * force.square().sum()
@@ -199,7 +199,7 @@ class LBFGSB(Reconstructor):
             )
         force = free * sim.tensor(result.x.reshape(like.shape))
         with torch.no_grad():
-            new, _ = sim.step(state, acting.plus(force), self._constants)
+            new = sim.step(state, acting.plus(force), self._constants)
         return Reconstruction(new, force, int(result.nit))
 
 

@@ -219,7 +219,7 @@ class MarkerForceProblem(StepProblem):
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
         try:
-            end = self.simulator.step(self.state, self.inputs.plus(x), self.constants)[0].q
+            end = self.simulator.step(self.state, self.inputs.plus(x), self.constants).q
         except ConvergenceError:
             return Point(x, x.new_full((len(x),), torch.inf), (self.state.q,))
         value = self.missing(end).square().sum((1, 2)) + self.weight * x.square().sum((1, 2))

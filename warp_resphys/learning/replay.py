@@ -254,7 +254,7 @@ class Replay:
         for k in range(self.steps(start)):
             state = state if windows is None else windows.begin(state, k)
             added = None if force is None else force(state, k)
-            state, _ = self.simulator.step(state, inputs.at(k).plus(added), constants)
+            state = self.simulator.step(state, inputs.at(k).plus(added), constants)
             series.append(self.observe(state.q))
         return torch.stack(series, 1)
 
@@ -281,10 +281,10 @@ class Replay:
         """Returns the next state, without the prediction if the solver fails from there."""
         if near is not None:
             try:
-                return self.simulator.step(state, inputs, constants, near)[0]
+                return self.simulator.step(state, inputs, constants, near)
             except ConvergenceError as error:
                 log.debug("the step is solved again without a prediction: %s", error)
-        return self.simulator.step(state, inputs, constants)[0]
+        return self.simulator.step(state, inputs, constants)
 
     def _observed(self, positions: Iterable[torch.Tensor]) -> torch.Tensor:
         """(B, K, M, 3) points at K positions (B, N, 3) [m], `_AT_ONCE` in a call, which is mostly overhead."""

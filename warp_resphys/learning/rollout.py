@@ -94,8 +94,8 @@ class Rollout:
             if inputs.fixed_positions is not None:
                 idle["fixed_positions"] = torch.where(failed[:, None, None], rest, inputs.fixed_positions)
             inputs = inputs.replace(**idle)
-        new, report = self.simulator.step(state, inputs.plus(force), self._constants)
-        return new, failed | ~report.converged
+        new = self.simulator.step(state, inputs.plus(force), self._constants)
+        return new, failed | ~new.converged
 
     def _reset(self, state: State, lost: torch.Tensor) -> State:
         """Returns the state with its lost environments at rest."""

@@ -194,8 +194,8 @@ class RobotScene:
                 if own.fixed_positions is None and len(body.fixed_vertices):
                     places = self.simulator.rest_positions[first + body.fixed_vertices]
                     by_body[name] = own.replace(fixed_positions=places.expand(state.body.batch, -1, -1))
-        new, report = self.simulator.step(state.body, self.scene.inputs(by_body), self.constants)
-        lost = state.lost | ~report.converged
+        new = self.simulator.step(state.body, self.scene.inputs(by_body), self.constants)
+        lost = state.lost | ~new.converged
         if bool(lost.any()):
             rest = self.simulator.rest_state(state.body.batch)
             new = RobotState(rest).where(lost, RobotState(new)).body

@@ -13,6 +13,16 @@ _MEMORY = "memory."  # prefix of memory variables among the tensors of a state
 
 
 @dataclass(frozen=True)
+class SolveReport:
+    """Outcome of the solve of a time step, by environment."""
+
+    iterations: torch.Tensor  # (B,) number of global steps
+    relative_residual: torch.Tensor  # (B,) last residual over balancing forces
+    converged: torch.Tensor  # (B,) bool
+    factorisations: torch.Tensor  # (B,) number of factorisations
+
+
+@dataclass(frozen=True)
 class State:
     """Positions and velocities of a batch, and the memory variables of its energies."""
 
@@ -21,6 +31,7 @@ class State:
     previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, for BDF2
     # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    report: SolveReport | None = field(default=None, compare=False)  # of the step that led here; None for other states
 
     def __repr__(self) -> str:
         """Shapes of the tensors."""
@@ -30,6 +41,13 @@ class State:
     def batch(self) -> int:
         """Number of environments B."""
         return self.q.shape[0]
+
+    @property
+    def converged(self) -> torch.Tensor:
+        """(B,) whether the step that led here has converged; true for states that no step led to."""
+        if self.report is None:
+            return torch.ones(self.batch, dtype=torch.bool, device=self.q.device)
+        return self.report.converged
 
     def check(self, vertices: int, like: torch.Tensor) -> None:
         """Raises InputError for a wrong shape, dtype or device, or values that are not finite; not for the memory."""

@@ -5,7 +5,7 @@ from .data.camera import PlacedCamera as PlacedCamera
 from .data.markers import Markers as Markers
 from .data.markers import Observation as Observation
 from .data.markers import bind_markers as bind_markers
-from .data.recordings.reading import read_recording as read_recording
+from .data.recordings.recording_files import read_recording as read_recording
 from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator
 from .dynamics.tape import record_rollout as record_rollout

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from support.command_line import outcome
 from warp_resphys.data.base_motion import since_first
-from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.settings.trials import BagSettings
 

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.data.recordings.segment import read_published_segment
 from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError, InputError

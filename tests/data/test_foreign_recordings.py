@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from support.command_line import outcome, refusal
-from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.settings.trials import TableSettings

@@ -4,15 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_resphys.data.recordings.processing import (
-    Release,
-    fill_gaps,
-    find_release,
-    release_of,
-    resample,
-    trim_to_release,
-)
-from warp_resphys.data.recordings.quality import (
+from warp_resphys.data.recordings.marker_quality import (
     check_base,
     compare_base,
     find_jumps,
@@ -20,6 +12,14 @@ from warp_resphys.data.recordings.quality import (
     noise_level,
     quality,
     quality_table,
+)
+from warp_resphys.data.recordings.processing import (
+    Release,
+    fill_gaps,
+    find_release,
+    release_of,
+    resample,
+    trim_to_release,
 )
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.io.errors import DataFileError, InputError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from warp_resphys.data.recordings.reading import read_recording, write_recording
+from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.settings.trials import TableSettings

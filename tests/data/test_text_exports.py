@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.command_line import outcome, refusal
-from warp_resphys.data.recordings.reading import read_recording
+from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.io.errors import DataFileError
 
 FRAMES, TIME = np.arange(1, 31), np.arange(30) / 100.0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.recordings.processing import valve_opening
-from warp_resphys.data.recordings.reading import read_recording
 from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.data.recordings.segment import (
     CLAMP_LABELS,
     MARKERS,

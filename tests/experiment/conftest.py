@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from warp_resphys.data.recordings import reading as arrays
+from warp_resphys.data.recordings import recording_files as arrays
 
 
 @pytest.fixture(scope="session")

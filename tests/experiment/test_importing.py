@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, settings
-from warp_resphys.data.recordings.reading import read_recording, write_recording
 from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run

@@ -14,7 +14,7 @@ from support.configured import check, composed, settings
 from support.main_job import finish, without_reports
 from support.segment_run import TRACKED, place_segment
 from warp_resphys import pipeline
-from warp_resphys.data.recordings.reading import read_recording, write_recording
+from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.configured import settings
-from warp_resphys.data.recordings.reading import read_recording, write_recording
+from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.rigid_bodies import angles, motion_between
 from warp_resphys.experiment.files import DATASET, TRUTH, read_dataset
 from warp_resphys.io.errors import DataFileError, InputError

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from warp_resphys.data.recordings.quality import quality_table
+from warp_resphys.data.recordings.marker_quality import quality_table
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import write_json
 from warp_resphys.io.settings import parse

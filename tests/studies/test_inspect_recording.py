@@ -6,10 +6,10 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from support.command_line import settings_of
+from warp_resphys.data.recordings.marker_quality import quality
 from warp_resphys.data.recordings.processing import Release
-from warp_resphys.data.recordings.quality import quality
-from warp_resphys.data.recordings.reading import write_recording
 from warp_resphys.data.recordings.recording import Recording
+from warp_resphys.data.recordings.recording_files import write_recording
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.studies.inspection import Inspection
 from warp_resphys.studies.recording_quality import inspect_recording, recording_quality

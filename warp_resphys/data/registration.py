@@ -241,6 +241,14 @@ def _pick(names: Sequence[str], chosen: BoolArray) -> list[str]:
     return [name for name, here in zip(names, chosen, strict=True) if here]
 
 
+def unit_vector(axis: str | Sequence[float]) -> FloatArray:
+    """Returns the unit vector (3,) of an axis, such as ``x`` or ``-x``, or along a vector (3,)."""
+    if isinstance(axis, str):
+        return np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0)
+    vector = np.asarray(axis, dtype=np.float64)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
 def axes_rotation(axes: Sequence[str]) -> FloatArray:
     """Rotation (3, 3) from the frame of the recording to that of the body.
 
@@ -251,8 +259,7 @@ def axes_rotation(axes: Sequence[str]) -> FloatArray:
     Raises:
         InputError: an axis twice, or axes of a mirror image.
     """
-    rows = [np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0) for axis in axes]
-    rotation = np.array(rows)
+    rotation = np.stack([unit_vector(axis) for axis in axes])
     if np.linalg.matrix_rank(rotation) < 3:
         raise InputError(f"the axes ({', '.join(axes)}) name one axis twice: each of x, y and z must be there once.")
     if np.linalg.det(rotation) < 0.0:

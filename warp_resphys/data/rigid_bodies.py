@@ -37,7 +37,7 @@ def with_corners(recording: Recording, lengths: Mapping[str, float]) -> Recordin
     """Adds the four points of rigid bodies to a recording.
 
     Args:
-        recording: has a position and three points on the axes of a rigid body, as `to_recording` returns them.
+        recording: has a position and three points on the axes of a rigid body, as `in_metres` returns them.
         lengths: L of the rigid bodies by name [m].
 
     Raises:

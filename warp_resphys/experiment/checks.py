@@ -36,7 +36,7 @@ from .actuators import Drive, check_drive, drive_of
 from .build import build_body, build_material, build_simulator
 from .experiment import LAW
 from .identify import ELASTIC
-from .recordings.checks import check_recorded
+from .recordings.recorded_checks import check_recorded
 from .shapes import check_shape
 from .simulate import substeps_of, target_settings, vertices_in
 from .trials import split_of, trials_of

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from ..data.base_motion import in_frame, rigid
 from ..data.input_response import draw_inputs, wave_inputs
-from ..data.recordings.reading import write_recording
 from ..data.recordings.recording import ARM, Recording
-from ..data.registration import RigidTransform
+from ..data.recordings.recording_files import write_recording
+from ..data.registration import RigidTransform, unit_vector
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
@@ -33,7 +33,6 @@ from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
 from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
-from .recordings.reading import vertical
 from .simulate import distributed, played, substeps_of, target_settings, true_motions
 
 _LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
@@ -194,7 +193,7 @@ def make_setup(settings: PlayedSettings) -> Setup:
     laboratory, binding = settings.laboratory, settings.binding
     draw = np.random.default_rng([settings.seed, 0])
     gravity = np.asarray(settings.gravity, dtype=np.float64)
-    up = vertical(settings.data.up)
+    up = None if settings.data.up is None else unit_vector(settings.data.up)
     rotation = Rotation.random(random_state=draw)
     heading, turn = draw.uniform(0.0, 2.0 * np.pi, 2)
     strength = float(np.linalg.norm(gravity))

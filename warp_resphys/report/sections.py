@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..data.recordings.quality import QUALITY_COLUMNS, quality_table
+from ..data.recordings.marker_quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
 from ..settings.run import RunSettings

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from ..data.recordings.bag import is_bag
-from ..data.recordings.reading import READERS
+from ..data.recordings.recording_files import READERS
 from ..dynamics.mesh_error import NOTICED
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated

@@ -15,8 +15,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from ..data.recordings.bag import is_bag
-from ..data.recordings.processing import fill_gaps, release_of
-from ..data.recordings.quality import (
+from ..data.recordings.marker_quality import (
     QUALITY_COLUMNS,
     MarkerQuality,
     Quality,
@@ -25,8 +24,9 @@ from ..data.recordings.quality import (
     quality,
     quality_table,
 )
-from ..data.recordings.reading import READERS, read_recording, write_recording
+from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.recording import Recording
+from ..data.recordings.recording_files import READERS, read_recording, write_recording
 from ..io.atomic import atomic_path
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import write_json

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..data.recordings.reading import read_recording
+from ..data.recordings.recording_files import read_recording
 from ..data.registration import RigidTransform, register_markers
 from ..data.rigid_bodies import as_markers, with_corners
 from ..io.arrays import FloatArray

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, ResphysError, did_you_mean
 from ...settings.trials import BagSettings
-from .recording import SI_PER_ACTUATION_UNIT, RawRecording
+from ..base_motion import since_first
+from .recording import SI_PER_ACTUATION_UNIT, Recording
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
 _GAP = 2.5  # frames: a marker without messages for longer is not seen
@@ -38,12 +39,12 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(path: Path) -> str:
-    """Returns the topics of a bag and the types of their messages, for a sentence; raises errors as `read_raw_bag`."""
+    """Returns the topics of a bag and the types of their messages, for a sentence; raises errors as `read_bag`."""
     with _opened(path) as reader:
         return ", ".join(sorted(f"{one.topic} ({one.msgtype})" for one in reader.connections)) or "no topic"
 
 
-def read_raw_bag(path: Path, bag: BagSettings) -> RawRecording:
+def read_bag(path: Path, bag: BagSettings) -> Recording:
     """Reads the named topics of a bag.
 
     Args:
@@ -85,13 +86,14 @@ def read_raw_bag(path: Path, bag: BagSettings) -> RawRecording:
     for source in inputs:
         own, values = source.series(late)
         held.append(values[np.clip(np.searchsorted(own, times, side="right") - 1, 0, None), 0])
-    return RawRecording(
+    poses = None if base is None else _at_frames(*base.series(late), times, rate)
+    return Recording(
+        (*bag.markers,),
         moved[..., :3],
-        [*bag.markers],
-        "m",
         rate,
+        path,
         np.stack(held, 1) * factors if held else None,
-        base=None if base is None else _at_frames(*base.series(late), times, rate),
+        base=None if poses is None else since_first(poses[:, :3], poses[:, 3:], path),
         turns=moved[..., 3:] if np.isfinite(moved[..., 3:]).any() else None,
     )
 

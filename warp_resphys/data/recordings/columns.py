@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ...io.arrays import FloatArray, IntArray
 from ...io.errors import DataFileError
 from ...io.text import Rows, number
-from .recording import RawRecording
+from .recording import Recording
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class Layout:
     planar: bool = False
     turn: Turn = QUATERNION
 
-    def read(self, rows: Rows, path: Path) -> RawRecording:
+    def read(self, rows: Rows, path: Path) -> Recording:
         """Reads the recording from all lines of a file."""
         markers, chosen, turned = self._markers(path)
         others = [column for columns in turned.values() for column in columns]
@@ -118,9 +118,11 @@ class Layout:
             except ValueError as error:
                 raise DataFileError(f"{path}: {markers[marker]} has a row that is no rotation ({error}).") from error
         timed = self.seconds is not None
-        return RawRecording(
-            *(positions, markers, self.unit, measured_rate if timed else self.rate, actuation),
+        rate = measured_rate if timed else self.rate
+        return Recording(
+            *(tuple(markers), positions, np.nan if rate is None else rate, path, actuation),
             start=float(stamps[0]) if timed else 0.0,
+            unit=self.unit or "",
             turns=turns if turned else None,
         )
 

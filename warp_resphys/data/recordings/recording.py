@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from ...io.arrays import BoolArray, FloatArray
 from ...io.errors import DataFileError, InputError, listed, number_of
-from ..base_motion import since_first
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +35,11 @@ RATES = (1e-3, 1e6)  # [Hz]
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Positions of markers over time."""
+    """Positions of markers over time.
+
+    The reader of a file returns lengths in the unit of the file, and what the file does not say as no labels, a rate of
+    NaN, or no unit; `in_metres` returns the recording that others read.
+    """
 
     labels: tuple[str, ...]  # Names of the M markers
     positions: FloatArray  # (T, M, 3) [m], NaN where a marker is occluded
@@ -51,6 +54,9 @@ class Recording:
     start: float = 0.0  # Time of the first frame [s]; after `trim_to_release`, since the release
     # (T, 6) motions of obstacles, if recorded; see `data.obstacle_motion`
     obstacles: Mapping[str, FloatArray] = dataclasses.field(default_factory=dict)
+    unit: str = "m"  # of positions and rest
+    # (T, M, 4) quaternions, w first, of those markers that are rigid bodies; NaN for others; None after `in_metres`
+    turns: FloatArray | None = None
 
     @property
     def seen(self) -> BoolArray:
@@ -87,23 +93,6 @@ class Recording:
         return dataclasses.replace(self, positions=positions, actuation=actuation, base=base, obstacles=obstacles)
 
 
-@dataclasses.dataclass(frozen=True)
-class RawRecording:
-    """Content of a file, in its own units; None for missing values."""
-
-    positions: FloatArray  # (T, M, 3) [unit]
-    labels: Sequence[str] | None  # M names
-    unit: str | None  # m, cm or mm
-    rate: float | None  # [Hz]
-    actuation: FloatArray | None = None  # (T, C) [Pa, N or 1]
-    rest: FloatArray | None = None  # (M, 3) [unit]
-    # (T, 7) position of a point of the base [m], and quaternion of its rotation, w first
-    base: FloatArray | None = None
-    start: float = 0.0  # Time of the first frame [s]
-    # (T, M, 4) quaternions, w first, of those markers that are rigid bodies; NaN for others
-    turns: FloatArray | None = None
-
-
 def length_unit(text: str) -> str:
     """Returns m, cm or mm for a name of theirs in any case (Meters, MM), else the text; without blanks and zeros."""
     word = text.replace("\0", " ").strip()
@@ -119,107 +108,113 @@ def without_subject(labels: Sequence[str]) -> list[str]:
     return [label.rpartition(":")[2] if label in named else label for label in labels]
 
 
-def hide_zeros(raw: RawRecording, path: Path) -> RawRecording:
+def hide_zeros(recording: Recording) -> Recording:
     """Replaces positions at exactly (0, 0, 0), which some programs write for occlusions, by NaN, with a warning."""
-    zero = (raw.positions == 0.0).all(axis=2)
-    if raw.turns is not None:
-        zero &= ~np.isfinite(raw.turns).all(axis=2)
+    zero = (recording.positions == 0.0).all(axis=2)
+    if recording.turns is not None:
+        zero &= ~np.isfinite(recording.turns).all(axis=2)
     if zero.any():
-        names = [label for label, hidden in zip(raw.labels or (), zero.T, strict=False) if hidden.any()]
+        names = [label for label, hidden in zip(recording.labels, zero.T, strict=False) if hidden.any()]
         log.warning(
             "%s: %s at exactly (0, 0, 0) read as occluded, of %s.",
-            *(path.name, number_of(int(zero.sum()), "position"), listed(names)),
+            *(recording.source.name, number_of(int(zero.sum()), "position"), listed(names)),
         )
-    return dataclasses.replace(raw, positions=np.where(zero[..., None], np.nan, raw.positions))
+    return dataclasses.replace(recording, positions=np.where(zero[..., None], np.nan, recording.positions))
 
 
-def to_recording(
-    raw: RawRecording,
-    path: Path,
-    units: str | None = None,
-    rate: float | None = None,
-    labels: Sequence[str] | None = None,
+def in_metres(
+    recording: Recording, units: str | None = None, rate: float | None = None, labels: Sequence[str] | None = None
 ) -> Recording:
-    """Converts the content of a file to metres and seconds, and checks it.
+    """Converts the content of a file to metres, names its markers, and checks it.
 
-    Arguments, described in `reading.read_recording`, take precedence over the file. A marker without a name becomes
-    `marker 3`, markers with one name become `name #1`, `name #2` and so on. A rigid body becomes four markers: its
-    position, and the points `name +x`, `name +y` and `name +z` at 50 mm along its axes.
+    Arguments, described in `recording_files.read_recording`, take precedence over the file. A marker without a name
+    becomes `marker 3`, markers with one name become `name #1`, `name #2` and so on. A rigid body becomes four markers:
+    its position, and the points `name +x`, `name +y` and `name +z` at 50 mm along its axes.
 
     Raises:
         DataFileError: The unit or the rate is missing or unknown, an array has the wrong shape, or the positions are
             too large or too small for the unit.
         InputError: The unit, rate or list of names in the arguments is invalid.
     """
+    path = recording.source
     if units is not None and length_unit(units) not in METRES_PER_UNIT:
         raise InputError(f"units is {units!r}: set it to m, cm or mm, the unit of {path}.")
     if rate is not None and not RATES[0] <= rate <= RATES[1]:
         raise InputError(f"rate is {rate!r}: set it to the frames a second of {path}.")
-    shape = raw.positions.shape
-    if len(shape) != 3 or shape[2] != 3 or 0 in shape:
-        raise DataFileError(
-            f"{path} holds no marker trajectories: positions must be (frames, markers, 3), not {shape}."
-        )
-    unit, rate = length_unit((raw.unit if units is None else units) or ""), raw.rate if rate is None else rate
+    _check_shapes(recording)
+    unit, rate = length_unit(recording.unit if units is None else units), recording.rate if rate is None else rate
     lacks, cures = list[str](), list[str]()
     if unit not in METRES_PER_UNIT:
         lacks.append(f"gives positions in '{unit}'" if unit else "does not say in which unit its positions are")
         cures.append("units to m, cm or mm (data.units=mm, recording.units=mm)")
-    if rate is None or not RATES[0] <= rate <= RATES[1]:
-        lacks.append(f"gives a frame rate of {rate} Hz" if rate else "does not say how many frames a second it has")
+    if not RATES[0] <= rate <= RATES[1]:
+        said = f"gives a frame rate of {rate} Hz" if rate and rate == rate else None
+        lacks.append(said or "does not say how many frames a second it has")
         cures.append("rate in Hz (data.rate=100, recording.rate=100)")
-    if lacks or rate is None:
+    if lacks:
         raise DataFileError(f"{path} {' and '.join(lacks)}: set {' and '.join(cures)}, or export it with them.")
-    names = _names(raw, path, labels)
-    factor = METRES_PER_UNIT[unit]
-    positions = np.ascontiguousarray(raw.positions, dtype=np.float64) * factor
+    positions, rest = (
+        None if points is None else np.ascontiguousarray(points, dtype=np.float64) * METRES_PER_UNIT[unit]
+        for points in (recording.positions, recording.rest)
+    )
+    assert positions is not None
     positions[~np.isfinite(positions).all(axis=2)] = np.nan
-    rest = None if raw.rest is None else np.asarray(raw.rest, dtype=np.float64) * factor
-    if rest is not None and rest.shape != shape[1:]:
-        raise DataFileError(f"{path}: rest has the shape {rest.shape} where {shape[1:]} is needed.")
-    driven = raw.actuation
-    if driven is not None and (driven.ndim != 2 or len(driven) != len(positions)):
+    named = dataclasses.replace(
+        recording, labels=_names(recording, labels), positions=positions, rest=rest, rate=float(rate), unit="m"
+    )
+    named = _with_arms(named)
+    _check_span(named)
+    return named
+
+
+def _check_shapes(recording: Recording) -> None:
+    """Refuses arrays that do not belong to each other, and inputs or times that are not finite."""
+    path, shape, driven = recording.source, recording.positions.shape, recording.actuation
+    if len(shape) != 3 or shape[2] != 3 or 0 in shape:
         raise DataFileError(
-            f"{path}: actuation has the shape {driven.shape}; it needs a row for each of the {len(positions)} frames."
+            f"{path} holds no marker trajectories: positions must be (frames, markers, 3), not {shape}."
+        )
+    if recording.rest is not None and recording.rest.shape != shape[1:]:
+        raise DataFileError(f"{path}: rest has the shape {recording.rest.shape} where {shape[1:]} is needed.")
+    if driven is not None and (driven.ndim != 2 or len(driven) != shape[0]):
+        raise DataFileError(
+            f"{path}: actuation has the shape {driven.shape}; it needs a row for each of the {shape[0]} frames."
         )
     if driven is not None and not np.isfinite(driven).all():
         raise DataFileError(f"{path}: an actuation is NaN or infinite; every frame needs one.")
-    if not np.isfinite(raw.start):
-        raise DataFileError(f"{path}: its first frame is at {raw.start} s: give the time of each frame, or no start.")
-    if raw.turns is not None:
-        names, positions, rest = _with_arms(names, positions, rest, raw.turns, path)
-    seen = positions[np.isfinite(positions).all(axis=2)]
+    if not np.isfinite(recording.start):
+        raise DataFileError(
+            f"{path}: its first frame is at {recording.start} s: give the time of each frame, or no start."
+        )
+
+
+def _check_span(recording: Recording) -> None:
+    """Refuses positions in a wrong unit, or none."""
+    seen = recording.positions[recording.seen]
     if not len(seen):
-        raise DataFileError(f"{path}: no marker is seen in any frame; check how it was exported.")
+        raise DataFileError(f"{recording.source}: no marker is seen in any frame; check how it was exported.")
     with np.errstate(over="ignore"):
         span = float(np.ptp(seen, axis=0).max())
-    if not LEAST_SPAN <= span <= LARGEST_SPAN:  # as in a wrong unit
+    if not LEAST_SPAN <= span <= LARGEST_SPAN:
         size = f"all markers lie within {1e3 * span:.2g} mm" if span < LEAST_SPAN else f"markers span {span:.3g} m"
         raise DataFileError(
-            f"{path}: {size}, which no recording of a robot does; check the unit of its positions and set units to it "
-            "(m, cm or mm)."
+            f"{recording.source}: {size}, which no recording of a robot does; check the unit of its positions and set "
+            "units to it (m, cm or mm)."
         )
-    base = None
-    if raw.base is not None:
-        if raw.base.shape != (len(positions), 7):
-            raise DataFileError(
-                f"{path}: base has the shape {raw.base.shape}; it needs a place and a quaternion (w, x, y, z) for each "
-                f"of the {len(positions)} frames."
-            )
-        base = since_first(raw.base[:, :3], raw.base[:, 3:], path)
-    return Recording(names, positions, float(rate), path, driven, rest, base, raw.start)
 
 
-def _with_arms(
-    names: tuple[str, ...], positions: FloatArray, rest: FloatArray | None, turns: FloatArray, path: Path
-) -> tuple[tuple[str, ...], FloatArray, FloatArray | None]:
-    """Adds the points on the axes of rigid bodies, with unknown rest positions."""
+def _with_arms(recording: Recording) -> Recording:
+    """Adds the points on the axes of rigid bodies, with unknown rest positions, in place of the quaternions."""
+    names, positions, rest = recording.labels, recording.positions, recording.rest
+    turns, path = recording.turns, recording.source
+    if turns is None:
+        return recording
     if turns.shape != (*positions.shape[:2], 4):
         raise DataFileError(
             f"{path}: its quaternions have the shape {turns.shape}; each marker in each frame needs (w, x, y, z), NaN "
             "for one that is no rigid body."
         )
-    size = np.where(np.isfinite(positions).all(axis=2), np.linalg.norm(turns, axis=2), np.nan)
+    size = np.where(recording.seen, np.linalg.norm(turns, axis=2), np.nan)
     wrong = np.abs(size - 1.0) > _QUATERNION_ERROR
     if wrong.any():
         frame, column = np.argwhere(wrong)[0]
@@ -239,16 +234,15 @@ def _with_arms(
             raise DataFileError(f"{path}: a marker is named {taken[0]!r}, as a point of a rigid body is: rename it.")
         names = (*names, *new)
         rest = None if rest is None else np.concatenate([rest, np.full((3, 3), np.nan)])
-    return names, positions, rest
+    return dataclasses.replace(recording, labels=names, positions=positions, rest=rest, turns=None)
 
 
-def _names(raw: RawRecording, path: Path, given: Sequence[str] | None) -> tuple[str, ...]:
+def _names(recording: Recording, labels: Sequence[str] | None) -> tuple[str, ...]:
     """Returns M distinct names."""
-    markers = raw.positions.shape[1]
-    if given is not None and len(given) != markers:
-        raise InputError(f"labels has {len(given)} names; {path} has {markers} markers: name each of them.")
-    names = raw.labels if given is None else given
-    names = [""] * markers if names is None else names
+    path, markers = recording.source, recording.positions.shape[1]
+    if labels is not None and len(labels) != markers:
+        raise InputError(f"labels has {len(labels)} names; {path} has {markers} markers: name each of them.")
+    names = (recording.labels if labels is None else labels) or [""] * markers
     if len(names) != markers:
         raise DataFileError(f"{path} has {markers} markers and {len(names)} labels: export it with a label for each.")
     names = [str(name).strip() or f"marker {number}" for number, name in enumerate(names, start=1)]

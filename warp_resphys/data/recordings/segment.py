@@ -13,8 +13,8 @@ import numpy as np
 from ...io.errors import DataFileError
 from ...io.files import read_arrays
 from .processing import valve_opening
-from .reading import numbers, write_recording
-from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, to_recording
+from .recording import SI_PER_ACTUATION_UNIT, Recording, in_metres
+from .recording_files import numbers, write_recording
 
 CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
 TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
@@ -46,7 +46,7 @@ def read_published_segment(path: str | Path) -> dict[int, Recording]:
     if not np.isfinite(pressure).all() or len({*np.rint(pressure).tolist()}) < len(pressure):
         raise DataFileError(f"{path}: 'pressure_mbar' is not finite, or two trials have the same pressure, to a mbar.")
     for mbar, frames in zip(pressure.tolist(), markers[:, :, list(MARKERS)], strict=True):
-        recording = mask_repeats(to_recording(RawRecording(frames, SEGMENT_LABELS, "m", rate.item()), path))
+        recording = mask_repeats(in_metres(Recording(SEGMENT_LABELS, frames, rate.item(), path)))
         recording = replace(recording, start=-valve_opening(recording, TIP_LABELS))
         opened = recording.time >= 0.0
         step = np.where(opened, mbar * SI_PER_ACTUATION_UNIT["mbar"], 0.0)[:, None]  # (T, 1) [Pa]

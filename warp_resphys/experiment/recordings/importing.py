@@ -14,20 +14,18 @@ import numpy as np
 
 from ...data.base_motion import at_times, check_steps
 from ...data.input_response import NO_INPUT
+from ...data.recordings.marker_quality import quality
 from ...data.recordings.processing import smooth
-from ...data.recordings.quality import quality
-from ...data.registration import root_mean_square
+from ...data.registration import root_mean_square, unit_vector
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, number_of
 from ...io.files import write_json
 from ...io.stages import StageContext
-from ...settings.stages import StageSettings
 from ..build import bound_markers
 from ..files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
 from ..trials import evenly
-from .observing import Observed, Observer
-from .reading import vertical
+from .registered_trials import RegisteredTrials
 
 log = logging.getLogger(__name__)
 
@@ -43,29 +41,28 @@ def import_recordings(context: StageContext) -> None:
         DataFileError: a recording cannot be read or used; the message names the file and the marker.
         InputError: a configured value is invalid.
     """
-    observer, settings = Observer(context), context.settings
-    observed = observer.observe(settings.trials)
-    drive, limit = observer.drive, settings.data.input_limit
-    driven = [x.driven for x in observed if x.driven is not None]
-    if drive is not None and limit is not None and any(len(inputs) > 1 for inputs in driven):
-        highest = max(float(np.abs(inputs).max()) for inputs in driven)
-        if highest < NO_INPUT * limit:  # as in a wrong unit
-            raise DataFileError(
-                f"the {drive.quantity.plural} of all {len(driven)} recordings stay below {highest:.3g} "
-                f"{drive.quantity.unit}, and data.input_limit is {limit:.3g} {drive.quantity.unit}: give their unit in "
-                "the files (actuation_units, or the header of the column), or set the limit to the robot's maximum."
-            )
-    if text := sessions_text({x.settings.name: x.raw.rate for x in observed}, [x.settings.session for x in observed]):
+    recorded = RegisteredTrials(context)
+    _check_input_unit(recorded)
+    names, sessions = [trial.name for trial in recorded.trials], [trial.session for trial in recorded.trials]
+    if text := sessions_text({n: r.rate for n, r in zip(names, recorded.measured, strict=True)}, sessions):
         log.warning("import: %s", text)
-    training = [x.settings.name for x in observed] if settings.learned is None else settings.learned
-    offsets = _offsets(observer, observed)
-    bound = _bound(observer, observed, offsets, training)
-    bound_markers(observer.markers, observer.simulator.body.mesh, bound, observer.tracked)  # Refuses a far marker.
-    mountings = _mountings(observer, observed, bound, offsets, training)
-    verticals, gravity = _verticals(observed, settings)
-    shifts = _shifts(observer, observed, bound, offsets)
-    _dataset(observer, observed, bound, shifts, gravity).write(context.run_dir / DATASET)
-    _write_quality(context, observer, observed, shifts, verticals, gravity, mountings)
+    training = names if recorded.settings.learned is None else recorded.settings.learned
+    offsets = _offsets(recorded)
+    bound = _bound(recorded, offsets, training)
+    bound_markers(recorded.markers, recorded.simulator.body.mesh, bound, recorded.tracked)  # Refuses a far marker.
+    mountings = _mountings(recorded, bound, offsets, training)
+    verticals, gravity = _verticals(recorded)
+    shifts = _shifts(recorded, bound, offsets)
+    _dataset(recorded, bound, shifts, gravity).write(context.run_dir / DATASET)
+    driven = [row for row, trial in enumerate(recorded.trials) if not trial.is_released]
+    hidden = {*driven} - {*(evenly(driven, _SHOWN) if driven else [])}
+    shown = {name: row for row, name in enumerate(names) if row not in hidden}
+    write_json(context.run_dir / QUALITY, {name: _quality(recorded, row) for name, row in shown.items()})
+    registrations = {name: _registration(recorded, row, shifts[row]) for name, row in shown.items()}
+    for name, row in shown.items():
+        registrations[name] |= {"mounting": mountings[name]} if mountings[name] else {}
+        registrations[name] |= {} if verticals is None else {"vertical_deg": _angle(verticals[row], -gravity)}
+    write_json(context.run_dir / REGISTRATION, registrations)
 
 
 def import_scaled(context: StageContext) -> None:
@@ -74,11 +71,25 @@ def import_scaled(context: StageContext) -> None:
     Raises:
         DataFileError: a recording cannot be read or used.
     """
-    observer, dataset = Observer(context), read_dataset(context.run_dir / DATASET)
+    recorded, dataset = RegisteredTrials(context), read_dataset(context.run_dir / DATASET)
     assert dataset.bound is not None
-    observed = observer.observe(context.settings.trials)
-    shifts = _shifts(observer, observed, dataset.bound, _offsets(observer, observed))
-    _dataset(observer, observed, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
+    shifts = _shifts(recorded, dataset.bound, _offsets(recorded))
+    _dataset(recorded, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
+
+
+def _check_input_unit(recorded: RegisteredTrials) -> None:
+    """Refuses inputs that are so much below the limit that their unit must be wrong."""
+    drive, limit = recorded.drive, recorded.data.input_limit
+    driven = [moving.actuation for moving in recorded.moving if moving.actuation is not None]
+    if drive is None or limit is None or not any(len(inputs) > 1 for inputs in driven):
+        return
+    highest = max(float(np.abs(inputs).max()) for inputs in driven)
+    if highest < NO_INPUT * limit:
+        raise DataFileError(
+            f"the {drive.quantity.plural} of all {len(driven)} recordings stay below {highest:.3g} "
+            f"{drive.quantity.unit}, and data.input_limit is {limit:.3g} {drive.quantity.unit}: give their unit in "
+            "the files (actuation_units, or the header of the column), or set the limit to the robot's maximum."
+        )
 
 
 def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) -> str:
@@ -100,21 +111,21 @@ def sessions_text(rates: Mapping[str, float], sessions: Sequence[str | None]) ->
     )
 
 
-def _offsets(observer: Observer, observed: Sequence[Observed]) -> FloatArray:
+def _offsets(recorded: RegisteredTrials) -> FloatArray:
     """(R, M, 3) observed minus expected places of tracked markers in the frame of the body [m], NaN if not seen.
 
     Those of rigid bodies are turned back with their part, so that they are places on the undeformed body.
     """
-    offsets = np.full((len(observed), *observer.nominal.shape), np.nan)
-    for offset, trial in zip(offsets, observed, strict=True):
-        offset[trial.columns] = trial.places - observer.expected(trial.settings)[: len(trial.columns)]
-        offset[:] = np.einsum("mij,mi->mj", observer.turned(trial.settings), offset)
+    offsets = np.full((len(recorded.trials), *recorded.nominal.shape), np.nan)
+    for offset, trial, registration in zip(offsets, recorded.trials, recorded.registrations, strict=True):
+        has = trial.tracked(recorded.tracked)
+        places = recorded.view(trial).of_arrays(registration.positions[: len(has)])
+        offset[has] = places - recorded.expected(trial)[: len(has)]
+        offset[:] = np.einsum("mij,mi->mj", recorded.turned(trial), offset)
     return offsets
 
 
-def _bound(
-    observer: Observer, observed: Sequence[Observed], offsets: FloatArray, training: Container[str]
-) -> FloatArray:
+def _bound(recorded: RegisteredTrials, offsets: FloatArray, training: Container[str]) -> FloatArray:
     """(M, 3) places of markers: nominal ones with their mean offsets; of rigid bodies, as their poses at rest [m].
 
     Test trials are used only for markers that no training trial has.
@@ -122,41 +133,42 @@ def _bound(
     Raises:
         InputError: no trial shows a rigid body at rest.
     """
-    bound = observer.nominal.copy()
-    shows_places = np.array([x.shows_places for x in observed])
-    learned = np.array([x.settings.name in training for x in observed])
-    for marker, seen in enumerate(np.isfinite(offsets).all(axis=2).T & shows_places):
+    bound, shows = recorded.nominal.copy(), np.array(recorded.shows_places)
+    learned = np.array([trial.name in training for trial in recorded.trials])
+    for marker, seen in enumerate(np.isfinite(offsets).all(axis=2).T & shows):
         if seen.any():
             bound[marker] += offsets[seen & learned if (seen & learned).any() else seen, marker].mean(axis=0)
-    for name, own in corners_of(observer.tracked).items():
-        if not any(x.shows_places and x.settings.has(name) for x in observed):
+    for name, corners in corners_of(recorded.tracked).items():
+        if not any(shows[row] and trial.has(name) for row, trial in enumerate(recorded.trials)):
             raise InputError(
                 f"markers.rigid_bodies.{name}: its mounting on the body is unknown, as no trial shows it while the "
                 "body is undeformed or at rest under its own weight alone: add such a trial, as a pose or a motion."
             )
-        bound[own] = motion_between(observer.nominal[own], bound[own]).apply(observer.nominal[own])
+        nominal = recorded.nominal[corners]
+        bound[corners] = motion_between(nominal, bound[corners]).apply(nominal)
     return bound
 
 
 def _mountings(
-    observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray, training: Container[str]
+    recorded: RegisteredTrials, bound: FloatArray, offsets: FloatArray, training: Container[str]
 ) -> dict[str, dict[str, Any]]:
     """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial.
 
     Raises:
         InputError: a rigid body was remounted between two trials.
     """
-    mountings: dict[str, dict[str, Any]] = {x.settings.name: {} for x in observed}
-    for name, own in corners_of(observer.tracked).items():
-        shown = [row for row, x in enumerate(observed) if x.shows_places and x.settings.has(name)]
-        places = observer.nominal[own] + offsets[shown][:, own]
-        away = _MILLI * np.linalg.norm(places.mean(axis=1) - bound[own].mean(axis=0), axis=-1)
-        turned = np.degrees(angles(bound[own], places))
-        first = next((at for at, row in enumerate(shown) if observed[row].settings.name in training), 0)
-        apart = [root_mean_square(corners - places[first]) for corners in places]
-        if max(apart) > observer.markers.largest_residual:
+    trials = recorded.trials
+    mountings: dict[str, dict[str, Any]] = {trial.name: {} for trial in trials}
+    for name, corners in corners_of(recorded.tracked).items():
+        shown = [row for row, trial in enumerate(trials) if recorded.shows_places[row] and trial.has(name)]
+        nominal, places = recorded.nominal[corners], recorded.nominal[corners] + offsets[shown][:, corners]
+        away = _MILLI * np.linalg.norm(places.mean(axis=1) - bound[corners].mean(axis=0), axis=-1)
+        turned = np.degrees(angles(bound[corners], places))
+        first = next((at for at, row in enumerate(shown) if trials[row].name in training), 0)
+        apart = [root_mean_square(points - places[first]) for points in places]
+        if max(apart) > recorded.markers.largest_residual:
             worst = int(np.argmax(apart))
-            source, other = (observed[shown[at]].raw.source for at in (worst, first))
+            source, other = (recorded.measured[shown[at]].source for at in (worst, first))
             moved = _MILLI * np.linalg.norm((places[worst] - places[first]).mean(axis=0))
             raise InputError(
                 f"{source}: {name!r} is {moved:.1f} mm and {np.degrees(angles(places[first], places[worst])):.1f} "
@@ -164,27 +176,26 @@ def _mountings(
                 "data.trials.NAME.labels and in markers.rigid_bodies."
             )
         for row, distance, angle in zip(shown, away, turned, strict=True):
-            mountings[observed[row].settings.name][name] = {"distance_mm": distance, "angle_deg": angle}
+            mountings[trials[row].name][name] = {"distance_mm": distance, "angle_deg": angle}
         log.info(
             "import: %s is mounted %.1f mm from the centre of what carries it, turned by %.1f degrees; the trials "
             "differ from this by up to %.2f mm and %.2f degrees",
-            *(name, _MILLI * np.linalg.norm(np.mean(bound[own] - observer.nominal[own], axis=0))),
-            *(np.degrees(angles(observer.nominal[own], bound[own])), away.max(), turned.max()),
+            *(name, _MILLI * np.linalg.norm(np.mean(bound[corners] - nominal, axis=0))),
+            *(np.degrees(angles(nominal, bound[corners])), away.max(), turned.max()),
         )
     return mountings
 
 
-def _shifts(observer: Observer, observed: Sequence[Observed], bound: FloatArray, offsets: FloatArray) -> FloatArray:
+def _shifts(recorded: RegisteredTrials, bound: FloatArray, offsets: FloatArray) -> FloatArray:
     """(R, M, 3) shifts that move the markers of each trial to their places [m]; zero if alignment is shared."""
-    if observer.data.alignment == "shared":
+    if recorded.data.alignment == "shared":
         return np.zeros_like(offsets)
-    shows_places = np.array([x.shows_places for x in observed])
-    turned = np.stack([observer.turned(x.settings) for x in observed])
-    shifts = np.einsum("rmij,rmj->rmi", turned, bound - observer.nominal - offsets)
-    return np.where(shows_places[:, None, None], shifts, 0.0)
+    turned = np.stack([recorded.turned(trial) for trial in recorded.trials])
+    shifts = np.einsum("rmij,rmj->rmi", turned, bound - recorded.nominal - offsets)
+    return np.where(np.array(recorded.shows_places)[:, None, None], shifts, 0.0)
 
 
-def _verticals(observed: Sequence[Observed], settings: StageSettings) -> tuple[FloatArray | None, FloatArray]:
+def _verticals(recorded: RegisteredTrials) -> tuple[FloatArray | None, FloatArray]:
     """Returns the (R, 3) vertical of each recording in the frame of the body, and (3,) gravity there [m/s^2].
 
     Gravity has the mean of their directions, and the configured strength. Where the vertical is unknown, gravity is the
@@ -193,15 +204,15 @@ def _verticals(observed: Sequence[Observed], settings: StageSettings) -> tuple[F
     Raises:
         InputError: a vertical is far from that of the configured gravity.
     """
-    up, configured = vertical(settings.data.up), np.asarray(settings.gravity, dtype=np.float64)
+    up, configured = recorded.data.up, np.asarray(recorded.settings.gravity, dtype=np.float64)
     if up is None:
         return None, configured
-    verticals = np.stack([x.registration.transform.rotation @ up for x in observed])
-    for trial, measured in zip(observed, verticals, strict=True):
+    verticals = np.stack([own.transform.rotation @ unit_vector(up) for own in recorded.registrations])
+    for recording, measured in zip(recorded.measured, verticals, strict=True):
         if configured.any() and _angle(measured, -configured) > _LARGEST_LEAN:
             down = ", ".join(f"{-x:.2f}" for x in measured)
             raise InputError(
-                f"{trial.raw.source}: with data.up {settings.data.up}, gravity points along ({down}) in the "
+                f"{recording.source}: with data.up {up}, gravity points along ({down}) in the "
                 f"frame of the body, {_angle(measured, -configured):.0f} degrees from the configured one: set data.up "
                 "to the vertical of the recordings, or gravity to its direction in the frame of markers and mesh."
             )
@@ -214,136 +225,145 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def _dataset(
-    observer: Observer, observed: Sequence[Observed], bound: FloatArray, shifts: FloatArray, gravity: FloatArray
-) -> Dataset:
+def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, gravity: FloatArray) -> Dataset:
     """Makes the dataset in the frame of the body; trials that end early are padded."""
-    settings, drive = observer.settings, observer.drive
-    cutoff, steps, step = settings.data.cutoff, settings.data.steps, settings.time_step
-    frames = max(len(x.moving.positions) if x.settings.is_released else 1 for x in observed)
-    resting = [len(x.moving.positions) for x in observed if x.settings.begins in RESTING]
-    begins = ["released" if x.settings.is_released else x.settings.begins for x in observed]
+    trials, settings = recorded.trials, recorded.settings
+    begins = ["released" if trial.is_released else trial.begins for trial in trials]
     begins = [UNDER_INPUTS if word == SLACK else word for word in begins]
+    resting = [len(own.positions) for own, word in zip(recorded.moving, begins, strict=True) if word in RESTING]
+    steps = settings.data.steps
     if resting:
         steps = steps or max(*resting, 2) - 1
-        frames = max(frames, steps + 1)
-    shape = (len(observed), frames, len(observer.tracked), 3)
-    markers, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
-    times, held = np.zeros(shape[:2]), np.full((shape[0], *shape[2:]), np.nan)
-    inputs = np.zeros((len(observed), steps or 1, 0 if drive is None else len(drive.parts)))
-    short = list[str]()
-    for row, trial in enumerate(observed):
-        limit = frames if trial.settings.is_released or steps is None else steps + 1
-        seen = trial.moving.positions[:limit]
-        slow = trial.moving if cutoff is None or len(seen) == 1 else smooth(trial.moving, cutoff)
-        has, shift = trial.columns, shifts[row, trial.columns]
-        markers[row, : len(seen), has] = trial.to_body(seen, shift).swapaxes(0, 1)
-        smoothed[row, : len(seen), has] = trial.to_body(slow.positions[:limit], shift).swapaxes(0, 1)
-        held[row, has] = trial.to_body(trial.still[: len(has)], shift)
-        if trial.settings.is_released:
-            times[row] = np.pad(trial.moving.time, (0, frames - len(seen)), mode="edge")
-        elif trial.settings.begins in RESTING:
-            times[row] = np.minimum(np.arange(frames), steps or 0) * step
-            held[row] = np.where(np.isfinite(markers[row, 0]), markers[row, 0], held[row])
-        else:
-            held[row, has] = bound[has]  # The displacement of a static pose counts from the undeformed body.
-        if trial.driven is not None:  # The last inputs are repeated after the end of a trial.
-            series = trial.driven if len(trial.driven) == 1 else trial.driven[1 : inputs.shape[1] + 1]
-            inputs[row, : len(series)], inputs[row, len(series) :] = series, trial.driven[-1]
-            if 1 < len(series) < inputs.shape[1]:
-                short.append(f"{trial.raw.source.name}: {len(series)}")
-    if short and settings.data.steps is not None:
-        log.warning(
-            "import: recordings are shorter than the %d steps of data.steps (%s); missing frames are ignored.",
-            *(steps, ", ".join(short)),
-        )
-    driven: dict[str, Any] = {}
+    times, observed, smoothed, held = _series(recorded, bound, shifts, steps, steps + 1 if resting and steps else 1)
+    at_steps = settings.time_step * np.arange(round(np.ceil(times.max() / settings.time_step - 1e-6)) + 1)
+    moved, driven, drive = any(own.base is not None for own in recorded.moving), dict[str, Any](), recorded.drive
     if drive is not None:
         name = drive.quantity.name
+        inputs = _inputs(recorded, steps or 1, len(drive.parts))
         driven = {"inputs": {name: inputs}, "channels": {name: drive.parts}, "units": {name: drive.quantity.unit}}
         if UNDER_INPUTS in begins:
-            driven["resting"] = {name: np.array([x.driven[0] for x in observed if x.driven is not None])}
-    at_steps = step * np.arange(round(np.ceil(times.max() / step - 1e-6)) + 1)
-
-    def motion_of(what: str, poses: Sequence[FloatArray | None]) -> FloatArray:
-        """Returns the motion (R, K + 1, 6) of the base or of an obstacle at the steps of the longest trial."""
-        motion, points = np.zeros((len(observed), len(at_steps), 6)), observer.simulator.body.mesh.vertices
-        for row, (trial, own) in enumerate(zip(observed, poses, strict=True)):
-            if own is not None:
-                zero = 0.0 if trial.settings.is_released else trial.moving.start  # of the simulation
-                motion[row] = at_times(own, trial.moving.time - zero, at_steps)
-                check_steps(motion[row], points, trial.raw.source, what)
-        return motion
-
+            first = [own.actuation[0] for own in recorded.moving if own.actuation is not None]
+            driven["resting"] = {name: np.array(first)}
     obstacles = {
-        name: motion_of(f"the obstacle {name!r}", [x.obstacles.get(name) for x in observed])
-        for name in dict.fromkeys(name for x in observed for name in x.obstacles)
+        name: _motion(
+            recorded, f"the obstacle {name!r}", [own.obstacles.get(name) for own in recorded.moving], at_steps
+        )
+        for name in dict.fromkeys(name for own in recorded.moving for name in own.obstacles)
     }
-    sessions = tuple(x.settings.session or "" for x in observed)
+    sessions = tuple(trial.session or "" for trial in trials)
     return Dataset(
-        names=tuple(x.settings.name for x in observed),
-        labels=tuple(observer.tracked),
+        names=tuple(trial.name for trial in trials),
+        labels=tuple(recorded.tracked),
         begins=tuple(begins),
         times=times,
-        observed=markers,
+        observed=observed,
         held=held,
-        payload=np.array([x.settings.payload for x in observed]),
+        payload=np.array([trial.payload for trial in trials]),
         gravity=gravity,
-        time_step=step,
+        time_step=settings.time_step,
         bound=bound,
-        smoothed=smoothed if cutoff is not None or {*begins} <= {*RESTING} else None,
-        base=motion_of("the base", [x.base for x in observed]) if any(x.base is not None for x in observed) else None,
+        smoothed=smoothed if settings.data.cutoff is not None or {*begins} <= {*RESTING} else None,
+        base=_motion(recorded, "the base", [own.base for own in recorded.moving], at_steps) if moved else None,
         obstacles=obstacles,
         sessions=sessions if any(sessions) else (),
         **driven,
     )
 
 
-def _write_quality(
-    context: StageContext,
-    observer: Observer,
-    observed: Sequence[Observed],
-    shifts: FloatArray,
-    verticals: FloatArray | None,
-    gravity: FloatArray,
-    mountings: Mapping[str, Any],
-) -> None:
-    """Writes quality.json and registration.json for all released trials and a few driven trials.
+def _series(
+    recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, steps: int | None, least: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Returns times (R, T) [s], positions and smoothed ones (R, T, M, 3), and those before time zero (R, M, 3) [m].
 
-    Lengths are in millimetres, except positions in the frame of the body in metres.
+    Args:
+        recorded: the trials.
+        bound: (M, 3) places of markers [m].
+        shifts: (R, M, 3), see `_shifts`.
+        steps: time steps of driven trials; None without such trials.
+        least: least number T of frames.
     """
-    settings, tracked = observer.settings, observer.tracked
-    assert settings.markers is not None
-    reference, gap = list(settings.markers.reference), settings.data.longest_gap
-    driven = [row for row, x in enumerate(observed) if not x.settings.is_released]
-    shown = evenly(driven, _SHOWN) if driven else []
-    qualities, registrations = {}, {}
-    for row, trial in enumerate(observed):
-        if row in driven and row not in shown:
+    trials, cutoff, step = recorded.trials, recorded.data.cutoff, recorded.settings.time_step
+    lengths = [len(own.positions) if t.is_released else 1 for t, own in zip(trials, recorded.moving, strict=True)]
+    frames = max(*lengths, least)
+    shape = (len(trials), frames, len(recorded.tracked), 3)
+    observed, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
+    times, held = np.zeros(shape[:2]), np.full((shape[0], *shape[2:]), np.nan)
+    for row, (trial, moving) in enumerate(zip(trials, recorded.moving, strict=True)):
+        limit = frames if trial.is_released or steps is None else steps + 1
+        seen = moving.positions[:limit]
+        slow = moving if cutoff is None or len(seen) == 1 else smooth(moving, cutoff)
+        has = trial.tracked(recorded.tracked)
+        for series, positions in ((observed, seen), (smoothed, slow.positions[:limit])):
+            series[row, : len(seen), has] = recorded.to_body(row, positions, shifts[row, has]).swapaxes(0, 1)
+        held[row, has] = recorded.to_body(row, recorded.rests[row][: len(has)], shifts[row, has])
+        if trial.is_released:
+            times[row] = np.pad(moving.time, (0, frames - len(seen)), mode="edge")
+        elif trial.begins in RESTING:
+            times[row] = np.minimum(np.arange(frames), steps or 0) * step
+            held[row] = np.where(np.isfinite(observed[row, 0]), observed[row, 0], held[row])
+        else:
+            held[row, has] = bound[has]  # The displacement of a static pose counts from the undeformed body.
+    return times, observed, smoothed, held
+
+
+def _inputs(recorded: RegisteredTrials, steps: int, parts: int) -> FloatArray:
+    """(R, K, C) inputs of the trials during the steps; the last ones are repeated after the end of a trial."""
+    inputs, short = np.zeros((len(recorded.trials), steps, parts)), list[str]()
+    for row, moving in enumerate(recorded.moving):
+        if moving.actuation is None:
             continue
-        name, labels, fit = trial.settings.name, trial.raw.labels, trial.registration
-        raw = replace(trial.raw, labels=owners(labels), positions=as_markers(trial.raw.positions, labels))
-        measured = quality(raw, reference if trial.base is None else [], trial.release, longest_gap=gap)
-        qualities[name] = asdict(measured)
-        if trial.settings.is_released:
-            for warning in measured.warnings:
-                log.warning("%s: %s", measured.source.name, warning)
-        elif measured.warnings:
-            remarks = number_of(len(measured.warnings), "remark")
-            log.info("import: %s: %s on its quality in the report", measured.source.name, remarks)
-        # Places of the tracked markers of a loaded body are not known, and do not concern the registration.
-        known = [*settings.markers.tracked, *reference] if trial.shows_places else reference
-        rows = [row for row, label in enumerate(fit.names) if label in known]
-        names = [fit.names[row] for row in rows]
-        moved = {tracked[n]: -_MILLI * shifts[row, n] for n in trial.columns if tracked[n] in settings.markers.tracked}
-        registrations[name] = {
-            "positions": dict(zip(names, fit.positions[rows].tolist(), strict=True)),
-            "rms_mm": _MILLI * fit.rms,
-            "residual_mm": dict(zip(names, _MILLI * fit.residual[rows], strict=True)),
-            "outliers": list(fit.outliers),
-            "shift_mm": {label: shift.tolist() for label, shift in moved.items()},
-            **({"mounting": mountings[name]} if mountings[name] else {}),
-            **({} if verticals is None else {"vertical_deg": _angle(verticals[row], -gravity)}),
-        }
-    write_json(context.run_dir / QUALITY, qualities)
-    write_json(context.run_dir / REGISTRATION, registrations)
+        series = moving.actuation if len(moving.actuation) == 1 else moving.actuation[1 : steps + 1]
+        inputs[row, : len(series)], inputs[row, len(series) :] = series, moving.actuation[-1]
+        if 1 < len(series) < steps:
+            short.append(f"{moving.source.name}: {len(series)}")
+    if short and recorded.data.steps is not None:
+        log.warning(
+            "import: recordings are shorter than the %d steps of data.steps (%s); missing frames are ignored.",
+            *(steps, ", ".join(short)),
+        )
+    return inputs
+
+
+def _motion(
+    recorded: RegisteredTrials, what: str, poses: Sequence[FloatArray | None], at_steps: FloatArray
+) -> FloatArray:
+    """(R, K + 1, 6) motion of the base or of an obstacle at the steps (K + 1,), from the poses at the frames."""
+    motion, points = np.zeros((len(poses), len(at_steps), 6)), recorded.simulator.body.mesh.vertices
+    for row, (trial, moving, own) in enumerate(zip(recorded.trials, recorded.moving, poses, strict=True)):
+        if own is not None:
+            zero = 0.0 if trial.is_released else moving.start  # of the simulation
+            motion[row] = at_times(own, moving.time - zero, at_steps)
+            check_steps(motion[row], points, moving.source, what)
+    return motion
+
+
+def _quality(recorded: RegisteredTrials, row: int) -> dict[str, Any]:
+    """Content of quality.json on a trial; its warnings are logged for released trials."""
+    measured, trial = recorded.measured[row], recorded.trials[row]
+    still = [*recorded.markers.reference] if recorded.moving[row].base is None else []
+    positions = as_markers(measured.positions, measured.labels)
+    shown = replace(measured, labels=owners(measured.labels), positions=positions)
+    found = quality(shown, still, recorded.releases[row], longest_gap=recorded.data.longest_gap)
+    if trial.is_released:
+        for warning in found.warnings:
+            log.warning("%s: %s", found.source.name, warning)
+    elif found.warnings:
+        remarks = number_of(len(found.warnings), "remark")
+        log.info("import: %s: %s on its quality in the report", found.source.name, remarks)
+    return asdict(found)
+
+
+def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> dict[str, Any]:
+    """Content of registration.json on a trial, in millimetres but for positions in the frame of the body [m]."""
+    markers, fit, tracked = recorded.markers, recorded.registrations[row], recorded.tracked
+    # Places of the tracked markers of a loaded body are not known, and do not concern the registration.
+    known = [*markers.reference, *(markers.tracked if recorded.shows_places[row] else [])]
+    rows = [number for number, label in enumerate(fit.names) if label in known]
+    names, has = [fit.names[number] for number in rows], recorded.trials[row].tracked(tracked)
+    return {
+        "positions": dict(zip(names, fit.positions[rows].tolist(), strict=True)),
+        "rms_mm": _MILLI * fit.rms,
+        "residual_mm": dict(zip(names, _MILLI * fit.residual[rows], strict=True)),
+        "outliers": list(fit.outliers),
+        "shift_mm": {tracked[n]: (-_MILLI * shifts[n]).tolist() for n in has if tracked[n] in markers.tracked},
+    }

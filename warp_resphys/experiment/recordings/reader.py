@@ -9,9 +9,9 @@ import numpy as np
 
 from ...data.marker_view import MarkerView
 from ...data.recordings.processing import obstacle_motion
-from ...data.recordings.reading import read_recording
 from ...data.recordings.recording import Recording
-from ...data.registration import assign, axes_rotation
+from ...data.recordings.recording_files import read_recording
+from ...data.registration import assign, axes_rotation, unit_vector
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed
@@ -57,8 +57,8 @@ class Reader:
         self.nominal = nominal_places(self.markers, self.simulator.body.mesh)
         self._reference = np.array([*self.markers.reference.values()], dtype=np.float64).reshape(-1, 3)
         self.rotation = None if self.data.axes is None else axes_rotation(self.data.axes)
-        up, gravity = vertical(self.data.up), np.asarray(settings.gravity, dtype=np.float64)
-        self.vertical = None if up is None or not gravity.any() else (up, -gravity)
+        up, gravity = self.data.up, np.asarray(settings.gravity, dtype=np.float64)
+        self.vertical = None if up is None or not gravity.any() else (unit_vector(up), -gravity)
         self.enough = standing_enough(self.data, settings.gravity)
         self._run_dir = context.run_dir
         self._hanging: FloatArray | None = None
@@ -267,20 +267,6 @@ def standing_enough(data: ReadingSettings, gravity: Sequence[float]) -> int:
     if data.axes is not None:
         return 1
     return 3 if data.up is None or not any(gravity) else 2
-
-
-def vertical(up: str | Sequence[float] | None) -> FloatArray | None:
-    """(3,) upward unit vector in the frame of the recordings; None if it is unknown.
-
-    Args:
-        up: ``x``, ``-x``, ``y`` and so on, or a vector (3,).
-    """
-    if up is None:
-        return None
-    if isinstance(up, str):
-        return np.eye(3)["xyz".index(up.removeprefix("-"))] * (-1.0 if up.startswith("-") else 1.0)
-    vector = np.asarray(up, dtype=np.float64)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def central_places(positions: FloatArray, centre: Callable[..., Any]) -> FloatArray:

@@ -14,9 +14,10 @@ from ...io.errors import DataFileError, DecodingError, InputError
 from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from ...io.text import decoded
 from ...settings.trials import BagSettings, TableSettings
-from .bag import SUFFIXES, is_bag, read_raw_bag, topics_of
-from .recording import SI_PER_ACTUATION_UNIT, RawRecording, Recording, hide_zeros, to_recording, without_subject
-from .text import read_raw_text
+from ..base_motion import since_first
+from .bag import SUFFIXES, is_bag, read_bag, topics_of
+from .recording import SI_PER_ACTUATION_UNIT, Recording, hide_zeros, in_metres, without_subject
+from .text_exports import read_text_export
 
 _KIND = "recording"
 _UNITS = {"positions": "units", "actuation": "actuation_units"}
@@ -48,20 +49,24 @@ def read_recording(
         InputError: An argument is invalid.
     """
     path = Path(path)
-    reader = None if is_bag(path) else READERS.get(path.suffix.lower())
-    if reader is None and not is_bag(path):
+    if not is_recording(path):
         raise DataFileError(
             f"{path} is no recording that can be read: give a file that ends in {', '.join((*READERS, *SUFFIXES))}, as "
             "docs/recordings.md has them."
         )
-    if table is not None and reader is not read_raw_text:
+    reader = None if is_bag(path) else READERS[path.suffix.lower()]
+    if table is not None and reader is not read_text_export:
         raise DataFileError(f"{path} is no text, so that data.table cannot tell what its columns are: leave that out.")
     if reader is not None:
-        raw = reader(path) if table is None else read_raw_text(path, table)
-        return to_recording(raw, path, units, rate, labels)
+        return in_metres(reader(path) if table is None else read_text_export(path, table), units, rate, labels)
     if bag is None:
         raise InputError(f"{path} is a bag: name topics in data.bag (docs/recordings.md). It has {topics_of(path)}.")
-    return to_recording(read_raw_bag(path, bag), path, units, bag.rate or rate, labels)
+    return in_metres(read_bag(path, bag), units, bag.rate or rate, labels)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether the name of a path is that of a recording that can be read."""
+    return is_bag(path) or path.suffix.lower() in READERS
 
 
 def write_recording(path: str | Path, recording: Recording, attributes: Mapping[str, Any] | None = None) -> None:
@@ -96,7 +101,7 @@ def numbers(arrays: Arrays, name: str, path: Path) -> FloatArray:
     return np.asarray(arrays[name], dtype=np.float64)
 
 
-def _read_npz(path: Path) -> RawRecording:
+def _read_npz(path: Path) -> Recording:
     """Reads a NumPy archive without unpickling."""
     arrays = read_arrays(path, _NAMES)
     if "" in arrays:
@@ -104,7 +109,7 @@ def _read_npz(path: Path) -> RawRecording:
     return _assembled(arrays, path)
 
 
-def _read_hdf5(path: Path) -> RawRecording:
+def _read_hdf5(path: Path) -> Recording:
     """Reads an HDF5 file of any origin: every name of the layout may be a dataset or an attribute of the root."""
     try:
         path.open("rb").close()  # The library's error for a file that cannot be opened has no cause.
@@ -120,7 +125,7 @@ def _read_hdf5(path: Path) -> RawRecording:
     return _assembled(arrays, path)
 
 
-def _assembled(arrays: Arrays, path: Path) -> RawRecording:
+def _assembled(arrays: Arrays, path: Path) -> Recording:
     """Returns the recording of arrays of the layout, by name."""
     words = ("labels", *_UNITS.values())
     found = {name: numbers(arrays, name, path) for name in _NAMES if name in arrays and name not in words}
@@ -135,15 +140,22 @@ def _assembled(arrays: Arrays, path: Path) -> RawRecording:
             )
         with np.errstate(over="ignore"):
             found["actuation"] = found["actuation"] * SI_PER_ACTUATION_UNIT[unit]
-    return RawRecording(
-        positions=numbers(arrays, "positions", path),
-        labels=[_text(label) for label in np.ravel(arrays["labels"])] if "labels" in arrays else None,
-        unit=_word(arrays, "units") or "m",
-        rate=found["rate_hz"].item() if "rate_hz" in found else None,
+    positions, base = numbers(arrays, "positions", path), found.get("base")
+    if base is not None and base.shape != (len(positions), 7):
+        raise DataFileError(
+            f"{path}: base has the shape {base.shape}; it needs a place and a quaternion (w, x, y, z) for each of the "
+            f"{len(positions)} frames."
+        )
+    return Recording(
+        labels=tuple(_text(label) for label in np.ravel(arrays["labels"])) if "labels" in arrays else (),
+        positions=positions,
+        rate=found["rate_hz"].item() if "rate_hz" in found else np.nan,
+        source=path,
         actuation=found.get("actuation"),
         rest=found.get("rest"),
-        base=found.get("base"),
+        base=None if base is None else since_first(base[:, :3], base[:, 3:], path),
         start=found["start"].item() if "start" in found else 0.0,
+        unit=_word(arrays, "units") or "m",
         turns=found.get("quaternions"),
     )
 
@@ -156,7 +168,7 @@ def _text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-def _read_c3d(path: Path) -> RawRecording:
+def _read_c3d(path: Path) -> Recording:
     """Reads the markers of a C3D file, decoded by ezc3d in a process of its own."""
     try:
         content = path.read_bytes()
@@ -187,18 +199,19 @@ def _read_c3d(path: Path) -> RawRecording:
     labels = [decoded(label.encode(errors="surrogateescape")) or "" for label in raw_labels]
     labels += [""] * (points.shape[1] - len(labels))
     chosen = [column for column, label in enumerate(labels) if label not in arrays["computed"]]
-    raw = RawRecording(
+    recording = Recording(
+        labels=tuple(without_subject([labels[column].strip() for column in chosen])),
         positions=points[:3, chosen].transpose(2, 1, 0),
-        labels=without_subject([labels[column].strip() for column in chosen]),
-        unit=str(arrays["units"][0]) if arrays["units"].size else None,
-        rate=float(arrays["rate"][0]) if arrays["rate"].size else None,
+        rate=float(arrays["rate"][0]) if arrays["rate"].size else np.nan,
+        source=path,
+        unit=str(arrays["units"][0]) if arrays["units"].size else "",
     )
-    return hide_zeros(raw, path)
+    return hide_zeros(recording)
 
 
-READERS: Final[Mapping[str, Callable[[Path], RawRecording]]] = {
+READERS: Final[Mapping[str, Callable[[Path], Recording]]] = {
     ".c3d": _read_c3d,
-    **dict.fromkeys((".csv", ".tsv", ".txt"), read_raw_text),
+    **dict.fromkeys((".csv", ".tsv", ".txt"), read_text_export),
     ".npz": _read_npz,
     **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
 }

@@ -21,7 +21,7 @@ from ...io.errors import DataFileError, did_you_mean, listed
 from ...io.text import Rows, number, read_rows
 from ...settings.trials import TableSettings
 from .columns import AXES, QUATERNION, Layout, Place, Turn, is_data, quaternions
-from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, RawRecording, hide_zeros, length_unit, without_subject
+from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, Recording, hide_zeros, length_unit, without_subject
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ _VICON = ("Trajectories", "Objects", "Devices", "Joints", "Model Outputs", "Segm
 _VICON_AXES = {"tx": "x", "ty": "y", "tz": "z"} | {axis: axis for axis in (*AXES, "rx", "ry", "rz", "rw")}
 
 
-def read_raw_text(path: Path, table: TableSettings | None = None) -> RawRecording:
+def read_text_export(path: Path, table: TableSettings | None = None) -> Recording:
     """Reads a table, or an export of Qualisys, Motive or Vicon, which its first line shows.
 
     Args:
@@ -74,7 +74,7 @@ def read_raw_text(path: Path, table: TableSettings | None = None) -> RawRecordin
     return _read_vicon(rows, path) if first.title() in _VICON else _read_named(rows, path)
 
 
-def _read_named(rows: Rows, path: Path) -> RawRecording:
+def _read_named(rows: Rows, path: Path) -> Recording:
     """Reads a table with a header; names of markers above their axes, and units below, may have lines of their own."""
     first = next((line for line, row in enumerate(rows) if is_data(row)), len(rows))
     head = [[cell.lstrip("# ") for cell in row] for row in rows[:first] if any(row)] or [[""]]
@@ -108,7 +108,7 @@ def _filled(row: Sequence[str], width: int) -> list[str]:
     return filled
 
 
-def _read_described(rows: Rows, table: TableSettings, path: Path) -> RawRecording:
+def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
     """Reads a table with described columns; a column in a length that is not of a marker is a channel."""
     first, width = table.header_lines, len(table.columns)
     header = rows[first] if len(rows) > first else []
@@ -137,7 +137,7 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> RawRecordin
 
 def _read_table(
     rows: Rows, first: int, columns: Columns, channel_units: Sequence[str], width: int, path: Path
-) -> RawRecording:
+) -> Recording:
     """Reads columns `time [s]` or `frame`, `<marker>.x`, `.y` and `.z`, of a rigid body `.qw` to `.qz`, and channels.
 
     Args:
@@ -243,7 +243,7 @@ def _coordinates(columns: Columns) -> dict[int, tuple[str, str]]:
     return result
 
 
-def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
+def _read_qualisys(rows: Rows, path: Path) -> Recording:
     """Reads lines of a key and its values, an optional line of column names, and one line for every frame; millimetres.
 
     A line may begin with its frame number, or with frame number and time. Qualisys writes zeros for an occluded marker
@@ -283,8 +283,8 @@ def _read_qualisys(rows: Rows, path: Path) -> RawRecording:
     rate, clock = number("".join(keys.get("FREQUENCY", [])[:1])), 0 if leading else None
     turn = Turn(tuple(axis for axis in (*_MATRIX, *_ANGLES) if axis in axes), _quaternions_of_qualisys)
     layout = Layout(first, len(axes), places[len(leading) :], "mm", clock, rate=rate, turn=turn)
-    raw = hide_zeros(replace(layout.read(rows, path), labels=labels), path)
-    return replace(raw, start=number(data[0][1]) or 0.0) if len(leading) == 2 else raw
+    recording = hide_zeros(replace(layout.read(rows, path), labels=tuple(labels)))
+    return replace(recording, start=number(data[0][1]) or 0.0) if len(leading) == 2 else recording
 
 
 def _quaternions_of_qualisys(numbers: FloatArray) -> FloatArray:
@@ -309,7 +309,7 @@ def _quaternions_of_qualisys(numbers: FloatArray) -> FloatArray:
     return quaternions(np.where(hidden, np.nan, numbers), rotations)
 
 
-def _read_motive(rows: Rows, path: Path) -> RawRecording:
+def _read_motive(rows: Rows, path: Path) -> Recording:
     """Reads a line of keys and values, lines of Type, Name and others, a line of axes, and one line for every frame.
 
     Measured markers and rigid bodies are read; markers of solved rigid bodies only if there is nothing else.
@@ -344,7 +344,7 @@ def _read_motive(rows: Rows, path: Path) -> RawRecording:
     return Layout(axes_line + 1, len(axes), read, unit, 0, rate=rate, turn=turn).read(rows, path)
 
 
-def _read_vicon(rows: Rows, path: Path) -> RawRecording:
+def _read_vicon(rows: Rows, path: Path) -> Recording:
     """Reads the sections Objects (rigid bodies of Tracker) and Trajectories (markers), or Segments without these.
 
     Angles are rotation vectors ("helical"), unless there are quaternions.

@@ -20,7 +20,7 @@ from ..files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..laboratory import largest_input
 from ..simulate import substeps_of
 from ..trials import all_trials, folds_of, split_of, trials_of
-from .reading import standing_enough
+from .reader import standing_enough
 
 
 def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings, body: Body) -> None:

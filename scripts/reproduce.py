@@ -88,7 +88,7 @@ class Run:
     @cached_property
     def data(self) -> dict[str, Any]:
         """The group `data` of the configuration of the run, from the record of its report."""
-        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["config"]["data"])
+        return dict(read_json(self.folder / "stages" / "report.json")["settings"]["data"])
 
 
 def main() -> None:

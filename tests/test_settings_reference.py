@@ -64,9 +64,14 @@ def test_choices_in_the_settings_are_those_in_the_code():
 
 def test_a_stage_has_the_keys_that_it_reads_alone():
     run = settings()
-    stage = StageSettings.reading(run, "simulation", files={})
-    assert (stage.simulation, stage.mesh) == (run.simulation, run.mesh)
-    assert (stage.reads("simulation"), stage.reads("seed"), "seed" in stage.plain()) == (True, False, False)
-    with pytest.raises(AttributeError, match="seed"):
-        _ = stage.seed
-    assert parse(StageSettings, stage.plain()) == stage
+    stage = StageSettings.reading(run, "simulation", "law", "parallel.batch", shared="..")
+    assert (stage.simulation, stage.batch, stage.shared) == (run.simulation, run.parallel.batch, "..")
+    for key, read in {"seed": lambda: stage.seed, "processes": lambda: stage.parallel.processes}.items():
+        with pytest.raises(AttributeError, match=key):
+            read()
+    with pytest.raises(AttributeError, match="identify"):
+        _ = stage.identified
+    content = stage.content()
+    assert {*content} == {"simulation", "law", "parallel", "shared"}
+    assert (content["law"], content["parallel"]) == (run.plain()["law"], {"batch": None})
+    assert parse(StageSettings, stage.plain()).content() == content

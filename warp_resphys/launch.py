@@ -18,10 +18,11 @@ from importlib import import_module, resources
 from pathlib import Path
 from typing import Any, Final, get_type_hints
 
-import hydra
+from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException, MissingConfigException, OverrideParseException
 from hydra.types import RunMode
+from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
@@ -51,78 +52,97 @@ def launch(command: str, function: str, arguments: Sequence[str]) -> None:
             is parsed into the class that annotates its first parameter.
         arguments: for Hydra.
     """
-    reported: list[BaseException] = []
-    started = False
-    shown: str | None
-    late = list[LateOverride]()
-
-    def job(config: DictConfig) -> Any:
-        nonlocal started
-        started = True
+    job = _Job(function, os.environ.get("HYDRA_FULL_ERROR") == "1")
+    with _one_sentence_each():
         try:
-            for override in late:
+            job.run(command, arguments)
+        except KeyboardInterrupt as error:
+            print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
+            raise SystemExit(INTERRUPTED) from None
+        except Exception as error:
+            job.report(error)
+            raise SystemExit(USER_ERROR) from None
+
+
+class _Job:
+    """A command that Hydra runs, once or for every job of a sweep; it reports errors in one sentence.
+
+    Args:
+        function: see `launch`.
+        full_error: whether errors have their traceback instead.
+    """
+
+    def __init__(self, function: str, full_error: bool) -> None:
+        self.function, self.full_error = function, full_error
+        self.late: list[LateOverride] = []
+        self.shown: str | None = None  # key of the settings that are printed instead of running
+        self.started = False
+        self._reported: list[BaseException] = []
+
+    def run(self, command: str, arguments: Sequence[str]) -> None:
+        """Composes the configuration and runs the command with it."""
+        if any(argument.startswith("--experimental-rerun") for argument in arguments):
+            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
+        rest = [*_own_options(), *arguments]
+        if command in TYPED:
+            rest, self.shown = _without_shown(rest)
+        if any(argument[:1] != "-" for argument in rest):
+            schema = run_schema() if command in TYPED else _function(self.function)[1].model_json_schema()
+            rest, self.late = readable(rest, schema)
+        OmegaConf.register_new_resolver("run_label", self._label, replace=True)
+        setbase("1.3")
+        parser = get_args_parser()
+        parsed = parser.parse_args([*rest, *(_SILENT if self.shown is not None else ())])
+        with _ends_as_after_ctrl_c(), names_are_texts():
+            _run_hydra(parsed, parser, self._call, f"pkg://{CONFIG_PACKAGE}", configuration(command))
+
+    def _label(self, overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
+        return run_label([*overrides, *(override.argument for override in self.late)], excluded)
+
+    def _call(self, config: DictConfig) -> Any:
+        """Runs the command, or shows its settings."""
+        self.started = True
+        try:
+            for override in self.late:
                 override.apply(config)
-            if shown is not None:
+            if self.shown is not None:
                 with ends_where_nobody_reads():
-                    _show(config, shown)
-                return None
+                    return _show(config, self.shown)
             values = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             folder = Path(HydraConfig.get().runtime.output_dir)
             gc.collect()  # What an earlier job of a sweep has left would be kept for good.
-            run, settings = _function(function)
+            run, settings = _function(self.function)
             with ends_where_nobody_reads():
                 return run(parse(settings, values), folder)
         except Exception as error:
-            sentence = _explain(error, started)
-            if sentence is None or full_error:
-                raise
-            print(f"error: {sentence}", file=sys.stderr, flush=True)
-            reported.append(error)
+            self.report(error)
             if HydraConfig.get().mode == RunMode.RUN:
                 raise SystemExit(USER_ERROR) from error
             raise
 
-    def label(overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
-        return run_label([*overrides, *(override.argument for override in late)], excluded)
+    def report(self, error: Exception) -> None:
+        """Prints the message of an error once; raises the error if it is a fault of the program."""
+        message = _explain(error, self.started)
+        if message is None or self.full_error:
+            raise error
+        if not any(error is earlier for earlier in self._reported):
+            print(f"error: {message}", file=sys.stderr, flush=True)
+            self._reported.append(error)
 
-    full_error = os.environ.get("HYDRA_FULL_ERROR") == "1"
+
+@contextmanager
+def _one_sentence_each() -> Iterator[None]:
+    """Lets errors and warnings have one sentence each, without lines of code; restores the process at the end."""
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # It tells of its list of fonts.
-    before = sys.argv
-    format_warning = warnings.formatwarning
-    raise_exceptions = logging.raiseExceptions
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them and exiting
-    logging.raiseExceptions = False  # no traceback for each log line if the disk is full
+    before = warnings.formatwarning, logging.raiseExceptions, os.environ.get("HYDRA_FULL_ERROR")
     warnings.formatwarning = _sentence_of_warning
+    logging.raiseExceptions = False  # no traceback for each log line if the disk is full
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them and exiting
     try:
-        if any(argument.startswith("--experimental-rerun") for argument in arguments):
-            raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
-        rest, shown = [*_own_options(), *arguments], None
-        if command in TYPED:
-            rest, shown = _without_shown(rest)
-        if any(argument[:1] != "-" for argument in rest):
-            schema = run_schema() if command in TYPED else _function(function)[1].model_json_schema()
-            rest, late = readable(rest, schema)
-        OmegaConf.register_new_resolver("run_label", label, replace=True)
-        sys.argv = [before[0], *rest, *(_SILENT if shown is not None else ())]
-        place = {"config_path": f"pkg://{CONFIG_PACKAGE}", "config_name": configuration(command)}
-        with _ends_as_after_ctrl_c(), names_are_texts():
-            hydra.main(version_base="1.3", **place)(job)()
-    except KeyboardInterrupt as error:
-        print(f"\n{error}" if str(error) else "\ninterrupted", file=sys.stderr, flush=True)
-        raise SystemExit(INTERRUPTED) from None
-    except Exception as error:
-        sentence = _explain(error, started)
-        if sentence is None or full_error:
-            raise
-        if not any(error is earlier for earlier in reported):
-            print(f"error: {sentence}", file=sys.stderr, flush=True)
-        raise SystemExit(USER_ERROR) from None
+        yield
     finally:
-        sys.argv = before
-        warnings.formatwarning = format_warning
-        logging.raiseExceptions = raise_exceptions
-        if not full_error:
-            del os.environ["HYDRA_FULL_ERROR"]
+        warnings.formatwarning, logging.raiseExceptions, full_error = before
+        os.environ.pop("HYDRA_FULL_ERROR") if full_error is None else os.environ.update(HYDRA_FULL_ERROR=full_error)
 
 
 def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:

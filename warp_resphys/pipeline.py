@@ -6,8 +6,10 @@ The configuration determines the stages. The settings of a stage are exactly wha
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -64,22 +66,20 @@ from .io.fan_out import ALONE, Workers
 from .io.files import read_json, write_json
 from .io.kernel_cache import start_quietly
 from .io.progress import show
-from .io.stages import Stage, StageContext, package_versions, resources_used, run_stages, unfinished
+from .io.stages import Stage, package_versions, resources_used, run_stages, unfinished
 from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
-from .settings.body import BodySettings
-from .settings.control import ControlSettings, FigureSettings
+from .settings.body import BodySettings, TargetSettings
+from .settings.control import ControlSettings
 from .settings.run import RunSettings
-from .settings.stages import LEARNING, NETWORKS, LaboratoryStage, PlayedSettings, ReportStage, StageSettings
-from .settings.trials import ReadingSettings, Split, Trial
+from .settings.stages import BATCH, FIGURES, IMPORTED, LEARNING, NETWORKS, PLAYED, SIMULATOR, StageSettings
+from .settings.trials import Split, Trial
 
 log = logging.getLogger(__name__)
 
 _SHORT = 60  # characters of advice beside which the path of the report is printed
-
-Work = Callable[[StageContext], None]
 
 _MOST_THREADS = 4  # that share the trials of a batch, as Python's part of a step runs in one at a time
 
@@ -118,42 +118,38 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
     Raises:
         DataFileError: a recording cannot be read.
     """
-    files, trials, data = files_read(run, run), trials_of(run), run.recorded
-    if data is None:
-        simulated = StageSettings.reading(run, "target", "data", files=files_read(run, run, run.target), trials=trials)
-        return [Stage("simulate", simulate, (DATASET,), simulated)]
-    stages, upstream = list[Stage](), tuple[str, ...]()
-    learned = None if folds_of(run) is not None else split_of(run).train + split_of(run).validation
-    own = {"data": ReadingSettings.of(data), "files": files, "trials": trials, "learned": learned}
-    imported = StageSettings.reading(run, "payload_at", "simulation", "markers", **own)
-    if run.is_laboratory:
-        stages.append(_laboratory_stage("laboratory", run, trials))
-        upstream = ("laboratory",)
-    else:
-        recordings = {
-            str(trial.file): _digest(Path(str(trial.file)), f"data.trials.{trial.name}.file") for trial in trials
-        }
-        imported = imported.model_copy(update={"files": {**files, **recordings}})
-    stages.append(Stage("import", import_recordings, (DATASET, QUALITY, REGISTRATION), imported, upstream))
-    scaled = scaled_trials_of(run)
-    if scaled:
-        stages.append(_laboratory_stage("laboratory_scaled", run, scaled, "laboratory"))
-        upstream, imported = ("import", "laboratory_scaled"), imported.model_copy(update={"trials": scaled})
-        stages.append(Stage("import_scaled", import_scaled, (SCALED_DATASET,), imported, upstream))
+    files, trials = files_read(run, run), trials_of(run)
+    if run.recorded is None:
+        keys = (*SIMULATOR, "target", "data")
+        settings = StageSettings.reading(run, *keys, files=files_read(run, run, run.target), trials=trials)
+        return [Stage("simulate", simulate, (DATASET,), settings)]
+    split = None if folds_of(run) is not None else split_of(run)
+    learned = None if split is None else split.train + split.validation
+
+    def imported(trials: Sequence[Trial]) -> StageSettings:
+        return StageSettings.reading(run, *IMPORTED, files=files, trials=trials, learned=learned)
+
+    outputs = (DATASET, QUALITY, REGISTRATION)
+    if not run.is_laboratory:
+        files |= {str(trial.file): _digest(Path(str(trial.file)), f"data.trials.{trial.name}.file") for trial in trials}
+        return [Stage("import", import_recordings, outputs, imported(trials))]
+    stages = [
+        _laboratory_stage("laboratory", run, trials, TRUTH),
+        Stage("import", import_recordings, outputs, imported(trials), ("laboratory",)),
+    ]
+    if scaled := scaled_trials_of(run):
+        stages += [
+            replace(_laboratory_stage("laboratory_scaled", run, scaled), upstream=("laboratory",)),
+            Stage("import_scaled", import_scaled, (SCALED_DATASET,), imported(scaled), ("import", "laboratory_scaled")),
+        ]
     return stages
 
 
-def _played(run: RunSettings) -> PlayedSettings:
-    """Settings that the recordings of a simulated laboratory depend on, without the trials."""
-    assert run.laboratory is not None
-    return PlayedSettings.of(run, files=files_read(run, run.laboratory))
-
-
-def _laboratory_stage(name: str, run: RunSettings, trials: Sequence[Trial], *upstream: str) -> Stage:
-    work = partial(run_laboratory, workers=workers_of(run))
-    scaled = any(trial.scale != 1.0 for trial in trials)
-    outputs = (*(trial.recording for trial in trials), *(() if scaled else (TRUTH,)))
-    return Stage(name, work, outputs, LaboratoryStage.of(_played(run), trials=trials, batch=run.batch), upstream)
+def _laboratory_stage(name: str, run: RunSettings, trials: Sequence[Trial], *truth: str) -> Stage:
+    """Returns a stage that simulates the recordings of trials."""
+    outputs = (*(trial.recording for trial in trials), *truth)
+    settings = StageSettings.reading(run, *PLAYED, BATCH, files=files_read(run, run.laboratory), trials=trials)
+    return Stage(name, partial(run_laboratory, workers=workers_of(run)), outputs, settings)
 
 
 def workers_of(run: RunSettings) -> Workers:
@@ -173,99 +169,141 @@ def learning_stages(
         acquired: fingerprint of the stage that wrote dataset.h5.
         workers: of the stages; those of the configuration if omitted.
     """
-    workers = workers_of(run) if workers is None else workers
-    needs = () if run.identify is None else ("identify",)
-    common = {"files": files_read(run, run), "shared": shared, "acquired": acquired, "split": split}
-    stages: list[Stage] = []
-
-    def of(*keys: str, **values: Any) -> StageSettings:
-        return StageSettings.reading(run, *LEARNING, *keys, **common, **values)
-
-    def add(name: str, work: Work, outputs: tuple[str, ...], settings: StageSettings, *upstream: str) -> None:
-        stages.append(Stage(name, work, outputs, settings, (*needs, *upstream)))
-
-    if run.identify is not None:
-        before = of("identify", "seed").model_copy(update={"with_law": False})
-        stages.append(Stage("identify", identify, (IDENTIFICATION,), before))
-    if run.law is not None:
-        given = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
-        of_law = of(*needs, "law", "name")
-        of_law = of_law.model_copy(update={"files": of_law.files | given})
-        add("identify_law", identify_law, (LAW_FILE,), of_law)
-        needs = (*needs, "identify_law")
-    if run.shapes:
-        assert run.data.steps is not None
-        others = of("target", "shapes", steps=run.data.steps)
-        bodies = [own for shape in run.shapes.values() for own in (shape, shape.target_body)]
-        others = others.model_copy(update={"files": {**others.files, **files_read(run, *bodies)}})
-        add("shapes", try_shapes, (SHAPES,), others)
-    # For the published comparison, where all vertices are observed, test trials are reconstructed, too.
-    compared = split.test if run.markers is None and run.law is None else ()
-    reconstructed = split.train + split.validation + compared
-    learned = []
-    for model in [model for model in run.models if model in LEARNED and model != SIMFREE]:
-        first, second = f"reconstruct_{model}", f"train_{model}"
-        forces = of("reconstruction", model=model, reconstructed=reconstructed)
-        add(first, partial(reconstruct, workers=workers), (reconstruction_file(model),), forces)
-        trained = of(*NETWORKS, model=model, training=run.training(model))
-        add(second, train, (weights_file(model), training_file(model)), trained, first)
-        learned.append(stages[-1].name)
-    trained = of(*NETWORKS, model=SIMFREE, training=run.training(SIMFREE))
-    if run.markers is None and run.target is not None:
-        # With observed states, a network that replaces the simulator does not depend on it.
-        without = {"simulation": run.target.material, "identified": None, "with_law": False}
-        trained = trained.model_copy(update=without)
-    outputs = (weights_file(SIMFREE), training_file(SIMFREE))
-    add("train_simfree", train, outputs, trained, *(() if run.markers is None else ("reconstruct_resphys",)))
-    learned.append("train_simfree")
-    groups = test_groups(run, split)
-    calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
-    keys = (*NETWORKS, "published", "correct_uncorrected", "horizons")
-    evaluated = of(*keys, groups=groups, calibration=calibration)
-    add("evaluate", partial(evaluate, workers=workers), (ROLLOUTS, ERRORS), evaluated, *learned, "reconstruct_resphys")
-    targets = () if run.target is None else ("target",)
-    if run.timing:
-        add("time", time_models, (TIMES,), of(*NETWORKS, *targets, groups=groups), *learned)
-    same = run.is_laboratory and run.laboratory and (run.laboratory.mesh, run.laboratory.parts) == (run.mesh, run.parts)
-    if run.mesh_check is not None and not same:
-        add("mesh_check", check_mesh, (MESH_CHECK,), of(*NETWORKS, "mesh_check", groups={"1": groups["1"]}))
+    split_stages = _SplitStages(run, split, shared, acquired, workers_of(run) if workers is None else workers)
+    split_stages.identification()
+    split_stages.learning()
+    split_stages.evaluation()
     if run.control is not None:
-        stages += control_stages(run, run.control, of, workers)
-    last = tuple(stage.name for stage in stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive"))
-    shown = ReportStage(config=run, acquired=acquired)
-    stages.append(Stage("report", make_report, (REPORT,), shown, last))
-    return stages
+        split_stages.control(run.control)
+    return split_stages.with_report()
 
 
-def control_stages(
-    run: RunSettings, control: ControlSettings, of: Callable[..., StageSettings], workers: Workers
-) -> list[Stage]:
-    """Returns the stages of control: plans on the models, and with a simulated laboratory, driven motions.
+class _SplitStages:
+    """The stages of one split in the order in which they run; see `learning_stages`."""
 
-    Args:
-        run: settings that `check_run` accepts.
-        control: its group ``control``.
-        of: makes the settings of a stage of the split.
-        workers: of the driven motions.
-    """
-    stages, last = list[Stage](), control.models[-1]
-    figures = FigureSettings.of(control)
-    for model in reversed(control.models):  # The last model must reach the paths, so it is checked first.
-        first = f"reduce_{model}"
-        reduced = of("seed", model=model, reduction=control.reduction)
-        stages.append(Stage(first, reduce_robot, (reduced_file(model),), reduced, ("evaluate",)))
-        tables = [plan_table(model, motion) for motion in motions_of(control)]
-        planned = of(model=model, figures=figures, plan=control.plan, must_reach=model == last)
-        stages.append(Stage(f"plan_{model}", plan_motions, (plans_file(model), *tables), planned, (first,)))
-    if run.laboratory is None:
-        return stages
-    played, needs = _played(run), tuple(stage.name for stage in stages)
-    settings = of(model=last, figures=figures, feedback=control.feedback, played=played)
-    stages.append(Stage("baselines", fit_baselines, (BASELINES,), settings, ("evaluate",)))
-    driven = of("control", played=played)
-    work = partial(drive, workers=workers)
-    stages.append(Stage("drive", work, (DRIVEN, CONTROL), driven, (*needs, "baselines")))
-    return stages
+    def __init__(self, run: RunSettings, split: Split, shared: str, acquired: str, workers: Workers) -> None:
+        self.run, self.split, self.workers = run, split, workers
+        self.stages: list[Stage] = []
+        self._identified: tuple[str, ...] = ()  # stages of the identification, which all others follow
+        self._common: dict[str, Any] = {
+            "files": files_read(run, run),
+            "shared": shared,
+            "acquired": acquired,
+            "split": split,
+        }
+
+    def add(
+        self,
+        name: str,
+        work: Callable[..., None],
+        outputs: tuple[str, ...],
+        keys: Sequence[str] = (),
+        upstream: Sequence[str] = (),
+        run: RunSettings | None = None,
+        **values: Any,
+    ) -> None:
+        """Adds a stage.
+
+        Args:
+            name: of the stage.
+            work: its function, which may take ``workers`` beside its context.
+            outputs: its files.
+            keys: of the run that it reads besides `LEARNING`.
+            upstream: stages besides the identification whose files it reads.
+            run: settings in place of those of the run.
+            values: derived from the run.
+        """
+        work = partial(work, workers=self.workers) if "workers" in signature(work).parameters else work
+        settings = StageSettings.reading(run or self.run, *LEARNING, *keys, **{**self._common, **values})
+        self.stages.append(Stage(name, work, outputs, settings, (*self._identified, *upstream)))
+
+    def identification(self) -> None:
+        """Adds the identification of parameters, of the law of the material, and its test on other bodies."""
+        run, files = self.run, self._common["files"]
+        if run.identify is not None:
+            self.add("identify", identify, (IDENTIFICATION,), ("seed",), run=run.model_copy(update={"law": None}))
+            self._identified = ("identify",)
+        if run.law is not None:
+            law = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
+            self.add("identify_law", identify_law, (LAW_FILE,), ("name",), files=files | law)
+            self._identified += ("identify_law",)
+        if run.shapes:
+            bodies = [body for shape in run.shapes.values() for body in (shape, shape.target_body)]
+            keys = ("target", "shapes", "data.steps")
+            self.add("shapes", try_shapes, (SHAPES,), keys, files=files | files_read(run, *bodies))
+
+    def learning(self) -> None:
+        """Adds the reconstruction of residual forces, and the training of the networks."""
+        run, split = self.run, self.split
+        # For the published comparison, where all vertices are observed, test trials are reconstructed, too.
+        compared = split.test if run.markers is None and run.law is None else ()
+        reconstructed = split.train + split.validation + compared
+        for model in LEARNED:
+            if model not in run.models or model == SIMFREE:
+                continue
+            self.add(
+                *(f"reconstruct_{model}", reconstruct, (reconstruction_file(model),), ("reconstruction",)),
+                model=model,
+                reconstructed=reconstructed,
+            )
+            outputs, training = (weights_file(model), training_file(model)), run.training_of(model)
+            upstream = (f"reconstruct_{model}",)
+            self.add(f"train_{model}", train, outputs, NETWORKS, upstream, model=model, training=training)
+        outputs, training = (weights_file(SIMFREE), training_file(SIMFREE)), run.training_of(SIMFREE)
+        needed = () if run.markers is None else ("reconstruct_resphys",)
+        alone = run if run.markers is not None or run.target is None else _without_simulator(run, run.target)
+        self.add("train_simfree", train, outputs, NETWORKS, needed, alone, model=SIMFREE, training=training)
+
+    def evaluation(self) -> None:
+        """Adds the roll-outs of all models on the test trials, their times, and the error of the mesh."""
+        run, split, groups = self.run, self.split, test_groups(self.run, self.split)
+        calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
+        learned = [stage.name for stage in self.stages if stage.name.startswith("train_")]
+        self.add(
+            *("evaluate", evaluate, (ROLLOUTS, ERRORS)),
+            (*NETWORKS, "published", "correct_uncorrected", "data.horizons"),
+            (*learned, "reconstruct_resphys"),
+            groups=groups,
+            calibration=calibration,
+        )
+        if run.timing:
+            self.add("time", time_models, (TIMES,), (*NETWORKS, "target"), learned, groups=groups)
+        played = run.laboratory if run.is_laboratory else None
+        same = played is not None and (played.mesh, played.parts) == (run.mesh, run.parts)
+        if run.mesh_check is not None and not same:
+            first = {"1": groups["1"]}
+            self.add("mesh_check", check_mesh, (MESH_CHECK,), (*NETWORKS, "mesh_check"), groups=first)
+
+    def control(self, control: ControlSettings) -> None:
+        """Adds plans on the models, and with a simulated laboratory, driven motions."""
+        last, planned = control.models[-1], list[str]()
+        for model in reversed(control.models):  # The last model must reach the paths, so it is checked first.
+            first, second = f"reduce_{model}", f"plan_{model}"
+            planned += [first, second]
+            keys: tuple[str, ...] = ("seed", "control.reduction")
+            self.add(first, reduce_robot, (reduced_file(model),), keys, ("evaluate",), model=model)
+            outputs = (plans_file(model), *(plan_table(model, motion) for motion in motions_of(control)))
+            keys = (*FIGURES, "control.plan")
+            self.add(second, plan_motions, outputs, keys, (first,), model=model, must_reach=model == last)
+        if self.run.laboratory is None:
+            return
+        files = self._common["files"] | files_read(self.run, self.run.laboratory)
+        keys = (*PLAYED, *FIGURES, "control.feedback")
+        self.add("baselines", fit_baselines, (BASELINES,), keys, ("evaluate",), model=last, files=files)
+        self.add("drive", drive, (DRIVEN, CONTROL), (*PLAYED, "control"), (*planned, "baselines"), files=files)
+
+    def with_report(self) -> list[Stage]:
+        """Returns all stages, with that of the report, which shows the whole configuration."""
+        shown = [
+            stage.name for stage in self.stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive")
+        ]
+        return [*self.stages, Stage("report", make_report, (REPORT,), self.run, tuple(shown))]
+
+
+def _without_simulator(run: RunSettings, target: TargetSettings) -> RunSettings:
+    """Returns the settings of a network that replaces the simulator, without those that identify the latter."""
+    without: dict[str, Any] = {"simulation": target.material, "identify": None, "law": None, "shapes": {}}
+    return run.model_copy(update=without)
 
 
 def prepare(run: RunSettings) -> None:
@@ -325,7 +363,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     write_json(folder / METRICS, metrics)
     if folds is not None:
         errors = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
-        reported = ReportStage(config=run, folds=errors)
+        reported = StageSettings.reading(run, *RunSettings.model_fields, folds=errors)
         run_stages([*first, Stage("report", make_folds_report, (REPORT,), reported, (first[-1].name,))], folder)
     _print(metrics, folder, run)
 

@@ -75,7 +75,7 @@ def control_of(folder):
 @pytest.mark.slow
 class TestLaboratory:
     def test_a_body_that_fails_or_begins_again_rests_and_the_other_goes_on(self, folder):
-        laboratory = Laboratory(driven_settings(folder).played, folder, "tendon_tension", 2, seed=0, on_failure="count")
+        laboratory = Laboratory(driven_settings(folder), folder, "tendon_tension", 2, seed=0, on_failure="count")
         rest, commands = laboratory.markers(), np.tile([1.0, 0.0, 0.0], (2, 1))
         assert not laboratory.step(commands).any()
         laboratory.begin(np.array([True, False]))

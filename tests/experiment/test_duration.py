@@ -37,7 +37,7 @@ def stages_of(data, *more):
 def works_of(data, *more):
     stages = {one.name: one.settings for one in stages_of(data, *more)}
     del stages["report"]
-    return {name: work_of(Experiment(own, data[0], "count")) for name, own in stages.items()}
+    return {name: work_of(name, Experiment(own, data[0], "count")) for name, own in stages.items()}
 
 
 def test_the_work_is_trials_by_steps_by_epochs(data):

@@ -26,8 +26,7 @@ from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import PlayedSettings, StageSettings
-from warp_resphys.settings.trials import ReadingSettings
+from warp_resphys.settings.stages import IMPORTED, PLAYED, StageSettings
 from warp_resphys.stepping.inputs import Inputs
 
 ROOT = Path(__file__).parents[2]
@@ -79,7 +78,7 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     assert dataset.inputs == dataset.channels == {}
     np.testing.assert_allclose(dataset.payload, [0.0, 0.05, 0.09])
     np.testing.assert_allclose(motions.inputs.attached_mass.sum(1), [0.0, 0.05, 0.09], atol=1e-12)
-    played = PlayedSettings.of(run, files={})
+    played = StageSettings.reading(run, *PLAYED)
     setup = make_setup(played)
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
     results = np.array([trial["release_frame"] for trial in read_json(folder / QUALITY).values()]) / RATE
@@ -129,7 +128,7 @@ def test_a_trial_does_not_depend_on_the_others(tmp_path, laboratory):
     np.testing.assert_allclose(one.positions, other.positions, rtol=0.0, atol=1e-7)
     again = settings("experiment=beam_real", *SMALL, "seed=1")
     assert fingerprint(acquisition_stages(again)[0], {}) != fingerprint(acquisition_stages(run)[0], {})
-    one, other = (make_setup(PlayedSettings.of(own, files={})) for own in (again, run))
+    one, other = (make_setup(StageSettings.reading(own, *PLAYED)) for own in (again, run))
     assert np.abs(one.frame.translation - other.frame.translation).min() > 1e-3
 
 
@@ -163,8 +162,7 @@ class Shelf:
 
     def bring_in(self):
         run = parse(RunSettings, self.config)
-        own = {"data": ReadingSettings.of(run.data), "trials": trials_of(run), "learned": self.learned}
-        stage = StageSettings.reading(run, "payload_at", "simulation", "markers", files={}, **own)
+        stage = StageSettings.reading(run, *IMPORTED, trials=trials_of(run), learned=self.learned)
         import_recordings(StageContext("import", self.folder, "", stage))
         with read_hdf5(self.folder / DATASET, "dataset") as file:
             return {name: file[name][()] for name in file} | dict(file.attrs)

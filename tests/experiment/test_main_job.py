@@ -115,11 +115,11 @@ class TestCompleteRun:
 
 
 def fingerprints(*overrides):
-    """Fingerprints of the stages of a main job, by name."""
-    run, stages = settings(*TINY, *overrides), {}
-    planned = [*pipeline.acquisition_stages(run)]
-    planned += pipeline.learning_stages(run, split_of(run), ".", fingerprint(planned[0], {}))
-    for stage in planned:
+    """Fingerprints of the stages of a run, by name."""
+    run, stages = settings(*overrides), {}
+    for stage in pipeline.acquisition_stages(run):
+        stages[stage.name] = acquired = fingerprint(stage, stages)
+    for stage in pipeline.learning_stages(run, split_of(run), ".", acquired):
         stages[stage.name] = fingerprint(stage, stages)
     return stages
 
@@ -138,8 +138,31 @@ def fingerprints(*overrides):
     ],
 )
 def test_a_stage_depends_on_its_own_settings_and_those_before_it(override, expected):
-    before, after = fingerprints(), fingerprints(override)
+    before, after = fingerprints(*TINY), fingerprints(*TINY, override)
     assert [name for name in STAGES if after[name] != before[name]] == expected
+
+
+PLANNED = {"plan_resphys", "plan_sysid", "plan_simulation"}
+CONTROLLED = {"reduce_resphys", "reduce_sysid", "reduce_simulation", *PLANNED, "baselines", "drive"}
+TRAINED = {"train_resphys", "train_simfree", "evaluate", *CONTROLLED}
+IMPORTED = {"import", "identify", "reconstruct_resphys", "mesh_check", *TRAINED}
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("control.feedback.gains=[1.0]", {"baselines", "drive"}),
+        ("control.plan.corrections=1", {*PLANNED, "drive"}),
+        ("data.horizons=[0.5]", {"evaluate", *CONTROLLED}),
+        ("trainer.epochs=7", TRAINED),
+        ("markers.largest_residual=0.01", IMPORTED),
+        ("laboratory.noise=2e-3", {"laboratory", *IMPORTED}),
+    ],
+)
+def test_a_stage_of_a_laboratory_or_of_control_reads_single_keys(override, expected):
+    run = "experiment=sopra_control"
+    before, after = fingerprints(run), fingerprints(run, override)
+    assert {name for name in before if after[name] != before[name]} == {*expected, "report"}
 
 
 @pytest.mark.slow

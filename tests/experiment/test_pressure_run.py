@@ -25,6 +25,7 @@ from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_j
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
 from warp_resphys.settings.stages import LEARNING, NETWORKS, StageSettings
+from warp_resphys.settings.trials import Split
 
 COMMAND = ("experiment=tiny", TRACKED)
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
@@ -107,7 +108,7 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
     for frame in ("corotated", "world"):
         keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
         monkeypatch.setattr(learn, "Trainer", keep)
-        experiment = Experiment(stage.changed(force_frame=frame), finished)
+        experiment = Experiment(stage.model_copy(update={"force_frame": frame}), finished)
         assert learn.trainer_of(experiment, "resphys", stage.training)[1].force_frame == frame
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
     frames = experiment.frames(experiment.model_simulator("resphys"), "corotated")
@@ -260,10 +261,10 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
     lost[1, 3:] = np.nan
     left = {"resphys": np.array([-1, 3])}
-    own = {"horizons": (0.02, 0.04), "split": {"train": [], "validation": [], "test": ["a", "b"]}}
-    keys = ("published", "correct_uncorrected")
-    own |= {"files": {}, "shared": ".", "acquired": "", "groups": {"1": ["a", "b"]}, "calibration": []}
-    stage = StageSettings.reading(settings("experiment=sopra"), *LEARNING, *NETWORKS, *keys, **own)
+    run = settings("experiment=sopra", "data.horizons=[0.02,0.04]")
+    split = Split(train=(), validation=(), test=("a", "b"))
+    keys = ("published", "correct_uncorrected", "data.horizons")
+    stage = StageSettings.reading(run, *LEARNING, *NETWORKS, *keys, split=split, shared=".", groups={"1": split.test})
     experiment = Experiment(stage, tmp_path)
     about = (np.tile(0.01 * np.arange(5), (2, 1)), observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
     pressed = {"pressure": np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 0.0]])[..., None]}

@@ -22,7 +22,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import StageSettings
+from warp_resphys.settings.stages import SIMULATOR, StageSettings
 from warp_resphys.stepping.inputs import Inputs
 
 SIZE = (0.1, 0.03, 0.03)
@@ -106,7 +106,7 @@ def test_the_data_are_the_motion_of_the_target_at_the_simulators_vertices_and_st
     assert np.abs(np.diff(dataset.observed[2], axis=0)).max(axis=(1, 2)).min() > 1e-3
     assert (dataset.time_step, dataset.times[2, -1]) == (0.01, pytest.approx(0.03))
     run = settings("experiment=marker_ablation", *COARSE, *OWN, "data.weights_g.observed=[200]", "ablation.counts=[4]")
-    own = StageSettings.reading(run, "target", "simulation", "data", files={})
+    own = StageSettings.reading(run, *SIMULATOR, "target", "simulation", "data")
     generate_motion(StageContext("generate", tmp_path, "fingerprint", own))
     seen, uncorrected = read_motion(tmp_path)
     np.testing.assert_allclose(seen, q[::2, at], atol=1e-8)

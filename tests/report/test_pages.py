@@ -36,7 +36,6 @@ from warp_resphys.report import run_page
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.page import NONE, Canvas, Drawn, number_text
-from warp_resphys.settings.stages import ReportStage
 
 FIGURES_OF_AN_ARM = {
     *("error_over_time", "loss_history", "markers", "inputs"),
@@ -199,7 +198,7 @@ class TestArms:
         settings, shown = arm_settings(), []
         write_arm_run(tmp_path, settings, test=1, steps=40, models=("simulation",), sag=0.004)
         monkeypatch.setattr(run_page, "write_report", lambda _, data: shown.append(data))
-        stage.make_report(StageContext("report", tmp_path, "", ReportStage(config=settings)))
+        stage.make_report(StageContext("report", tmp_path, "", settings))
         (page_data,) = shown
         sagged = page_data.mesh.vertices[:, 2].min() - page_data.recordings.mesh.vertices[:, 2].min()
         assert sagged == pytest.approx(0.004, abs=1e-6)

@@ -7,7 +7,6 @@ from html.parser import HTMLParser
 
 from warp_resphys.experiment.report import make_report
 from warp_resphys.io.stages import StageContext
-from warp_resphys.settings.stages import ReportStage
 
 FAILING = (sys.executable, "-c", "raise SystemExit('no OpenGL here')")
 
@@ -49,5 +48,5 @@ class Page(HTMLParser):
 
 def report(folder, settings, make=make_report):
     """Makes the report of a run folder."""
-    make(StageContext("report", folder, "", ReportStage(config=settings)))
+    make(StageContext("report", folder, "", settings))
     return Page(folder / "report.html")

@@ -61,8 +61,8 @@ def reduce_robot(context: StageContext) -> None:
     settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
     check_plannable(robot)
-    with Progress(context.name, settings.reduction.total, "samples") as progress:
-        reduced = reduce(robot, settings.reduction, settings.seed, progress.advance)
+    with Progress(context.name, settings.control.reduction.total, "samples") as progress:
+        reduced = reduce(robot, settings.control.reduction, settings.seed, progress.advance)
     write_reduced(context.run_dir / reduced_file(settings.model), reduced)
 
 
@@ -74,18 +74,18 @@ def plan_motions(context: StageContext) -> None:
         ConvergenceError: the robot diverges on a plan.
     """
     settings: StageSettings = context.settings
-    model, plan = settings.model, settings.plan
+    model, plan = settings.model, settings.control.plan
     robot = load(context.run_dir, model, settings.device)
-    task = Task(settings.figures, robot)
+    task = Task(settings.control, robot)
     reduced = read_reduced(context.run_dir / reduced_file(model), robot.description.learned)
     if settings.must_reach:
         task.check_reach(reduced, plan.reach)
     # The point starts where the recordings have it before anything moved.
     start = task.tracked @ np.nanmean(read_dataset(context.run_dir / DATASET).held, axis=0).ravel()
     plans = dict[str, PlannedMotion]()
-    total = (plan.corrections + 1) * sum(map(task.steps, settings.figures.seconds))
+    total = (plan.corrections + 1) * sum(map(task.steps, settings.control.seconds))
     with Progress(context.name, total, "steps") as progress:
-        for seconds in settings.figures.seconds:
+        for seconds in settings.control.seconds:
             paths = np.stack([task.timed(path, seconds, start) for path in task.paths])
             followed = follow(robot, reduced, partial(task.planner, reduced), paths, plan.corrections, progress.advance)
             plans |= dict(zip(_names(task, seconds), followed, strict=True))
@@ -106,17 +106,17 @@ def fit_baselines(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    task, driven, data = Task(settings.figures, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
+    task, driven, data = Task(settings.control, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
     assert driven.high is not None
     train, validation = (
         [_series(data, name, driven.name, robot.time_step) for name in names]
         for names in (settings.split.train, settings.split.validation)
     )
     linear = fit_linear(train, validation or train, np.asarray(driven.high), robot.time_step)
-    feedback, limits = settings.feedback, settings.figures.limits
+    feedback, limits = settings.control.feedback, settings.control.limits
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
     pressed = _PRESSED * limits.range * np.eye(parts)
-    laboratory = Laboratory(settings.played, context.run_dir, driven.name, parts, len(motions_of(settings.figures)))
+    laboratory = Laboratory(settings, context.run_dir, driven.name, parts, len(motions_of(settings.control)))
     rest, seen = laboratory.rest(), []
     with Progress(context.name, steps, "steps") as progress:
         for number in range(steps):
@@ -186,7 +186,7 @@ def _driven(part: TrialPart, report: Report) -> Arrays:
     control, folder, (name,) = settings.control, part.context.run_dir, part.names
     robot = load(folder, control.models[-1], settings.device)
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
-    laboratory = Laboratory(settings.played, folder, driven.name, count, motions_of(control).index(name))
+    laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
     plans = {model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models}
     rest, path = laboratory.rest(), plans[control.models[-1]].path
     linear, jacobian = read_baselines(folder / BASELINES)
@@ -294,7 +294,7 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     robot = load(folder, control.models[-1], settings.device)
     driven, rows = read_motion(folder / DRIVEN, PLAYED, motion), [names.index(name) for name in controllers]
     steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
-    laboratory = Laboratory(settings.played, folder, driven_input(robot).name, len(rows), 0)
+    laboratory = Laboratory(settings, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control.tracked)
     bodies, points = [laboratory.bodies()[1]], [laboratory.markers()]
     with Progress("laboratory", steps, "steps") as progress:

@@ -24,7 +24,7 @@ from ..report.obstacles import ObstacleSurface
 from ..robot.description import Description
 from ..robot.robot import Robot
 from ..robot.state import RobotState
-from ..settings.stages import LaboratoryStage, PlayedSettings
+from ..settings.stages import StageSettings
 from ..settings.trials import MarkerSettings
 from .reduced import ReducedModel
 
@@ -172,7 +172,7 @@ class RobotWorld(World):
         return ObstacleSurface.of(self.robot.simulator.body, self._nominal.parameters)
 
 
-def laboratory_robot(settings: PlayedSettings, upright: bool = False, on_failure: str = "raise") -> Robot:
+def laboratory_robot(settings: StageSettings, upright: bool = False, on_failure: str = "raise") -> Robot:
     """Returns the simulated laboratory of a run as a robot with its own markers.
 
     Args:
@@ -196,13 +196,13 @@ def laboratory_robot(settings: PlayedSettings, upright: bool = False, on_failure
     return Robot(description, simulation_device(settings.device), on_failure)
 
 
-def laboratory_settings(folder: Path) -> LaboratoryStage:
+def laboratory_settings(folder: Path) -> StageSettings:
     """Returns the settings of a run's laboratory, on the CPU.
 
     Raises:
         DataFileError: the run has no laboratory, or is unfinished.
     """
-    return parse(LaboratoryStage, finished_record(folder, _LABORATORY)["settings"]).changed(device="cpu")
+    return parse(StageSettings, finished_record(folder, _LABORATORY)["settings"]).model_copy(update={"device": "cpu"})
 
 
 class Laboratory(RobotWorld):
@@ -220,7 +220,7 @@ class Laboratory(RobotWorld):
     noise: float
 
     def __init__(
-        self, settings: PlayedSettings, run_dir: Path, name: str, count: int, seed: int, on_failure: str = "raise"
+        self, settings: StageSettings, run_dir: Path, name: str, count: int, seed: int, on_failure: str = "raise"
     ) -> None:
         substeps_of(settings.time_step, settings.laboratory, _LABORATORY)
         robot = laboratory_robot(settings, on_failure=on_failure)

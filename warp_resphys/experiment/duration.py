@@ -18,7 +18,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.stages import Stage
 from ..learning.reconstruction import make_reconstructor
 from ..report.page import duration_text
-from ..settings.stages import ReportStage, StageSettings
+from ..settings.stages import StageSettings
 from .evaluate import CHECKED_SECONDS
 from .experiment import MODELS, Experiment
 from .models import SIMFREE
@@ -48,7 +48,7 @@ def announcement(
     folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
     own = {one.name: one.settings for one in stages if isinstance(one.settings, StageSettings)}
     experiments = {name: Experiment(settings, folder, "count") for name, settings in own.items()}
-    works = {name: work for name, one in experiments.items() if (work := work_of(one)) is not None}
+    works = {name: work for name, one in experiments.items() if (work := work_of(name, one)) is not None}
     amount = times * sum(steps + _RECONSTRUCTION * forces for steps, forces, _ in works.values())
     vertices = next(iter(experiments.values())).body.n_vertices if works else 0
     if not works or amount * vertices < _SHORT:
@@ -58,31 +58,31 @@ def announcement(
         for reconstructed, number in ((False, steps), (True, forces)):
             if number and reconstructed not in paces:
                 paces[reconstructed] = pace_of(experiments[name], reconstructed)
-        one = own[name]  # workers share trials that are reconstructed, and calibration trials
-        names = one.reconstructed if one.reads("reconstructed") else one.groups["1"] if one.reads("calibration") else ()
+        one = own[name]  # workers share trials that are reconstructed, and test trials
+        names = one.groups["1"] if name == "evaluate" else one.reconstructed
         shared = min(workers.count, max(math.ceil(len(names) / (one.batch or len(names) or 1)), 1))
         seconds[name] = times * (steps * paces.get(False, 0.0) + forces * paces.get(True, 0.0) + training) / shared
     if sum(seconds.values()) < _LEAST_SECONDS:
         return ""
     longest = sorted(seconds, key=lambda name: -seconds[name])[:3]
     parts = ", ".join(f"{name} {duration_text(seconds[name])}" for name in longest)
-    others = [one.name for one in stages if one.name not in seconds and not isinstance(one.settings, ReportStage)]
+    others = [name for name in own if name not in seconds]
     without = f", without {', '.join(others)}" if others else ""
     shorter = ["a coarser mesh", "fewer or shorter trials"]
-    most = max((len(one.identify.parameters) for one in own.values() if one.reads("identify")), default=0)
+    most = len(own["identify"].identify.parameters) if "identify" in own else 0
     shorter += [f"fewer of the {number_of(most, 'parameter')} of identify.parameters"] if most > 1 else []
     shorter += [] if quick else ["or at first budget=quick"]
     took = f"about {duration_text(sum(seconds.values()))} more for {vertices:,} vertices"
     return f"{took}{without} (longest: {parts}); shorter with {', '.join(shorter)}."
 
 
-def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
+def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | None:
     """Returns the numbers of steps and of reconstructed steps of single trials, and the time of other training [s]."""
     settings = experiment.settings
     train, judged = settings.split.train, settings.split.validation or settings.split.train
-    if settings.reads("reconstructed"):
+    if stage.startswith("reconstruct_"):
         return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
-    if settings.reads("training"):
+    if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
         looped, loop, trainer = 0.0, training.in_the_loop, training.trainer
@@ -93,30 +93,29 @@ def work_of(experiment: Experiment) -> tuple[float, float, float] | None:
                 return looped, 0.0, 0.0
         replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
         return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
-    if settings.reads("calibration"):
+    if stage == "evaluate":
         tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
         return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
-    if settings.reads("mesh_check"):
+    if stage == "mesh_check":
         return (1.0 + settings.mesh_check**3) * CHECKED_SECONDS / settings.time_step, 0.0, 0.0
-    if settings.reads("groups"):  # three rows, one trial at a time, which takes twice as long
+    if stage == "time":  # three rows, one trial at a time, which takes twice as long
         return 6.0 * steps_of(experiment, "simulation", experiment.moving(settings.groups["1"])), 0.0, 0.0
-    if settings.reads("identify") and not settings.reads("law"):
+    if stage == "identify":
         wanted = settings.identify
         names = train if wanted.trials is None else tuple(evenly(train, wanted.trials))
         evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
         searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
         each = {model: evaluations * (1.0 + _VARIED * len(own)) for model, own in searches.items() if own}
-        return sum(number * steps_of(experiment, m, names) for m, number in each.items()), 0.0, 0.0
+        return sum(number * steps_of(experiment, m, names, wanted.seconds) for m, number in each.items()), 0.0, 0.0
     return None
 
 
-def steps_of(experiment: Experiment, model: str, names: Sequence[str]) -> float:
+def steps_of(experiment: Experiment, model: str, names: Sequence[str], longest: float | None = None) -> float:
     """Returns the number of steps of a model's simulator in trials, the longest of those that begin alike; 1 a pose."""
     settings, kind = experiment.settings, MODELS[model][0]
     time_step, total = experiment.settings_of("simulation" if kind == "law" else kind).time_step, 0.0
     for batch in experiment.batches(names):
-        limits = [float(experiment.trials(batch).times.max()), settings.trial_seconds]
-        limits += [settings.identify.seconds] if settings.reads("identify") else []
+        limits = [float(experiment.trials(batch).times.max()), settings.trial_seconds, longest]
         seconds = min(limit for limit in limits if limit is not None)
         total += len(batch) * max(math.ceil(seconds / time_step - 1e-6), 1)
     return total

@@ -81,7 +81,7 @@ class Experiment:
         """Dataset of the trials, including trials with scaled inputs if the stage tests them."""
         shared = self.folder / self.settings.shared
         dataset = read_dataset(shared / DATASET)
-        if self.settings.reads("groups") and len(self.settings.groups) > 1:
+        if len(self.settings.groups) > 1:
             dataset = dataset.joined(read_dataset(shared / SCALED_DATASET))
         return dataset
 

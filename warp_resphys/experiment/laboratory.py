@@ -25,8 +25,8 @@ from ..io.files import write_json
 from ..io.stages import StageContext
 from ..learning.replay import sample
 from ..mesh.mesh import select_vertices
-from ..settings.stages import LaboratoryStage, PlayedSettings
-from ..settings.trials import Trial
+from ..settings.stages import StageSettings
+from ..settings.trials import PlaySettings, Trial
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
@@ -78,7 +78,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         InputError: a configured value is invalid.
         ConvergenceError, WorkerError: a step of the simulation fails.
     """
-    settings: LaboratoryStage = context.settings
+    settings: StageSettings = context.settings
     laboratory, trials, parts = settings.laboratory, settings.trials, list[TrialPart]()
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
@@ -118,7 +118,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
 
 def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray) -> float:
     """Writes the recording of a trial; returns the mean distance by which noise moves its tracked markers [m]."""
-    settings: LaboratoryStage = context.settings
+    settings: StageSettings = context.settings
     laboratory, data = settings.laboratory, settings.data
     draw, released = _drawn(settings, trial)
     rate = _rate_of(settings) if trial.is_released else 1.0 / settings.time_step
@@ -164,7 +164,7 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     return float(np.linalg.norm(moved, axis=-1).mean())
 
 
-def _drawn(settings: PlayedSettings, trial: Trial) -> tuple[np.random.Generator, float | None]:
+def _drawn(settings: StageSettings, trial: Trial) -> tuple[np.random.Generator, float | None]:
     """Random numbers of a trial, and when its body is released, between two frames [s]; None if it is not held."""
     draw = np.random.default_rng([settings.seed, zlib.crc32(trial.name.encode())])
     if trial.begins != "held":
@@ -173,18 +173,18 @@ def _drawn(settings: PlayedSettings, trial: Trial) -> tuple[np.random.Generator,
     return draw, float(settings.laboratory.held_seconds + draw.random() / _rate_of(settings))
 
 
-def _zero_of(settings: PlayedSettings, trial: Trial) -> float:
+def _zero_of(settings: StageSettings, trial: Trial) -> float:
     """Recorded value of a trial's inputs where nothing acts."""
     draw = np.random.default_rng([settings.seed, 2, zlib.crc32(trial.name.encode())])
     return float(settings.laboratory.zero_noise * np.clip(draw.standard_normal(), -_FURTHEST_ZERO, _FURTHEST_ZERO))
 
 
-def _rate_of(settings: PlayedSettings) -> float:
+def _rate_of(settings: StageSettings) -> float:
     """Frame rate of the cameras [Hz]."""
     return settings.laboratory.rate or 1.0 / settings.time_step
 
 
-def make_setup(settings: PlayedSettings) -> Setup:
+def make_setup(settings: StageSettings) -> Setup:
     """Draws the pose of the body, the places of its markers and the mountings of its rigid bodies from the seed.
 
     The vertical of the recordings is ``data.up``, as with levelled cameras, and the body is tilted by
@@ -216,25 +216,25 @@ def make_setup(settings: PlayedSettings) -> Setup:
     return Setup(gravity, RigidTransform(rotation.as_matrix(), translation), observed, places[count:])
 
 
-def laboratory_simulator(settings: PlayedSettings, gravity: FloatArray) -> Simulator:
+def laboratory_simulator(settings: StageSettings, gravity: FloatArray) -> Simulator:
     """Simulator that takes the place of the real body, for gravity in the frame of the body [m/s^2]."""
     simulated = target_settings(settings, settings.laboratory).model_copy(update={"gravity": tuple(gravity.tolist())})
     return build_simulator(simulated, settings.laboratory.material, payload_at=settings.payload_at)
 
 
-def largest_input(settings: PlayedSettings) -> float:
-    """Largest random or periodic input, in its unit, so that recorded ones stay within the limit with any zero."""
-    assert settings.data.input_limit is not None
-    return settings.data.input_limit - _FURTHEST_ZERO * settings.laboratory.zero_noise
+def largest_input(limit: float | None, laboratory: PlaySettings) -> float:
+    """Largest random or periodic input, in its unit, so that recorded ones stay within a limit with any zero."""
+    assert limit is not None
+    return limit - _FURTHEST_ZERO * laboratory.zero_noise
 
 
-def _inputs_of(settings: PlayedSettings, trial: Trial) -> FloatArray:
+def _inputs_of(settings: StageSettings, trial: Trial) -> FloatArray:
     """(K + 1, C) inputs of a trial at the frames: its waves, or drawn from the seed and the number of its sequence."""
     draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
     assert settings.data.steps is not None
     before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
     steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
-    limit = largest_input(settings)
+    limit = largest_input(settings.data.input_limit, settings.laboratory)
     if trial.waves is not None:
         drawn = wave_inputs(trial.waves, limit, steps, settings.time_step)
     else:
@@ -253,7 +253,7 @@ def _played(part: TrialPart, report: Report) -> Arrays:
     At every step of released bodies, from time zero on, and at the frames of driven bodies, whose inputs are
     interpolated linearly.
     """
-    settings: LaboratoryStage = part.context.settings
+    settings: StageSettings = part.context.settings
     setup, binding = make_setup(settings), settings.binding
     simulator = laboratory_simulator(settings, setup.gravity)
     by_name = {trial.name: trial for trial in settings.trials}

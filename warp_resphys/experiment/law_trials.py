@@ -133,7 +133,7 @@ class LawTrials:
 
     def bounds_of_others(self, simulator: Simulator) -> dict[str, Bounds]:
         """Returns the ranges of the identified parameters that are not those of the material."""
-        if not self.settings.reads("identify"):
+        if self.settings.identified is None:
             return {}
         return {name: bounds_of(self.settings.identify.parameters[name]) for name in self.others(simulator)}
 
@@ -257,7 +257,7 @@ class LawTrials:
 
     def _prior_of_modulus(self) -> Prior | None:
         """Returns the prior of c10 that corresponds to one of Young's modulus, if there is one."""
-        parameters = self.settings.identify.parameters if self.settings.reads("identify") else {}
+        parameters = self.settings.identify.parameters if self.settings.identified is not None else {}
         wanted = parameters.get("youngs_modulus")
         if wanted is None or wanted.prior is None:
             return None

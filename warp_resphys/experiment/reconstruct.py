@@ -23,7 +23,7 @@ from ..learning.metrics import mean_distance
 from ..learning.reconstruction import follow, make_reconstructor, without_ringing
 from ..mesh.mesh import surface_vertices
 from ..settings.run import RunSettings
-from ..settings.stages import ReportStage, StageSettings
+from ..settings.stages import SIMULATOR, StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
@@ -105,13 +105,14 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     assert run.ablation is not None
     own = run.ablation
     workers = workers_for(run.parallel, own.processes, run.device).at_most(len(own.counts))
-    keys = ("target", "simulation", "data", "reconstruction", "seed")
-    drawn = {"counts": own.counts, "draws": own.draws, "modes": own.modes}
-    settings = StageSettings.reading(run, *keys, files=files, **drawn)
+    keys = (*SIMULATOR, "simulation")
+    generated = StageSettings.reading(run, *keys, "target", "data", files=files)
+    drawn = (f"ablation.{name}" for name in ("counts", "draws", "modes"))
+    ablated = StageSettings.reading(run, *keys, *drawn, "reconstruction", "seed", files=files)
     return [
-        Stage("generate", generate_motion, (MOTION,), settings),
-        Stage("ablation", partial(ablate, workers=workers), (DRAWS, SUMMARY), settings, ("generate",)),
-        Stage("report", report_ablation, (REPORT,), ReportStage(config=run), ("ablation",)),
+        Stage("generate", generate_motion, (MOTION,), generated),
+        Stage("ablation", partial(ablate, workers=workers), (DRAWS, SUMMARY), ablated, ("generate",)),
+        Stage("report", report_ablation, (REPORT,), run, ("ablation",)),
     ]
 
 
@@ -148,7 +149,7 @@ def ablate(context: StageContext, workers: Workers = ALONE) -> None:
     Raises:
         ConvergenceError, WorkerError: a step could not be reconstructed.
     """
-    counts = list(context.settings.counts)
+    counts = list(context.settings.ablation.counts)
     motion, uncorrected = read_motion(context.run_dir)
     parts = {}
     for count in sorted(counts, reverse=True):  # Longest first, to balance the load of the processes.
@@ -178,12 +179,12 @@ def _from_markers(part: TrialPart, report: Report) -> Arrays:
     The mean distances (draws, T) of all vertices and of the markers, and the marker sets.
     """
     settings: StageSettings = part.context.settings
-    count, draws = part.more, settings.draws
+    count, draws = part.more, settings.ablation.draws
     simulator = build_simulator(settings, settings.simulation)
     motion, like = simulator.tensor(read_motion(part.context.run_dir)[0]), simulator.rest_positions
     vertices = draw_markers(simulator, count, draws, settings.seed)
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=like.device), like.dtype)
-    more = dict(settings.reconstruction) | {"modes": settings.modes}
+    more = dict(settings.reconstruction) | {"modes": settings.ablation.modes}
     method = make_reconstructor(simulator, **more, observation=markers)
     q = motion[0].expand(draws, *like.shape)
     error, misfit = list[torch.Tensor](), list[torch.Tensor]()
@@ -194,7 +195,7 @@ def _from_markers(part: TrialPart, report: Report) -> Arrays:
         error.append(away.norm(dim=-1).mean(-1))
         misfit.append(markers(away).norm(dim=-1).mean(-1))
         report(iterations=step.iterations)
-    padding = max(settings.counts) - count
+    padding = max(settings.ablation.counts) - count
     sets = np.pad(vertices, ((0, 0), (0, padding)), constant_values=-1)  # -1 where a set is smaller
     distances = {"error": error, "misfit": misfit}
     series = {name: (torch.stack(values, 1).cpu().numpy(), "m") for name, values in distances.items()}
@@ -233,7 +234,7 @@ def report_ablation(context: StageContext) -> None:
     """Writes report.html and its figure."""
     from ..report.ablation_page import write_ablation_report  # matplotlib
 
-    run: RunSettings = context.settings.config
+    run: RunSettings = context.settings
     body = build_body(run)
     mesh, fixed = body.mesh, body.fixed_vertices
     surface = surface_vertices(mesh)

@@ -65,7 +65,7 @@ def make_report(context: StageContext) -> None:
     """
     from ..report import run_page  # matplotlib
 
-    folder, run = context.run_dir, context.settings.config
+    folder, run = context.run_dir, context.settings
     metrics, truth = collect_metrics(folder, run), read_if_there(common_folder(folder) / TRUTH)
     body = build_body(run, run.payload_at)
     mesh = body.mesh
@@ -114,7 +114,7 @@ def make_folds_report(context: StageContext) -> None:
     """
     from ..report import run_page  # matplotlib
 
-    folder, run = context.run_dir, context.settings.config
+    folder, run = context.run_dir, context.settings
     metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
     body = build_body(run, run.payload_at)
     data = RunReport(

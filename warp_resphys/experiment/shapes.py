@@ -89,7 +89,7 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
     models = ("simulation", *(("sysid",) if settings.identified else ()), *((LAW,) if experiment.has_law else ()))
     with torch.no_grad():
         held, substeps = _held(target, shape), substeps_of(settings.time_step, settings.target, "target")
-        observed = seen(target.rollout(held, settings.steps * substeps).q[::substeps, 0]).cpu().numpy()
+        observed = seen(target.rollout(held, settings.data.steps * substeps).q[::substeps, 0]).cpu().numpy()
         start, errors = State(seen(held.q), seen(held.v)), dict[str, float | None]()
         for model in models:
             kind = experiment.sources(model)[0]
@@ -99,7 +99,7 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
             known = simulator.materials[""].quantities
             values = {name: x for name, x in experiment.parameters(model).items() if name in known}
             substeps = round(settings.time_step / simulator.time_step)
-            q = simulator.rollout(start, settings.steps * substeps, None, values).q[::substeps, 0]
+            q = simulator.rollout(start, settings.data.steps * substeps, None, values).q[::substeps, 0]
             errors[model] = summarise([marker_errors(q.cpu().numpy(), observed)])["mean"]
     moved = 1e3 * float(np.linalg.norm(observed - mesh.vertices, axis=-1).max())
     result: dict[str, Any] = {"vertices": len(mesh.vertices), "moved_mm": moved, "errors_mm": errors}

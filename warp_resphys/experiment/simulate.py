@@ -29,7 +29,7 @@ from ..mesh.mesh import Mesh, select_vertices
 from ..mesh.surface import locate
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.stages import PlayedSettings, StageSettings
+from ..settings.stages import StageSettings
 from ..settings.trials import (
     HeldSettings,
     MotionSettings,
@@ -80,7 +80,7 @@ def build_target(settings: SimulatorSettings, target: TargetSettings) -> Target:
     return Target(simulator, substeps_of(settings.time_step, target, "target"), seen.to(simulator.rest_positions))
 
 
-def target_settings(settings: SimulatorSettings | PlayedSettings, target: TargetSettings) -> SimulatorSettings:
+def target_settings(settings: SimulatorSettings, target: TargetSettings) -> SimulatorSettings:
     """Settings of the simulator of a target; gravity, solver and device are those of the run."""
     return SimulatorSettings.of(settings, **{key: getattr(target, key) for key in SteppedSettings.model_fields})
 

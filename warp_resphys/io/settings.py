@@ -51,6 +51,10 @@ class Settings(BaseModel):
         """Returns nested data of JSON types."""
         return self.model_dump(mode="json", by_alias=True)
 
+    def content(self) -> Any:
+        """Returns the data that a fingerprint covers, of JSON types: all keys."""
+        return self.plain()
+
     def packages(self) -> dict[str, str]:
         """Returns the versions of the other packages whose classes these settings and all their groups name."""
         return packages_of(dict(self))

@@ -28,12 +28,12 @@ from .errors import DataFileError, InputError
 from .files import FORMAT_VERSION, read_json, to_plain, write_json
 from .machine import peak_memory_gib
 from .progress import one_line
-from .settings import packages_of
+from .settings import Settings, packages_of
 
 log = logging.getLogger(__name__)
 
 _VALID, _CHANGED = "up to date", "settings changed"  # states of an earlier run
-_PLANNED = "stages.json"  # settings of all stages of the last command
+_PLANNED = "stages.json"  # fingerprints and settings of all stages of the last command
 _PACKAGES = ("warp-resphys", "warp-lang", "torch", "numpy", "scipy", "cholespy", "h5py", "hydra-core")
 
 
@@ -68,7 +68,7 @@ def fingerprint(stage: Stage, upstream_fingerprints: Mapping[str, str]) -> str:
     content = {
         "name": stage.name,
         "format_version": FORMAT_VERSION,
-        "settings": to_plain(stage.settings),
+        "settings": to_plain(stage.settings.content() if isinstance(stage.settings, Settings) else stage.settings),
         "upstream": [upstream_fingerprints[name] for name in stage.upstream],
     }
     if packages := packages_of(stage.settings):
@@ -95,7 +95,7 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False)
     """
     seconds: dict[str, float] = {}
     with run_lock(run_dir, wait):
-        _plan(stages, Path(run_dir) / _PLANNED)
+        _plan([*_contexts(stages, Path(run_dir))], Path(run_dir) / _PLANNED)
         for stage, context in _contexts(stages, Path(run_dir)):
             try:
                 took, state = _earlier(stage, context)
@@ -111,14 +111,17 @@ def run_stages(stages: Sequence[Stage], run_dir: str | Path, wait: bool = False)
     return seconds
 
 
-def _plan(stages: Sequence[Stage], path: Path) -> None:
-    """Adds the settings of all stages to a file, unless it has them."""
+def _plan(stages: Sequence[tuple[Stage, StageContext]], path: Path) -> None:
+    """Adds fingerprints and settings of stages to a file, unless it has them."""
     before = dict[str, Any]()
     with suppress(DataFileError):
         before = read_json(path) if path.is_file() else {}
-    planned = {**before, **{stage.name: to_plain(stage.settings) for stage in stages}}
-    if planned != before:
-        write_json(path, planned)
+    planned = {
+        stage.name: {"fingerprint": context.fingerprint, "settings": to_plain(stage.settings)}
+        for stage, context in stages
+    }
+    if before != before | planned:
+        write_json(path, before | planned)
 
 
 def unfinished(stages: Sequence[Stage], run_dir: str | Path) -> list[Stage]:
@@ -181,11 +184,11 @@ def _write_record(stage: Stage, context: StageContext, seconds: float) -> None:
     )
 
 
-def planned_settings(run_dir: str | Path, name: str) -> dict[str, Any] | None:
-    """Returns the settings of a stage of the last command with this stage in a run folder; None if there was none."""
+def planned(run_dir: str | Path, name: str) -> dict[str, Any]:
+    """Returns ``fingerprint`` and ``settings`` of a stage in the last command that had it; empty if there was none."""
     path = Path(run_dir) / _PLANNED
-    planned: dict[str, Any] = read_json(path) if path.is_file() else {}
-    return planned.get(name)
+    stages: dict[str, Any] = read_json(path) if path.is_file() else {}
+    return stages.get(name, {})
 
 
 def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ..io.classes import check_packages
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
-from ..io.stages import finished_record, planned_settings
+from ..io.stages import finished_record, planned
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
@@ -208,14 +208,14 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
             raise DataFileError(
                 f"{folder} is a cross-validation, which has a robot for each fold: name one of {listed(folds)}."
             )
-        needed, settings = _NEEDED.get(model or ""), planned_settings(folder, _EVALUATE)
-        if needed is not None and settings is not None and (folder / "stages" / f"{needed}.json").is_file():
-            if finished_record(folder, needed)["settings"] != planned_settings(folder, needed):
+        needed, evaluated = _NEEDED.get(model or ""), planned(folder, _EVALUATE)
+        if needed is not None and evaluated and (folder / "stages" / f"{needed}.json").is_file():
+            if finished_record(folder, needed)["fingerprint"] != planned(folder, needed).get("fingerprint"):
                 raise DataFileError(
                     f"{folder} is unfinished: the settings of '{needed}' changed; run its command again."
                 )
             log.info("%s is not evaluated yet: errors and prediction intervals of %s are not known", folder, model)
-            return Experiment(parse(StageSettings, settings), folder)
+            return Experiment(parse(StageSettings, evaluated["settings"]), folder)
     return Experiment(parse(StageSettings, finished_record(folder, _EVALUATE)["settings"]), folder)
 
 

@@ -225,7 +225,7 @@ class RunSettings(SimulatorSettings):
         """Names of the models that the run compares."""
         return models_of(self.published, self.identify, self.correct_uncorrected, self.with_law)
 
-    def training(self, model: str) -> TrainingSettings:
+    def training_of(self, model: str) -> TrainingSettings:
         """Settings of the training of a model; ``simfree`` has its own, and is trained on steps.
 
         Raises:
@@ -279,7 +279,7 @@ class RunSettings(SimulatorSettings):
     @model_validator(mode="after")
     def _training(self) -> Self:
         for model in ("resphys", "simfree"):
-            self.training(model)
+            self.training_of(model)
         return self
 
     @model_validator(mode="after")

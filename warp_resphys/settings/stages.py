@@ -1,131 +1,145 @@
-"""Settings of the stages of a run: for each, the keys that it reads, and what the pipeline derives from the run for it.
+"""Settings of the stages of a run: a stage reads the keys of the run that the pipeline names for it, and no others.
 
-The fingerprint of a stage is that of its settings. A stage cannot read keys that the pipeline does not name for it, so
-that no dependency of a file is forgotten.
+The fingerprint of a stage covers the content of these keys, and the values that the pipeline derives for it. A key that
+is not named raises an AttributeError, so that no dependency of a file is forgotten.
 """
 
-from typing import Any, Final, Self
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, PrivateAttr, model_validator
+from typing_extensions import override
 
-from ..io.settings import Many, Settings, Vector, setting
-from .body import MaterialSettings, SimulatorSettings, SolveSettings, TargetSettings
-from .control import ControlSettings, FeedbackSettings, FigureSettings, PlanSettings, ReductionSettings
-from .learning import (
-    ActuationSettings,
-    IdentifiedSettings,
-    IdentifySettings,
-    LawSettings,
-    ReconstructionSettings,
-    ReleaseSettings,
-    TrainingSettings,
-)
+from ..io.files import to_plain
+from ..io.settings import Many, Settings, setting
+from .body import SimulatorSettings, TargetSettings
+from .control import ControlSettings, FigureSettings
+from .learning import AblationSettings, IdentifySettings, LawSettings, TrainingSettings
 from .mesh import PlaceSettings
-from .run import PublishedSettings, RunSettings
-from .shapes import ShapeSettings
-from .trials import BindingSettings, MarkerSettings, PlaySettings, ReadingSettings, Split, Trial
+from .run import RunSettings
+from .trials import BindingSettings, LaboratorySettings, PlaySettings, ReadingSettings, Split, Trial
 
-LEARNING: Final = (  # keys of all stages of a split, beside those of the simulator
-    *("payload_at", "simulation", "markers", "release", "force_frame", "train_fraction", "trial_seconds", "identified"),
-    *("with_law", "batch"),
+S = TypeVar("S", bound=Settings)
+
+
+def keys_of(group: str, settings: type[Settings]) -> tuple[str, ...]:
+    """Returns the dotted keys of a group that a class of settings has."""
+    return tuple(f"{group}.{name}" for name in settings.model_fields)
+
+
+SIMULATOR: Final = tuple(SimulatorSettings.model_fields)
+BATCH: Final = "parallel.batch"
+IMPORTED: Final = (*SIMULATOR, "simulation", "markers", *keys_of("data", ReadingSettings))
+# Keys of a simulated laboratory.
+PLAYED: Final = (
+    *("gravity", "time_step", "solver", "device", "seed", "tip"),
+    *keys_of("laboratory", PlaySettings),
+    *keys_of("markers", BindingSettings),
+    *keys_of("data", ReadingSettings),
 )
-NETWORKS: Final = ("actuation", "range_guard")  # and of all with networks
+# Keys of all stages of a split, and of all with networks.
+LEARNING: Final = (
+    *SIMULATOR,
+    *("simulation", "markers", "release", "force_frame", "identify", "law"),
+    *("data.payload_at", "data.seconds", "data.train_fraction", BATCH),
+)
+NETWORKS: Final = ("actuation", "range_guard")
+FIGURES: Final = keys_of("control", FigureSettings)
 
 
-class PlayedSettings(Settings):
-    """A simulated laboratory."""
-
-    laboratory: PlaySettings
-    tip: PlaceSettings
-    payload_at: PlaceSettings | None
-    gravity: Vector
-    time_step: float
-    solver: SolveSettings
-    device: str
-    seed: int
-    binding: BindingSettings
-    data: ReadingSettings
-    files: dict[str, str]
-
-
-class LaboratoryStage(PlayedSettings):
-    """Recordings of the laboratory."""
-
-    trials: Many[Trial]
-    batch: int | None
-
-
-class ReportStage(Settings):
-    """A report, which shows the whole configuration."""
-
-    config: RunSettings
-    acquired: str = ""  # fingerprint of the stage that wrote the dataset, for the report of a split
-    folds: dict[str, Any] = Field(default={})  # errors of the models of a cross-validation, by the left-out trial
-
-
-class StageSettings(SimulatorSettings):
-    """Settings of a stage that simulates: those of the simulator, and of the following the ones that it reads."""
+class StageSettings(RunSettings):
+    """The keys of a run that a stage reads, and the values that the pipeline derives for it."""
 
     model_config = ConfigDict(validate_default=False)
 
-    files: dict[str, str] = setting(None)  # SHA-256 of all files that are read, by path
-    name: str = setting(None)
-    seed: int = setting(None)
-    simulation: MaterialSettings = setting(None)
-    target: TargetSettings = setting(None)
-    published: PublishedSettings | None = setting(None)
-    payload_at: PlaceSettings | None = setting(None)
-    markers: MarkerSettings | None = setting(None)
-    data: Any = setting(None)  # of simulations, of recordings or of pictures
-    played: PlayedSettings = setting(None)
-    trials: Many[Trial] = setting(None)
+    reads: Many[str]  # keys of the run; a dotted key leads to one key of a group
+    files: dict[str, str] = setting({})  # SHA-256 of all files that are read, by path
+    trials: Many[Trial] = setting(())
     learned: Many[str] | None = setting(None)  # names of the trials of training and validation; None with folds
-    split: Split = setting(None)
-    shared: str = setting(None)  # folder of the dataset, from that of the split
-    acquired: str = setting(None)  # fingerprint of the stage that wrote the dataset
-    steps: int = setting(None)
-    train_fraction: float = setting(None)
-    trial_seconds: float | None = setting(None)
-    batch: int | None = setting(None)
-    release: ReleaseSettings = setting(None)
-    identify: IdentifySettings = setting(None)
-    identified: IdentifiedSettings | None = setting(None)
-    law: LawSettings = setting(None)
-    with_law: bool = setting(None)  # whether the law of the material is identified
-    shapes: dict[str, ShapeSettings] = setting(None)
-    model: str = setting(None)
-    reconstruction: ReconstructionSettings = setting(None)
-    reconstructed: Many[str] = setting(None)  # names of the trials
-    force_frame: str = setting(None)
-    actuation: ActuationSettings = setting(None)
-    range_guard: bool = setting(None)
+    split: Split = setting(Split(train=(), validation=(), test=()))
+    shared: str = setting("")  # folder of the dataset, from that of the split
+    acquired: str = setting("")  # fingerprint of the stage that wrote the dataset
+    model: str = setting("")
+    reconstructed: Many[str] = setting(())  # names of the trials
     training: TrainingSettings = setting(None)
-    correct_uncorrected: bool = setting(None)
-    groups: dict[str, Many[str]] = setting(None)  # names of the test trials by scale of the inputs, ``1`` first
-    calibration: Many[str] = setting(None)  # names of the trials that prediction intervals come from
-    horizons: Many[float] = setting(None)
-    mesh_check: float = setting(None)
-    counts: Many[int] = setting(None)  # of markers
-    draws: int = setting(None)  # of sets of markers
-    modes: int | None = setting(None)
-    reduction: ReductionSettings = setting(None)
-    figures: FigureSettings = setting(None)
-    plan: PlanSettings = setting(None)
-    must_reach: bool = setting(None)  # whether the robot must be able to reach all figures
-    feedback: FeedbackSettings = setting(None)
-    control: ControlSettings = setting(None)
+    groups: dict[str, Many[str]] = setting({})  # names of the test trials by scale of the inputs, ``1`` first
+    calibration: Many[str] = setting(())  # names of the trials that prediction intervals come from
+    must_reach: bool = setting(False)  # whether the robot must be able to reach all figures
+    folds: dict[str, Any] = setting({})  # errors of the models of a cross-validation, by the left-out trial
+    _whole: dict[str, Any] = PrivateAttr(default_factory=dict)  # all keys of the run
+
+    if TYPE_CHECKING:  # A stage with a group is part of runs that have it.
+        data: Any
+        tip: PlaceSettings
+        target: TargetSettings
+        laboratory: LaboratorySettings
+        identify: IdentifySettings
+        law: LawSettings
+        control: ControlSettings
+        ablation: AblationSettings
+        mesh_check: float
 
     @model_validator(mode="after")
     def _lacks_others(self) -> Self:
-        for name in type(self).model_fields.keys() - self.model_fields_set:
-            del self.__dict__[name]
+        self._whole.update(self.__dict__)
+        derived = {name: value for name, value in self.__dict__.items() if name not in RunSettings.model_fields}
+        object.__setattr__(self, "__dict__", _part(self, self.reads) | derived)
         return self
 
     @classmethod
     def reading(cls, run: RunSettings, *keys: str, **values: Any) -> Self:
-        """Returns settings with keys of a run and of its simulator, and ``values`` for what is derived."""
-        return cls(**{key: getattr(run, key) for key in (*SimulatorSettings.model_fields, *keys)}, **values)
+        """Returns the settings of a stage.
 
-    def reads(self, key: str) -> bool:
-        """Whether the stage reads a key."""
-        return key in self.model_fields_set
+        Args:
+            run: settings of the run.
+            keys: those that the stage reads; a dotted key leads to one key of a group.
+            values: what is derived from the run.
+        """
+        return cls(**dict(run), **values, reads=tuple(dict.fromkeys(keys)))
+
+    @override
+    def plain(self) -> dict[str, Any]:
+        """Returns nested data of JSON types with all keys of the run, from which `parse` makes this object again."""
+        whole = self.model_copy()
+        object.__setattr__(whole, "__dict__", self._whole)
+        absent = type(self).model_fields.keys() - self.model_fields_set - RunSettings.model_fields.keys()
+        return whole.model_dump(mode="json", by_alias=True, exclude=absent)
+
+    @override
+    def content(self) -> Any:
+        derived = self.model_fields_set - RunSettings.model_fields.keys() - {"reads"}
+        values = {name: value for name, value in self.__dict__.items() if name in RunSettings.model_fields}
+        values |= {name: self.__dict__[name] for name in derived}
+        return {name: _content(value) for name, value in values.items()}
+
+
+def _part(group: Settings, keys: Iterable[str]) -> dict[str, Any]:
+    """Returns the values of some keys of a group by name; a dotted key leads to one key of a group in it.
+
+    Names that the group lacks are left out, as it may be of another kind.
+    """
+    below: dict[str, list[str]] = {}
+    for key in keys:
+        name, _, rest = key.partition(".")
+        below.setdefault(name, []).append(rest)
+    values = {name: getattr(group, name) for name in below if name in type(group).model_fields}
+    return {
+        name: _only(value, below[name]) if "" not in below[name] and isinstance(value, Settings) else value
+        for name, value in values.items()
+    }
+
+
+def _only(group: S, keys: Iterable[str]) -> S:
+    """Returns a group that has some keys alone."""
+    part = group.model_copy()
+    object.__setattr__(part, "__dict__", _part(group, keys))
+    return part
+
+
+def _content(value: Any) -> Any:
+    """Returns nested data of settings of which some lack keys."""
+    if isinstance(value, Settings) and value.__dict__.keys() == type(value).model_fields.keys():
+        return value.plain()
+    if isinstance(value, Settings):
+        return {name: _content(one) for name, one in value.__dict__.items()}
+    return to_plain(value)

@@ -118,7 +118,7 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSe
             "a search needs one split, and data.folds makes several: set data.folds to null, and data.train, "
             "data.validation and data.test."
         )
-    training, fixed, space = run.training(search.model), _dotted(search.settings), _dotted(search.space)
+    training, fixed, space = run.training_of(search.model), _dotted(search.settings), _dotted(search.space)
     if not space:
         raise InputError("tune.space is empty: it must name at least one setting, such as network.width.")
     groups = ("network", "trainer" if training.in_the_loop is None else "in_the_loop")

@@ -31,7 +31,7 @@ from ...report.identification_section import parameter_rows
 from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
 from ...settings.pictures import PictureData
 from ...settings.run import RunSettings
-from ...settings.stages import ReportStage, StageSettings
+from ...settings.stages import SIMULATOR, StageSettings
 from ..build import build_mesh, simulation_device
 from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from ..identify import Checkpoint, bounds_of, search_parameters
@@ -72,8 +72,9 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     data = run.pictures
     assert data is not None
     stages, upstream = list[Stage](), tuple[str, ...]()
-    common = {"files": {**files, **picture_files(data)}, "data": data}
-    settings = StageSettings.reading(run, "simulation", "seed", **common)
+    run, files = run.model_copy(update={"data": data}), {**files, **picture_files(data)}
+    keys = (*SIMULATOR, "simulation", "seed", "data")
+    settings = StageSettings.reading(run, *keys, files=files)
     if data.folder is None:
         of_poses = {own.folder: [SCENE, own.points] for own in data.poses.values()}
         for own in data.poses.values():
@@ -81,12 +82,11 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
         written = tuple(f"recordings/{folder}/{file}" for folder, files in of_poses.items() for file in files if file)
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
-    identified = StageSettings.reading(run, "simulation", "seed", "identify", **common)
+    identified = StageSettings.reading(run, *keys, "identify", files=files)
     laws = dict.fromkeys(law_file(data.poses[name].material or "") for name in data.train)
     stages.append(Stage("identify", identify_pictures, (IDENTIFICATION, *laws), identified, ("import",)))
     stages.append(Stage(COMPARE, compare_pictures, (DIFFERENCES, OUTLINES), identified, ("identify",)))
-    shown = ReportStage(config=run)
-    stages.append(Stage("report", report_pictures, (REPORT,), shown, (COMPARE,)))
+    stages.append(Stage("report", report_pictures, (REPORT,), run, (COMPARE,)))
     return stages
 
 
@@ -348,10 +348,10 @@ def summary_of(rows: Sequence[Mapping[str, Any]], data: PictureData) -> list[Pic
 
 def report_pictures(context: StageContext) -> None:
     """Writes report.html and its figures."""
-    run: RunSettings = context.settings.config
+    run: RunSettings = context.settings
     data = run.pictures
     assert data is not None
-    settings = StageSettings.reading(run, "simulation", "seed", files={}, data=data)
+    settings = StageSettings.reading(run, *SIMULATOR, "simulation", "seed", "data")
     poses = SeenPoses(settings, context.run_dir)
     identified = read_json(context.run_dir / IDENTIFICATION)["sysid"]
     start = dict(run.simulation.constants)

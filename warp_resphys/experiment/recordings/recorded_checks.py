@@ -12,7 +12,6 @@ from ...fem.body import Body
 from ...io.errors import InputError, listed, naming, number_of
 from ...mesh.mesh import select_vertices
 from ...settings.run import RunSettings
-from ...settings.stages import PlayedSettings
 from ...settings.trials import MarkerSettings, RecordedData, Trial
 from ..actuators import Drive, drive_of
 from ..build import build_material, marker_view_of, mounted_on
@@ -163,10 +162,11 @@ def _check_laboratory(run: RunSettings, data: RecordedData, trials: Sequence[Tri
                 f"laboratory.seconds is {laboratory.seconds}, less than data.seconds ({data.seconds}): record at "
                 "least as long as the data are used."
             )
-    played = PlayedSettings.of(run, files={})
     if begins & {*RESTING} and data.steps is not None:
         substeps_of(run.time_step, laboratory, "laboratory")
         if drive is not None:
             random = np.random.default_rng(0)
             parts, sequences = len(drive.parts), laboratory.sequences
-            draw_inputs(sequences, largest_input(played), data.steps, run.time_step, parts, random)
+            draw_inputs(
+                sequences, largest_input(data.input_limit, laboratory), data.steps, run.time_step, parts, random
+            )

@@ -1,4 +1,4 @@
-"""Tendons through guides: stress, tangent and derivatives by actuation, friction and routing.
+"""Tendons through guides: stress, tangent, and which guides slide.
 
 A point is the segment of a tendon between two guides. The first column of F = sum_a x_a g_a^T is the vector from one
 guide to the next; the other two are its changes as the guides move in the body along the tendon's two offset
@@ -16,7 +16,6 @@ wp.set_module_options({"enable_backward": False})
 
 ZERO, ONE = wp.float64(0.0), wp.float64(1.0)
 OFFSET_UNIT = 5e-3  # unit of the offsets [m], about a cell size, so that the columns of F have similar norms
-PER_UNIT_OFFSET = wp.float64(1.0 / OFFSET_UNIT)
 
 
 @wp.func
@@ -39,7 +38,7 @@ def segment(
 
 @wp.func
 def bristle(slide: wp.float64, hold: wp.float64, drop: wp.float64, rise: wp.float64, length: wp.float64):
-    """Returns energy, force and slope of a guide's friction after a slide (``energies.tendon_friction``)."""
+    """Returns energy, force and slope of a guide's friction after a slide (``energies.tendon_forces``)."""
     size, start, most, sign = slide, hold, rise, ONE
     if slide < ZERO:
         size, start, most, sign = -slide, -hold, drop, -ONE
@@ -54,36 +53,33 @@ def pull(
     anchors: wp.array[wp.mat33d],
     first: wp.array[int],  # (T + 1) first segment of each tendon
     rest: wp.array[wp.mat33d],  # (P) F of the undeformed body
-    first_offset: wp.array2d[wp.float64],  # (B, T) [m]
-    second_offset: wp.array2d[wp.float64],
+    toe: wp.float64,  # elongation at which the spring reaches its full stiffness [m]
+    route: wp.array2d[wp.vec3d],  # (B, T) c
     commanded: wp.array2d[wp.float64],  # (B, T) tension [N]
     contraction: wp.array2d[wp.float64],  # (B, T) [m]
     stiffness: wp.array2d[wp.float64],  # (B, T) of the spring [N/m]
-    toe: wp.float64,  # elongation at which the spring reaches its full stiffness [m]
     hold: wp.array2d[wp.float64],  # (B, P) friction of the guide before each segment at the step's start [N]
     drop: wp.array2d[wp.float64],  # (B, P) its bounds, downwards and upwards [N]
     rise: wp.array2d[wp.float64],
     beyond: wp.array2d[wp.float64],  # (B, P) length of the tendon beyond that guide at the step's start [m]
     bristles: wp.array2d[wp.float64],  # (B, T) bristle length [m]
     positions: wp.array2d[wp.vec3d],
-    along_out: wp.array2d[wp.vec3d],  # (B, T) c
     tension_out: wp.array2d[wp.float64],  # (B, P) of each segment [N]
     spring_out: wp.array2d[wp.vec3d],  # (B, T) energy, force and slope of a spring of stiffness one [m^2, m, -]
     friction_out: wp.array2d[wp.vec3d],  # (B, P) energy [J], slide [m] and slope [N/m] of the friction before it
 ):
-    """Computes the vector c, spring, friction and tensions of each tendon."""
+    """Computes spring, friction and tensions of each tendon."""
     b, t = wp.tid()
     if active[b] == 0:
         return
-    c = wp.vec3d(ONE, PER_UNIT_OFFSET * first_offset[b, t], PER_UNIT_OFFSET * second_offset[b, t])
-    along_out[b, t] = c
+    c = route[b, t]
     longer = wp.float64(0.0)
     length = wp.float64(0.0)
     for k in range(first[t + 1] - first[t]):
         p = first[t + 1] - 1 - k  # from the end, as friction depends on the length beyond a guide
-        own = wp.length(segment(points, positions, anchors, b, p) * c)
-        length += own
-        longer += own - wp.length(rest[p] * c)
+        span = wp.length(segment(points, positions, anchors, b, p) * c)
+        length += span
+        longer += span - wp.length(rest[p] * c)
         slide = length - beyond[b, p]
         energy, force, slope = bristle(slide, hold[b, p], drop[b, p], rise[b, p], bristles[b, t])
         friction_out[b, p] = wp.vec3d(energy, slide, slope)
@@ -103,10 +99,10 @@ def local_step(
     anchors: wp.array[wp.mat33d],
     first: wp.array[int],
     tendon: wp.array[int],  # (P)
+    route: wp.array2d[wp.vec3d],
     commanded: wp.array2d[wp.float64],
     stiffness: wp.array2d[wp.float64],
-    along: wp.array2d[wp.vec3d],  # (B, T) c, from `pull` like the next three
-    total: wp.array2d[wp.float64],
+    total: wp.array2d[wp.float64],  # (B, P) tension, from `pull` like the next two
     spring: wp.array2d[wp.vec3d],
     friction: wp.array2d[wp.vec3d],
     positions: wp.array2d[wp.vec3d],
@@ -118,7 +114,7 @@ def local_step(
     if active[b] == 0:
         return
     t = tendon[p]
-    c = along[b, t]
+    c = route[b, t]
     line = segment(points, positions, anchors, b, p) * c
     energy = commanded[b, t] * wp.length(line) + friction[b, p][0]
     if p == first[t]:
@@ -134,7 +130,7 @@ def tangent(
     points: MatrixPoints,
     anchors: wp.array[wp.mat33d],
     tendon: wp.array[int],
-    along: wp.array2d[wp.vec3d],
+    route: wp.array2d[wp.vec3d],
     total: wp.array2d[wp.float64],
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
@@ -146,7 +142,7 @@ def tangent(
     b, p = wp.tid()
     if active[b] == 0:
         return
-    c = along[b, tendon[p]]
+    c = route[b, tendon[p]]
     line = segment(points, positions, anchors, b, p) * c
     length = wp.length(line)
     stiffness = ZERO
@@ -165,103 +161,23 @@ def tangent(
 
 
 @wp.kernel
-def directions(
-    points: MatrixPoints,
-    anchors: wp.array[wp.mat33d],
-    tendon: wp.array[int],
-    along: wp.array2d[wp.vec3d],
-    positions: wp.array2d[wp.vec3d],
-    direction_out: wp.array2d[wp.mat33d],  # (B, P)
-):
-    """Derivative u c^T of the length of each segment by F, with the unit vector u along the segment."""
-    b, p = wp.tid()
-    c = along[b, tendon[p]]
-    line = segment(points, positions, anchors, b, p) * c
-    direction_out[b, p] = wp.outer(direction_of(line), c)
-
-
-@wp.kernel
-def adjoint(
-    points: MatrixPoints,
-    anchors: wp.array[wp.mat33d],
-    tendon: wp.array[int],
-    rest: wp.array[wp.mat33d],
-    along: wp.array2d[wp.vec3d],
-    total: wp.array2d[wp.float64],
-    positions: wp.array2d[wp.vec3d],
-    direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-    by_tension_out: wp.array2d[wp.float64],  # (B, P) -u . dZ c, this segment's part of dL/dT [m]
-    by_offset_out: wp.array2d[wp.vec2d],  # (B, P) dL/d offset at constant tension [N]
-    longer_out: wp.array2d[wp.vec2d],  # (B, P) derivative of the segment's length by the offsets
-    rest_out: wp.array2d[wp.vec2d],  # (B, P) derivative of its length at rest
-):
-    """Derivatives of each segment by tension and offsets, with dZ = F of the displacement z."""
-    b, p = wp.tid()
-    t = tendon[p]
-    c = along[b, t]
-    f = segment(points, positions, anchors, b, p)
-    dz = matrix_at(points, direction, b, p)
-    line, moved = f * c, dz * c
-    u, u_rest = direction_of(line), direction_of(rest[p] * c)
-    shorter = -wp.dot(u, moved)
-    turned = wp.vec3d(ZERO, ZERO, ZERO)
-    if wp.length(line) > ZERO:
-        turned = (moved + shorter * u) / wp.length(line)
-    by_offset = -total[b, p] * (wp.transpose(dz) * u + wp.transpose(f) * turned)
-    longer, at_rest = wp.transpose(f) * u, wp.transpose(rest[p]) * u_rest
-    by_tension_out[b, p] = shorter
-    by_offset_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(by_offset[1], by_offset[2])
-    longer_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(longer[1], longer[2])
-    rest_out[b, p] = PER_UNIT_OFFSET * wp.vec2d(at_rest[1], at_rest[2])
-
-
-@wp.kernel
 def stick(
     first: wp.array[int],
     begin: wp.array2d[wp.float64],  # (B, T) tension before the first guide [N]
-    held: wp.array2d[wp.float64],  # (B, P) tension of each segment so far [N]
+    segments: wp.array2d[wp.float64],  # (B, P) tension of each segment so far [N]
     growth: wp.array2d[wp.float64],  # (B, P) exp(mu theta) of the guide before it
-    tension_out: wp.array2d[wp.float64],  # (B, P) its tension, within the bounds of that guide [N]
+    slides_out: wp.array2d[int],  # (B, P) -1 and 1 where that guide slides, so that the tension falls or rises there
 ):
-    """Lets every guide stick, or slide as far as its bounds ask for."""
+    """Lets every guide stick, or slide as far as its bounds ask for; guides without contact slide."""
     b, t = wp.tid()
     before = wp.float64(begin[b, t])
     for p in range(first[t], first[t + 1]):
-        before = wp.clamp(held[b, p], before / growth[b, p], before * growth[b, p])
-        tension_out[b, p] = before
-
-
-@wp.kernel
-def stick_adjoint(
-    first: wp.array[int],
-    begin: wp.array2d[wp.float64],
-    held: wp.array2d[wp.float64],
-    growth: wp.array2d[wp.float64],
-    tension: wp.array2d[wp.float64],
-    adjoint: wp.array2d[wp.float64],  # (B, P) of the tension
-    begin_out: wp.array2d[wp.float64],
-    held_out: wp.array2d[wp.float64],
-    growth_out: wp.array2d[wp.float64],
-):
-    """Adjoint of `stick`; guides without contact slide."""
-    b, t = wp.tid()
-    carried = wp.float64(0.0)
-    for k in range(first[t + 1] - first[t]):
-        p = first[t + 1] - 1 - k
-        before = begin[b, t]
-        if p > first[t]:
-            before = tension[b, p - 1]
-        total = adjoint[b, p] + carried
-        by_held, by_growth, factor = ZERO, ZERO, ZERO
-        if held[b, p] <= before / growth[b, p]:
-            factor = ONE / growth[b, p]
-            by_growth = -total * before * factor * factor
-        elif held[b, p] >= before * growth[b, p]:
-            factor = growth[b, p]
-            by_growth = total * before
+        if segments[b, p] <= before / growth[b, p]:
+            slides_out[b, p] = -1
+            before = before / growth[b, p]
+        elif segments[b, p] >= before * growth[b, p]:
+            slides_out[b, p] = 1
+            before = before * growth[b, p]
         else:
-            by_held = total
-        held_out[b, p] = by_held
-        growth_out[b, p] = by_growth
-        carried = total * factor
-    begin_out[b, t] = carried
+            slides_out[b, p] = 0
+            before = segments[b, p]

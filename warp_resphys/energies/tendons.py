@@ -11,7 +11,7 @@ by tension has k = 0, one commanded by length has T = 0, and a passive cable has
 
 Without friction the tension is the same in all segments of a tendon: its change, k s'' g g^T with the gradient g of the
 length, couples all vertices near the tendon. It is a low-rank correction to a Hessian that stays as sparse as the mesh.
-With friction (`tendon_friction`) there is such a correction for every guide.
+With friction (`tendon_forces`) there is such a correction for every guide.
 
 The routing may be a parameter, too: the guides move in the undeformed body along up to two given directions, from X to
 X + o_1 d_1 + o_2 d_2. A guide is at sum_a N_a(X) x_a; the shape functions N_a are extrapolated linearly from X, so that
@@ -20,11 +20,10 @@ offsets must be small compared with the cells. L_0 is the length of the offset t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
@@ -33,21 +32,19 @@ from ..kernels import tendon_segments as kernels
 from ..mesh.mesh import Mesh
 from ..mesh.surface import locate
 from ..stepping.quantity import Parameter, Quantity
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, PointSet, Values, value_of
-from .launcher import Launcher, warp_view
-from .pointwise import PartTerm
-from .tendon_friction import (
+from .base import BoundEnergy, Energy, EnergySite, PointSet
+from .launcher import Launcher
+from .tendon_forces import (
     BRISTLE,
     CONTRACTION,
     FRICTION,
     OFFSETS,
-    STEP_VALUES,
+    ROUTE,
     STIFFNESS,
     TENSION,
     BoundTendons,
     TendonPoints,
-    beyond,
-    friction_after,
+    TendonTerm,
 )
 
 
@@ -194,10 +191,12 @@ class Tendons(Energy):
 
     @override
     def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Implements `Energy.prepare`; offsets without a direction are zero."""
+        """Implements `Energy.prepare`, with the offsets as ``tendon_route`` (1 or B, T, 3)."""
         values = super().prepare(constants)
-        zero = torch.zeros_like(values["tendon_stiffness"])
-        return values | {offset.name: zero for offset in OFFSETS[self.offset_count :]}
+        one = torch.ones_like(values[STIFFNESS.name])
+        offsets = [values.pop(offset.name) / kernels.OFFSET_UNIT for offset in OFFSETS[: self.offset_count]]
+        parts = [one, *offsets, *(torch.zeros_like(one),) * (len(OFFSETS) - len(offsets))]
+        return values | {ROUTE: torch.stack(torch.broadcast_tensors(*parts), -1)}
 
     @override
     def bind(self, site: EnergySite) -> BoundEnergy:
@@ -244,12 +243,12 @@ class Tendons(Energy):
         operator = np.zeros((len(nodes), 1, most, 3))
         for row, own in enumerate(operators):
             operator[row, 0, : len(own)] = own
-        lines = (np.concatenate(rest), np.concatenate(anchors))
+        lines = (np.concatenate(rest), np.concatenate(anchors), self.offset_count)
         return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), *lines),)
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "TendonTerm":
-        return TendonTerm(launcher, sets, self)
+        return TendonTerm(launcher, sets, self.count, self.toe, self.friction is not None)
 
 
 def _difference(
@@ -262,146 +261,3 @@ def _difference(
     used = np.abs(sums).max(axis=1) > 1e-14
     used[0] |= not used.any()  # both guides are fixed in the world
     return vertices[used], sums[used]
-
-
-class TendonTerm(PartTerm):
-    """Kernels of tendons, on the set of their segments."""
-
-    couples_cells = True
-    _kernels = kernels
-
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], tendons: Tendons) -> None:
-        (s,) = sets
-        assert isinstance(s.source, TendonPoints)
-        numbers = s.source.part
-        names = ("tendon_tension", "tendon_contraction", "tendon_stiffness", *(offset.name for offset in OFFSETS))
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(names, (tendons.count,))
-        self._rubs = tendons.friction is not None
-        if self._rubs:
-            shapes |= {BRISTLE.name: (tendons.count,), **dict.fromkeys(STEP_VALUES, (s.n_points,))}
-        super().__init__(launcher, sets, shapes, tendons.count)
-        self._beyond = torch.as_tensor(beyond(numbers), device=launcher.device)
-        self._toe = wp.float64(tendons.toe)
-        self._first = launcher.upload(np.searchsorted(numbers, np.arange(tendons.count + 1)).astype(np.int32), int)
-        self._rest = launcher.upload(s.source.rest, wp.mat33d)
-        self._anchors = launcher.upload(s.source.anchors, wp.mat33d)
-        self._along, self._tension = launcher.zeros(tendons.count, 3), launcher.zeros(s.n_points)
-        self._spring, self._friction = launcher.zeros(tendons.count, 3), launcher.zeros(s.n_points, 3)
-        self._direction = launcher.zeros(s.n_points, 3, 3)
-        self._directions: Any = None  # the launch that fills it, made at its first use
-        self._segment_length = torch.as_tensor(np.linalg.norm(s.source.rest[..., 0], axis=1), device=launcher.device)
-        columns = 1 + tendons.offset_count
-        operator = np.zeros((s.n_points, s.n_vertices, columns))
-        rows = np.arange(s.n_points)[:, None]
-        np.add.at(operator, (rows, s.source.nodes), s.source.gradients[:, 0, :, :columns])
-        self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (.., P, N)
-
-    @property
-    def _pull(self) -> tuple[Any, Any]:
-        """Outputs of `before`: c of each tendon and the tension of each segment."""
-        return warp_view(self._along, wp.vec3d), warp_view(self._tension, wp.float64)
-
-    @override
-    def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
-        (s,) = self.sets
-        tension, contraction, stiffness, first, second, *rubbing = self.views(values)
-        if self._rubs:
-            bristles, *friction = rubbing
-        else:
-            zeros, ones = self.launcher.zeros(s.n_points), self.launcher.zeros(self.count) + 1.0
-            bristles, *friction = (warp_view(own, wp.float64) for own in (ones, *(zeros,) * 4))
-        runs = [s.points, self._anchors, self._first, self._rest, first, second]
-        inputs = [active, *runs, tension, contraction, stiffness, self._toe, *friction, bristles, positions]
-        outputs = [*self._pull, warp_view(self._spring, wp.vec3d), warp_view(self._friction, wp.vec3d)]
-        return [self.launcher.record(kernels.pull, (self.launcher.batch, self.count), inputs, outputs)]
-
-    @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        tension, _, stiffness, *_ = self.views(values)
-        runs = [s.points, self._anchors, self._first, self.part]
-        forces = [warp_view(own, wp.vec3d) for own in (self._spring, self._friction)]
-        return [*runs, tension, stiffness, *self._pull, *forces, positions]
-
-    @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        return kernels.tangent, [s.points, self._anchors, self.part, *self._pull, positions]
-
-    @override
-    def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
-        stiffness, slopes = value_of(values, "tendon_stiffness"), self._friction[..., 2]
-        sprung, rubs = bool((stiffness > 0.0).any()), self._rubs and bool((slopes > 0.0).any())
-        if not (sprung or rubs):
-            return None
-        own, (s,) = self.launcher, self.sets
-        if self._directions is None:
-            inputs = [s.points, self._anchors, self.part, self._pull[0], positions]
-            out = [warp_view(self._direction, wp.mat33d)]
-            self._directions = own.record(kernels.directions, (own.batch, s.n_points), inputs, out)
-        own.launch(self._directions)
-        columns = self._direction.movedim(-1, 1)[:, : len(self._operator)]  # (B, .., P, 3)
-        weights = []  # (B, P, r) of the segments' lengths in the columns
-        if sprung:
-            weights.append(self._one_hot * (stiffness * self._spring[..., 2]).sqrt()[:, None])
-        if rubs:
-            weights.append(self._beyond * slopes.sqrt()[:, None])
-        by_column = columns[..., None] * torch.cat(weights, -1)[:, None, :, None]  # (B, .., P, 3, r)
-        gradient = (self._operator.mT @ by_column.flatten(3)).sum(1)  # (B, N, 3 r)
-        return gradient.unflatten(2, (3, -1)).flatten(1, 2)
-
-    @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        tension, stiffness = value_of(values, "tendon_tension"), value_of(values, "tendon_stiffness")
-        # |F c|^2 <= |c|^2 |F|^2, and the square of a sum of n lengths is at most n times the sum of their squares.
-        columns = 1.0 + sum((value_of(values, o.name) / kernels.OFFSET_UNIT).square() for o in OFFSETS)
-        stretching = (tension * columns)[:, self.part_of] / self._segment_length
-        if self._rubs:  # A guide's slope is at most the sum of its bounds over the bristle length.
-            _, drop, rise, _ = (value_of(values, name) for name in STEP_VALUES)
-            slopes = (drop + rise) / value_of(values, BRISTLE.name)[:, self.part_of] * self._beyond.sum(0)
-            stretching = stretching + columns[:, self.part_of] * (slopes @ self._beyond.mT)
-        return stretching + (stiffness * columns * self._one_hot.sum(0))[:, self.part_of]
-
-    @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own, (s,) = self.launcher, self.sets
-        views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
-        shorter = own.zeros(s.n_points)
-        by_offset, longer, at_rest = (own.zeros(s.n_points, 2) for _ in range(3))
-        inputs = [s.points, self._anchors, self.part, self._rest, *self._pull, *views]
-        outputs = [warp_view(shorter, wp.float64), *(warp_view(x, wp.vec2d) for x in (by_offset, longer, at_rest))]
-        launches = [
-            *self.before(values, views[0], warp_view(own.active, wp.int32)),
-            own.record(kernels.adjoint, (own.batch, s.n_points), inputs, outputs),
-        ]
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(*launches)
-            stiffness = value_of(values, "tendon_stiffness")
-            by_tension = self.sum_parts(shorter)
-            by_contraction = stiffness * self._spring[..., 2] * by_tension
-            by_stiffness = self._spring[..., 1] * by_tension
-            by_offsets = [
-                self.sum_parts(held) + by_contraction * self.sum_parts(taut)
-                for held, taut in zip(by_offset.unbind(-1), (longer - at_rest).unbind(-1), strict=True)
-            ]
-            if not self._rubs:
-                return dict(zip(self.shapes, (by_tension, by_contraction, by_stiffness, *by_offsets), strict=True))
-            past = shorter @ self._beyond  # (B, P) of the tendon beyond each guide
-            by_length = -self._friction[..., 2] * past
-            by_offsets = [
-                total - self.sum_parts((by_length @ self._beyond.mT) * taut)
-                for total, taut in zip(by_offsets, longer.unbind(-1), strict=True)
-            ]
-            by_friction = self._friction_slopes(values, past)
-            slopes = (by_tension, by_contraction, by_stiffness, *by_offsets, *by_friction, by_length)
-            return dict(zip(self.shapes, slopes, strict=True))
-
-        return differentiate
-
-    def _friction_slopes(self, values: Values, past: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the derivatives by bristle length, hold, drop and rise; ``past`` (B, P) is -z . d length beyond."""
-        length, hold, drop, rise, _ = (value_of(values, name) for name in (BRISTLE.name, *STEP_VALUES))
-        with torch.enable_grad():
-            length, hold, drop, rise = leaves = [x.detach().requires_grad_() for x in (length, hold, drop, rise)]
-            slide = self._friction[..., 1].clone()
-            friction = friction_after(slide, hold, drop, rise, length[:, self.part_of])
-            return torch.autograd.grad(friction, leaves, past)

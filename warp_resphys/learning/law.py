@@ -30,7 +30,7 @@ import torch
 from ..dynamics.simulator import Simulator
 from ..energies.hysteresis import PLASTIC_STRAIN
 from ..energies.solid import VISCOUS_STRAIN
-from ..energies.tendon_friction import SEGMENT_TENSION
+from ..energies.tendon_forces import SEGMENT_TENSION
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs

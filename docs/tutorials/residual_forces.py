@@ -25,10 +25,11 @@ import warp as wp
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import MarkerMap
+from warp_resphys.learning.correction import CorrectedSimulator, known_positions
 from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.reconstruction import make_reconstructor
-from warp_resphys.learning.rollout import Rollout, closed_loop
 from warp_resphys.settings.learning import NetworkSettings
+from warp_resphys.stepping.rollout import rollout
 
 wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)
@@ -59,7 +60,9 @@ motion = robot.rollout(held, STEPS)  # q and v (T + 1, B, N, 3)
 def rolled_out(simulator, predict=None):
     """(T + 1, B, N, 3) simulated positions of the test motions, from their first state [m]."""
     start = State(motion.q[0, test], motion.v[0, test])
-    return closed_loop(Rollout(simulator, predict), start, STEPS).transpose(0, 1)
+    corrected = CorrectedSimulator(simulator, predict)
+    with torch.no_grad():
+        return torch.stack(rollout(corrected.step, start, range(STEPS), known_positions))
 
 
 def error(q):

@@ -7,8 +7,8 @@ import torch
 
 from warp_resphys import State
 from warp_resphys.experiment.models import Learned
+from warp_resphys.learning.correction import LearnedPredictor, Range
 from warp_resphys.learning.networks import ResidualForce, build_model
-from warp_resphys.learning.rollout import LearnedPredictor, Range
 from warp_resphys.settings.learning import NetworkSettings
 
 SAMPLES, VERTICES = 30, 8

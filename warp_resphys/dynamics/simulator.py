@@ -23,6 +23,7 @@ from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import make_integrator
 from ..stepping.quantity import Quantity
+from ..stepping.rollout import rollout
 from ..stepping.state import Constants, SolveReport, State
 from .assembly import BlockPattern
 from .energy_set import EnergySet
@@ -542,24 +543,29 @@ class Simulator:
         inputs = self._fitted(inputs, state.batch)
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
-        states, unchecked = [state], list[State]()
-        together = 1 if state.q.device.type == "cpu" else _STEPS_TO_CHECK
-        for t, current in enumerate(inputs.by_step(steps)):
-            if t == 0:
-                self._checked(state, current, constants)
-            elif current is not inputs:
-                self._check_inputs(current, state.batch)
-            state = self._advance(state, current, constants)
-            states.append(state)
-            unchecked.append(state)
-            if len(unchecked) == together or t == steps - 1:
-                for solved in unchecked:
-                    check_converged(self.settings, solved.report, solved.q)
-                unchecked.clear()
-        q, v = (torch.stack([getattr(s, name) for s in states]) for name in ("q", "v"))
+        self._checked(state, inputs.at(0), constants)
+        together, unchecked = 1 if state.q.device.type == "cpu" else _STEPS_TO_CHECK, list[State]()
+
+        def check() -> None:
+            for solved in unchecked:
+                check_converged(self.settings, solved.report, solved.q)
+            unchecked.clear()
+
+        def step(before: State, now: Inputs) -> State:
+            if now is not inputs:
+                self._check_inputs(now, before.batch)
+            unchecked.append(self._advance(before, now, constants))
+            after = unchecked[-1]
+            if len(unchecked) == together:
+                check()
+            return after
+
+        states = rollout(step, state, inputs.by_step(steps), lambda reached: reached)
+        check()
+        q, v = (torch.stack([getattr(reached, name) for reached in states]) for name in ("q", "v"))
         obstacles = self.obstacle_motions(states, constants)
-        reports = [after.report for after in states if after.report is not None]
-        return Trajectory(q, v, reports, state, self.body, self.time_step, obstacles)
+        reports = [after.report for after in states[1:] if after.report is not None]
+        return Trajectory(q, v, reports, states[-1], self.body, self.time_step, obstacles)
 
     def _checked(
         self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None

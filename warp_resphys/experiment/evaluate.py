@@ -19,6 +19,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
+from ..learning.correction import known_positions
 from ..learning.metrics import PHASES, errors_per_marker, marker_errors, summarise, summarise_trajectories
 from ..learning.replay import Replay
 from ..settings.stages import StageSettings
@@ -119,13 +120,9 @@ def _rolled_out(part: TrialPart, report: Report) -> Arrays:
     model, filmed = part.more
     run, points, bodies = ModelRollout(experiment, model, part.names), list[torch.Tensor](), list[torch.Tensor]()
     predictor = run.predictor(learned_of(experiment, model))
-    for state, lost in run.roll(predictor):
-        points.append(run.points(state, lost))
-        bodies += [
-            torch.where(lost[row], torch.nan, state.q[row]).float()
-            for row, name in enumerate(part.names)
-            if name == filmed
-        ]
+    for state in run.roll(predictor):
+        points.append(run.points(state))
+        bodies += [known_positions(state)[row].float() for row, name in enumerate(part.names) if name == filmed]
         report()
     shift = run.start.shift
     sideways = torch.full((len(part.names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)

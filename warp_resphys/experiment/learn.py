@@ -13,10 +13,10 @@ from ..dynamics.modes import RestStiffness
 from ..io.files import read_array, read_hdf5, resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
+from ..learning.correction import Range
 from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model
 from ..learning.replay import Replay, Windows
-from ..learning.rollout import Range
 from ..learning.training import EpochTrainer, Samples, SequenceTrainer, Trainer
 from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSettings
 from ..settings.stages import StageSettings

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -14,10 +14,11 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
+from ..learning.correction import CorrectedSimulator, LearnedPredictor, Range, is_lost
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.replay import Start
-from ..learning.rollout import LearnedPredictor, Range, Rollout
+from ..stepping.rollout import states
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment
 from .files import GIVEN, weights_file
@@ -136,27 +137,26 @@ class ModelRollout:
             self._first = self.replay.initial_state(self.start, self._constants, self._resting)
         return self._first
 
-    def roll(self, predictor: LearnedPredictor | None) -> Iterator[tuple[State, torch.Tensor]]:
-        """Yields the state of each step, and which trials (R,) have diverged; so has a pose without equilibrium.
+    @torch.no_grad()
+    def roll(self, predictor: LearnedPredictor | None) -> Iterator[State]:
+        """Yields the state of each step; a pose without equilibrium is lost.
 
         Raises:
             ConvergenceError: the equilibrium from which a motion begins was not found.
         """
-        rollout, failed = Rollout(self._simulator, predictor, self._inputs, self._constants), False
         try:
             state = self.begin(predictor)
         except ConvergenceError:
             if not self.replay.is_static:
                 raise
-            state, failed = self._simulator.rest_state(len(self.replay.trials.names)), True
-        yield state, rollout.lost(state) | failed
-        for _ in range(self.steps):
-            state = rollout.step(state)
-            yield state, rollout.lost(state) | failed
+            state = self._simulator.rest_state(len(self.replay.trials.names))
+            state = replace(state, lost=~is_lost(state))
+        step = CorrectedSimulator(self._simulator, predictor, self._inputs, self._constants).step
+        yield from states(step, state, range(self.steps))
 
-    def points(self, state: State, lost: torch.Tensor) -> torch.Tensor:
+    def points(self, state: State) -> torch.Tensor:
         """(R, M, 3) observed points of a state [m]; NaN where the roll-out has diverged."""
-        return torch.where(lost[:, None, None], torch.nan, self.replay.observe(state.q))
+        return torch.where(is_lost(state)[:, None, None], torch.nan, self.replay.observe(state.q))
 
     def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
         """(R, T, M, 3) observed points at the frames of the trials [m], from those of all steps (R, M, 3)."""
@@ -171,11 +171,11 @@ class ModelRollout:
             steps = min(steps, self._experiment.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
-            for state, lost in islice(self.roll(self.predictor(learned)), steps + 1):
-                if series and bool(lost.all()):
+            for state in islice(self.roll(self.predictor(learned)), steps + 1):
+                if series and bool(is_lost(state).all()):
                     series = []
                     break
-                series.append(self.points(state, lost))
+                series.append(self.points(state))
         if not series:
             return [np.full(1, np.nan) for _ in observed]
         first = first_frame(self._experiment, self.replay.trials.names)

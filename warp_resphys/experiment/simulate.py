@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ from ..settings.trials import (
     Trial,
 )
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import states
 from ..stepping.rotations import twisted
 from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
@@ -210,16 +212,15 @@ def played(
         fixed = np.asarray(simulator.body.mesh.vertices[simulator.body.fixed_vertices], dtype=np.float64)
         at_times = rigid(base.swapaxes(0, 1).reshape(-1, 6)).apply(fixed)
         moving["fixed_positions"] = simulator.tensor(at_times).unflatten(0, (len(times), -1))
-    state = begin
-    yield state
-    for number in range(part.frames - 1):
-        for i in range(1, substeps + 1):
-            # Inputs are taken at the end of a step, or in its middle.
-            share = (i - 0.5 * (simulator.integrator == "midpoint")) / substeps
-            at = number * substeps + i
-            inputs = inputs_at(number, share).replace(**{name: own[at] for name, own in moving.items()})
-            state = simulator.step(state, inputs, constants)
-        yield state
+
+    def step(state: State, number: int) -> State:
+        frame, i = divmod(number, substeps)
+        # Inputs are taken at the end of a step, or in its middle.
+        share = (i + 1 - 0.5 * (simulator.integrator == "midpoint")) / substeps
+        now = inputs_at(frame, share).replace(**{name: own[number + 1] for name, own in moving.items()})
+        return simulator.step(state, now, constants)
+
+    yield from islice(states(step, begin, range((part.frames - 1) * substeps)), 0, None, substeps)
 
 
 def _free_motion(part: TrialPart, report: Report) -> Arrays:

@@ -23,9 +23,9 @@ from typing_extensions import override
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..io.errors import ConvergenceError
 from ..settings.learning import InTheLoopSettings
+from .correction import LearnedPredictor
 from .networks import OwnNetwork, ResidualForce
 from .replay import Replay, Start, Windows
-from .rollout import LearnedPredictor
 from .training import EpochTrainer
 
 _EVALUATIONS = 12  # of the loss, at most, in one epoch

@@ -24,14 +24,15 @@ from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..settings.learning import NetworkSettings, ReconstructionSettings, TrainerSettings
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import rollout
 from ..stepping.state import State
+from .correction import CorrectedSimulator, LearnedPredictor, Predictor, known_positions
 from .identification import Identification, ParameterSearch
 from .misfit import Misfit
 from .networks import ResidualForce, build_model
 from .parameters import Bounds, configured_parameters
 from .reconstruction import follow, make_reconstructor, without_ringing
 from .replay import Replay, Start
-from .rollout import LearnedPredictor, Predictor, Rollout, closed_loop
 from .training import Samples, Trainer
 
 
@@ -244,8 +245,9 @@ def evaluate(
         else:
             predict = force
         state = replay.initial_state(start, constants, resting)
-        q = closed_loop(Rollout(used, predict, inputs, constants), state, observed.shape[1] - 1)
-        points = torch.stack([replay.observe(positions) for positions in q.unbind(1)], 1)
+        step = CorrectedSimulator(used, predict, inputs, constants).step
+        seen = rollout(step, state, range(observed.shape[1] - 1), lambda now: replay.observe(known_positions(now)))
+        points = torch.stack(seen, 1)
         distance = replay.observe.residual(points, observed).norm(dim=-1).nan_to_num(math.inf)
         mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
     return mean.transpose(0, 1)

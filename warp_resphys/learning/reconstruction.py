@@ -15,6 +15,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, Self
 
 import numpy as np
@@ -29,6 +30,7 @@ from ..io.errors import ConvergenceError, InputError
 from ..linalg.least_squares import minimise
 from ..linalg.threads import threads_for
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import states
 from ..stepping.state import State
 from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, StepProblem
 
@@ -214,12 +216,15 @@ def follow(
         targets: (B, M, D) measured points at the end of each step [unit].
         inputs: of the steps.
     """
-    force = torch.zeros_like(state.q)
-    for number, observed in enumerate(targets):
+
+    def step(last: Reconstruction, now: tuple[int, torch.Tensor]) -> Reconstruction:
+        number, observed = now
         with torch.enable_grad():
-            result = method.step(state, observed, None if inputs is None else inputs.at(number), force)
-        state, force = result.state.detach(), result.force.detach()
-        yield Reconstruction(state, force, result.iterations)
+            result = method.step(last.state, observed, None if inputs is None else inputs.at(number), last.force)
+        return Reconstruction(result.state.detach(), result.force.detach(), result.iterations)
+
+    start = Reconstruction(state, torch.zeros_like(state.q), 0)
+    return islice(states(step, start, enumerate(targets)), 1, None)
 
 
 def without_ringing(simulator: Simulator, observation: Observation) -> Simulator:

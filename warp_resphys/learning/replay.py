@@ -20,9 +20,10 @@ from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import rollout, states
 from ..stepping.state import State
+from .correction import equilibrium_under_feedback
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
-from .rollout import equilibrium_under_feedback
 
 log = logging.getLogger(__name__)
 
@@ -249,14 +250,14 @@ class Replay:
     ) -> torch.Tensor:
         """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on; for the arguments, see a call."""
         constants, inputs, resting = self.prepare(parameters)
-        state = self.initial_state(start, constants, resting, _count(parameters), force)
-        series = [self.observe(state.q)]
-        for k in range(self.steps(start)):
+
+        def step(state: State, k: int) -> State:
             state = state if windows is None else windows.begin(state, k)
             added = None if force is None else force(state, k)
-            state = self.simulator.step(state, inputs.at(k).plus(added), constants)
-            series.append(self.observe(state.q))
-        return torch.stack(series, 1)
+            return self.simulator.step(state, inputs.at(k).plus(added), constants)
+
+        begun = self.initial_state(start, constants, resting, _count(parameters), force)
+        return torch.stack(rollout(step, begun, range(self.steps(start)), lambda state: self.observe(state.q)), 1)
 
     @torch.no_grad()
     def states(self, start: Start, parameters: Parameters, near: Near | None = None) -> list[State]:
@@ -272,19 +273,17 @@ class Replay:
         """
         constants, inputs, resting = self.prepare(parameters)
         first = replace(start, state=start.state.map(lambda t: t[: len(self.trials.names)]))
-        states = [self.initial_state(first, constants, resting)]
-        for k in range(self.steps(start)):
-            states.append(self._step(states[-1], inputs.at(k), constants, None if near is None else near(k + 1)))
-        return states
 
-    def _step(self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None) -> State:
-        """Returns the next state, without the prediction if the solver fails from there."""
-        if near is not None:
-            try:
-                return self.simulator.step(state, inputs, constants, near)
-            except ConvergenceError as error:
-                log.debug("the step is solved again without a prediction: %s", error)
-        return self.simulator.step(state, inputs, constants)
+        def step(state: State, k: int) -> State:
+            predicted = None if near is None else near(k + 1)
+            if predicted is not None:
+                try:
+                    return self.simulator.step(state, inputs.at(k), constants, predicted)
+                except ConvergenceError as error:
+                    log.debug("the step is solved again without a prediction: %s", error)
+            return self.simulator.step(state, inputs.at(k), constants)
+
+        return [*states(step, self.initial_state(first, constants, resting), range(self.steps(start)))]
 
     def _observed(self, positions: Iterable[torch.Tensor]) -> torch.Tensor:
         """(B, K, M, 3) points at K positions (B, N, 3) [m], `_AT_ONCE` in a call, which is mostly overhead."""

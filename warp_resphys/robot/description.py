@@ -21,10 +21,10 @@ from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
 from ..io.stages import finished_record, planned
+from ..learning.correction import Range
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
-from ..learning.rollout import Range
 from ..mesh.mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings

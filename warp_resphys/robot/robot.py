@@ -16,10 +16,16 @@ from ..energies.materials import MASS_DAMPING
 from ..experiment.experiment import COROTATED
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError, number_of
+from ..learning.correction import (
+    DIVERGENCE_DISTANCE,
+    CorrectedSimulator,
+    LearnedPredictor,
+    equilibrium_under_feedback,
+    is_lost,
+)
 from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
-from ..learning.rollout import DIVERGENCE_DISTANCE, LearnedPredictor, Rollout, equilibrium_under_feedback
 from ..mesh.mesh import Mesh
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
@@ -297,10 +303,9 @@ class Robot:
         if self._learned is not None:
             predictor = self._predictor(acting.conditions, acting.base)
             predictor.hidden = state.hidden
-        rollout = Rollout(self.simulator, predictor, acting.inputs, self.constants)
-        rollout.resume(state.lost, 0)
-        body = rollout.differentiable_step(state.body)
-        now = rollout.lost(body)
+        corrected = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants)
+        body = corrected.step(replace(state.body, lost=state.lost), 0)
+        now = is_lost(body)
         if self.simulator.settings.on_failure == "raise" and bool((now & ~state.lost).any()):
             raise ConvergenceError(
                 f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths; "

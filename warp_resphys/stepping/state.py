@@ -31,6 +31,7 @@ class State:
     previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, for BDF2
     # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    lost: torch.Tensor | None = None  # (B,) bool, whether a roll-out that counts failures has diverged
     report: SolveReport | None = field(default=None, compare=False)  # of the step that led here; None for other states
 
     def __repr__(self) -> str:
@@ -60,7 +61,7 @@ class State:
             check_tensor(name, values, (self.batch, vertices, 3), unit, "vertex", like)
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
-        """Returns the state with a function applied to every tensor."""
+        """Returns the state with a function applied to every tensor, without report."""
         return State.from_tensors({name: change(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> "State":
@@ -68,10 +69,11 @@ class State:
         return self.map(torch.Tensor.detach)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Returns all tensors of the state by name: ``q``, ``v``, ``previous_q``, ``previous_v``, ``memory.NAME``."""
+        """Returns the tensors by name: ``q``, ``v``, ``previous_q``, ``previous_v``, ``lost``, ``memory.NAME``."""
         tensors = {"q": self.q, "v": self.v}
         if self.previous is not None:
             tensors |= {"previous_q": self.previous[0], "previous_v": self.previous[1]}
+        tensors |= {} if self.lost is None else {"lost": self.lost}
         return tensors | {f"{_MEMORY}{name}": tensor for name, tensor in self.memory.items()}
 
     @classmethod
@@ -79,7 +81,7 @@ class State:
         """Builds the state from its `tensors`; other names are ignored."""
         previous = (tensors["previous_q"], tensors["previous_v"]) if "previous_q" in tensors else None
         memory = {name.removeprefix(_MEMORY): x for name, x in tensors.items() if name.startswith(_MEMORY)}
-        return cls(tensors["q"], tensors["v"], previous, memory)
+        return cls(tensors["q"], tensors["v"], previous, memory, tensors.get("lost"))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from ..control.reduced import ReducedState
 from ..control.reduction import reduced_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..learning.rollout import DIVERGENCE_DISTANCE
+from ..learning.correction import DIVERGENCE_DISTANCE
 from ..robot.inputs import Given, InputReader
 from ..robot.robot import Robot
 from ..robot.state import RobotState

@@ -4,7 +4,7 @@ Trained models are predictors of a roll-out, with a guard against states outside
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -31,20 +31,17 @@ _MEMORY = 6  # iterations that are combined
 _RIDGE = 1e-12
 
 
-class Rollout:
-    """Steps a batch and detects environments that diverge.
+class CorrectedSimulator:
+    """The steps of a simulator with a learned force, or of a network in its place, by their numbers.
 
     An environment has diverged when a step fails or a vertex is further than `DIVERGENCE_DISTANCE` body lengths from
-    its rest position: from then on it stands at rest and is reported as lost.
+    its rest position: from then on it stands at rest and is `State.lost`, and gradients are meaningless there.
 
     Args:
         simulator: its solver settings must count failures rather than raise them.
         predict: residual force or, in place of the simulator, next state; None for the simulator alone.
-        inputs: of the batch, from the first step on.
-        constants: in place of the simulator's own.
-
-    Attributes:
-        done: number of steps made.
+        inputs: inputs of the batch, from the first step on.
+        constants: constants from `Simulator.prepare` in place of the simulator's.
     """
 
     def __init__(
@@ -54,36 +51,25 @@ class Rollout:
         inputs: Inputs | None = None,
         constants: Constants | None = None,
     ) -> None:
-        self.simulator, self._predict, self.done = simulator, predict, 0
-        self._lost: torch.Tensor | None = None
+        self.simulator, self._predict = simulator, predict
         self._inputs = Inputs() if inputs is None else inputs
         self._constants = simulator.prepare() if constants is None else constants
         self._rest = simulator.rest_positions
         self._length = float((self._rest.amax(0) - self._rest.amin(0)).max())
 
-    def resume(self, lost: torch.Tensor, done: int) -> None:
-        """Continues after a number of steps, in which environments (B,) were lost."""
-        self._lost, self.done = lost, done
-
-    @torch.no_grad()
-    def step(self, state: State) -> State:
-        """Advances a batch by one step, without gradients."""
-        return self.differentiable_step(state)
-
-    def differentiable_step(self, state: State) -> State:
-        """Advances a batch by one step; gradients are meaningless where an environment is lost."""
-        lost = self.lost(state)
-        new, failed = self._advance(state, lost)
-        self.done += 1
+    def step(self, state: State, number: int) -> State:
+        """Returns the state after the step of a number; differentiable."""
+        lost = is_lost(state)
+        new, failed = self._advance(state, number, lost)
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
-        self._lost = lost | failed | ~(distance < DIVERGENCE_DISTANCE * self._length)
-        return self._reset(new, self._lost) if bool(self._lost.any()) else new
+        lost = lost | failed | ~(distance < DIVERGENCE_DISTANCE * self._length)
+        return replace(self._reset(new, lost) if bool(lost.any()) else new, lost=lost)
 
-    def _advance(self, state: State, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
+    def _advance(self, state: State, number: int, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """Returns the next state, and which environments (B,) failed."""
-        inputs, force, failed = self._inputs.at(self.done), None, lost
+        inputs, force, failed = self._inputs.at(number), None, lost
         if self._predict is not None:
-            predicted = self._predict(state, self.done)
+            predicted = self._predict(state, number)
             if isinstance(predicted, State):
                 return predicted, lost
             failed = lost | ~torch.isfinite(predicted).flatten(1).all(1)
@@ -107,22 +93,15 @@ class Rollout:
 
         return State.from_tensors({name: masked(name, value) for name, value in state.tensors().items()})
 
-    def lost(self, state: State) -> torch.Tensor:
-        """Which environments have diverged, (B,) bool."""
-        return torch.zeros(state.batch, dtype=torch.bool, device=state.q.device) if self._lost is None else self._lost
 
-    def positions(self, state: State) -> torch.Tensor:
-        """Positions (B, N, 3) of a state, NaN in lost environments [m]."""
-        return state.q if self._lost is None else torch.where(self._lost[:, None, None], torch.nan, state.q)
+def is_lost(state: State) -> torch.Tensor:
+    """Returns which environments have diverged, (B,) bool."""
+    return torch.zeros(state.batch, dtype=torch.bool, device=state.q.device) if state.lost is None else state.lost
 
 
-def closed_loop(rollout: Rollout, start: State, steps: int) -> torch.Tensor:
-    """Returns positions (B, T + 1, N, 3) of a roll-out [m]; NaN from the step where an environment diverged."""
-    positions, state = [start.q], start
-    for _ in range(steps):
-        state = rollout.step(state)
-        positions.append(rollout.positions(state))
-    return torch.stack(positions, dim=1)
+def known_positions(state: State) -> torch.Tensor:
+    """Returns the positions (B, N, 3) of a state, NaN in lost environments [m]."""
+    return torch.where(is_lost(state)[:, None, None], torch.nan, state.q)
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,16 @@ import torch
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.learning.networks import NextState, build_model
-from warp_resphys.learning.rollout import (
+from warp_resphys.learning.correction import (
     DIVERGENCE_DISTANCE,
+    CorrectedSimulator,
     LearnedPredictor,
-    Rollout,
-    closed_loop,
     equilibrium_under_feedback,
+    known_positions,
 )
+from warp_resphys.learning.networks import NextState, build_model
 from warp_resphys.settings.learning import NetworkSettings
+from warp_resphys.stepping.rollout import rollout
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
 BODY, TIP = Body(MESH, fixed=select_vertices(MESH, x=0.0)), select_vertices(MESH, x=0.1)
@@ -66,7 +67,9 @@ def test_the_linear_part_alone_reproduces_a_linear_system(system, kind):
     model = linear_model(system, kind)
     z = torch.tensor([[1.0, -2.0, 0.5, 0.0, 1.5, -1.0], [0.0, 0.3, 0.0, -2.0, 0.0, 0.7]], dtype=torch.float64)
     start = State(*system.state(z))
-    positions = closed_loop(Rollout(SIMULATOR, LearnedPredictor(model)), start, 30)
+    step = CorrectedSimulator(SIMULATOR, LearnedPredictor(model)).step
+    with torch.no_grad():
+        positions = torch.stack(rollout(step, start, range(30), known_positions), 1)
     for step in range(31):
         q, _ = system.state(z @ torch.linalg.matrix_power(system.matrix, step).mT)
         torch.testing.assert_close(positions[:, step], q, rtol=0.0, atol=1e-5 * float((start.q - REST).abs().max()))
@@ -87,9 +90,9 @@ def test_a_diverged_roll_out_stays_lost_and_does_not_affect_others(value, left):
             following[1, -1, 0] = REST[-1, 0] + 0.1 * value
         return State(following, state.v + 0.5)
 
-    rollout = Rollout(SIMULATOR, predict)
     start = SIMULATOR.rest_state(3)
-    positions = closed_loop(rollout, start, 6)
+    step = CorrectedSimulator(SIMULATOR, predict).step
+    positions = torch.stack(rollout(step, start, range(6), known_positions), 1)
     lost = torch.isnan(positions).all((2, 3))
     assert lost.tolist() == [7 * [False], 3 * [False] + 4 * [left], 7 * [False]]
     for step in range(7):
@@ -110,13 +113,13 @@ def test_lost_environments_stand_at_rest_without_inputs(integrator):
             force[2] = 1e3 * torch.randn(force[2].shape, generator=torch.Generator().manual_seed(0), dtype=force.dtype)
         return force
 
-    rollout, alone = Rollout(simulator, predict), Rollout(simulator)
-    state, other = simulator.rest_state(3), simulator.rest_state(3)
-    for _ in range(5):
-        state, other = rollout.step(state), alone.step(other)
-    assert rollout.lost(state).tolist() == [False, True, True]
+    state, other = (
+        rollout(CorrectedSimulator(simulator, force).step, simulator.rest_state(3), range(5), lambda now: now)[-1]
+        for force in (predict, None)
+    )
+    assert state.lost.tolist() == [False, True, True]
     assert torch.equal(state.q[1:], simulator.rest_positions.expand(2, -1, -1))
-    assert all(not bool(t[1:].any()) for name, t in state.tensors().items() if name not in ("q", "previous_q"))
+    assert all(not bool(t[1:].any()) for name, t in state.tensors().items() if name not in ("q", "previous_q", "lost"))
     assert float(other.memory["viscous_strain"].abs().max()) > 1e-6
     for name, tensor in state.tensors().items():
         torch.testing.assert_close(tensor[0], other.tensors()[name][0], rtol=0.0, atol=1e-9)

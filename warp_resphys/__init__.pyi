@@ -53,11 +53,11 @@ from .io.errors import ResphysError as ResphysError
 from .io.errors import ResphysWarning as ResphysWarning
 from .learning.identification import Identification as Identification
 from .learning.identification import ParameterSearch as ParameterSearch
-from .learning.library import ObservedMotion as ObservedMotion
 from .learning.library import evaluate as evaluate
 from .learning.library import fit_force as fit_force
 from .learning.library import identify as identify
 from .learning.library import reconstruct as reconstruct
+from .learning.observed_motions import ObservedMotions as ObservedMotions
 from .learning.parameters import Bounds as Bounds
 from .learning.parameters import Prior as Prior
 from .mesh.arm import ArmGeometry as ArmGeometry

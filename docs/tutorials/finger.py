@@ -58,7 +58,7 @@ pull = wr.Inputs(tendon_tension=tension.detach())
 real = simulator.rollout(simulator.rest_state(), 30, pull, {"youngs_modulus": 430e3})
 noise = 1e-4 * torch.randn(31, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 seen = torch.cat([markers(q) for q in real.q]) + noise  # (T + 1, M, 3) m
-observed = wr.ObservedMotion(seen, start=simulator.rest_state(), inputs=pull, observation=markers)
+observed = wr.ObservedMotions.of(simulator, seen, start=simulator.rest_state(), inputs=pull, observation=markers)
 identified = wr.identify(simulator, observed, {"youngs_modulus": (200e3, 1e6)})
 modulus = identified.parameters["youngs_modulus"]
 before = wr.evaluate(simulator, observed).mean().item()
@@ -68,7 +68,7 @@ print(f"{1e3 * after:.2f} mm after identification, equal to their noise")
 
 # %% [markdown]
 # Learned forces reduce the error that remains after identification: `reconstruct` and `fit_force` take the same
-# `ObservedMotion`, see [the functions](../api/learning.md) and, step by step, [Residual forces](residual_forces.py).
+# `ObservedMotions`, see [the functions](../api/learning.md) and, step by step, [Residual forces](residual_forces.py).
 #
 # ## Summary
 #

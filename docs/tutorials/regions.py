@@ -55,7 +55,7 @@ markers = wr.bind_markers(mesh, places, ["left", "right", "top"])
 swing = real.rollout(real.rest_state(), steps=50)
 noise = 1e-4 * torch.randn(51, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 seen = torch.cat([markers(q) for q in swing.q]) + noise
-observed = wr.ObservedMotion(seen, start=real.rest_state(), observation=markers)
+observed = wr.ObservedMotions.of(real, seen, start=real.rest_state(), observation=markers)
 
 guess = simulator(stiff=200e3, soft=200e3)
 ranges = {"stiff_youngs_modulus": (50e3, 1e6), "soft_youngs_modulus": (30e3, 1e6)}
@@ -75,7 +75,7 @@ for name, value in identified.parameters.items():
 rubber = wr.Corotated(200e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
 one = wr.Simulator(beam, rubber, time_step=0.01, integrator="bdf2")
 single = wr.identify(one, observed, {"youngs_modulus": (30e3, 1e6)})
-body = wr.ObservedMotion(swing.q, start=real.rest_state())
+body = wr.ObservedMotions.of(real, swing.q, start=real.rest_state())
 models = {
     "first guess": (guess, None),
     "one modulus": (one, single.parameters),

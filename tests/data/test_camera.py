@@ -41,7 +41,7 @@ def let_go(noise=0.0):
     q = robot.rollout(robot.static_equilibrium(resting), 25).q
     pixels = torch.stack([camera()(positions) for positions in q])
     pixels = pixels + noise * torch.as_tensor(np.random.default_rng(0).normal(size=pixels.shape))
-    return wr.ObservedMotion(pixels, resting=resting, observation=camera())
+    return wr.ObservedMotions.of(beam(264e3), pixels, resting=resting, observation=camera())
 
 
 def test_a_marker_is_at_its_pinhole_projection():
@@ -77,7 +77,7 @@ def test_bad_input_is_named():
     with pytest.raises(InputError, match="no rotation with a shift"):
         PlacedCamera(lens, pose * torch.tensor([[-1.0], [1.0], [1.0], [1.0]]))
     with pytest.raises(wr.InputError, match=r"\(time, motion, point, 2\) in px"):
-        wr.ObservedMotion(torch.zeros(3, 1, 3, 3), observation=camera())
+        wr.ObservedMotions.of(beam(264e3), torch.zeros(3, 1, 3, 3), observation=camera())
 
 
 OPENCV = """%YAML:1.0

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from warp_resphys.experiment.files import Dataset, driving, first_change, phases_of, read_dataset, since_change
+from warp_resphys.data.dataset import Dataset, read_dataset
+from warp_resphys.experiment.files import driving, first_change, phases_of, since_change
 from warp_resphys.io.files import read_hdf5
 
 TIMES = 0.1 * np.arange(6)
@@ -15,7 +16,7 @@ def dataset(begins, names="abc", resting=None, **inputs):
     channels = {name: ("left", "right")[: values.shape[2]] for name, values in inputs.items()}
     fields = {"inputs": inputs, "channels": channels, "resting": resting or {}}
     about = (times, observed, observed[:, 0], np.zeros(rows), np.zeros(3), 0.05)
-    return Dataset(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), **fields)
+    return Dataset(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), units=UNITS, **fields)
 
 
 UNITS = {"pressure": "Pa", "tendon_tension": "N", "tendon_contraction": "m", "muscle_stress": "Pa"}

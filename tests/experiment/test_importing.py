@@ -10,12 +10,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, settings
+from warp_resphys.data.dataset import Dataset, payload_inputs, read_dataset
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run
-from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH, Dataset, payload_inputs, read_dataset
+from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
 from warp_resphys.experiment.trials import trials_of

@@ -12,6 +12,7 @@ from support.main_job import run_without_report
 from support.played_run import check_robots
 from warp_resphys import Body
 from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
+from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.energies.contact import Contact
@@ -19,7 +20,6 @@ from warp_resphys.energies.obstacles import Box, HalfSpace, Sphere
 from warp_resphys.energies.surfaces import FrictionPair, SurfaceContact
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
-from warp_resphys.experiment.files import read_dataset
 from warp_resphys.experiment.report import true_contact
 from warp_resphys.experiment.simulate import target_settings
 from warp_resphys.io.errors import DataFileError, InputError

@@ -9,10 +9,10 @@ from support.main_job import finish, run
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
 from warp_resphys.data.base_motion import prescribed
+from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.input_response import wave_inputs
 from warp_resphys.data.marker_view import MarkerView
 from warp_resphys.experiment.build import bound_markers, build_simulator
-from warp_resphys.experiment.files import read_dataset
 from warp_resphys.experiment.report import read_recordings
 from warp_resphys.experiment.sensitivity import sensitivities
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
@@ -228,8 +228,10 @@ def check_sensitivities(experiment, names):
     found = sensitivities(experiment, "sysid", names)
     parameters, step = experiment.parameters("sysid"), 1e-4
     for name in names:
-        replay = experiment.replay(exact(experiment.model_simulator("sysid")), [name], "sysid")
-        start = experiment.start(replay, "sysid")
+        replay = experiment.motions.replay(
+            exact(experiment.model_simulator("sysid")), [name], experiment.identified("sysid")
+        )
+        start = experiment.motions.start(replay, experiment.identified("sysid"))
         own = {"tendon_tension_zero": f"tendon_tension_zero@{name}", "youngs_modulus": "youngs_modulus"}
         for key, moved in own.items():
             size = step * (float(parameters[moved]) if key == "youngs_modulus" else 1.0)

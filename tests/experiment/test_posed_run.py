@@ -8,8 +8,8 @@ import warp_resphys
 from support.configured import settings
 from support.main_job import finish, run_without_report
 from support.played_run import check_robots
+from warp_resphys.data.dataset import read_dataset
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
-from warp_resphys.experiment.files import read_dataset
 from warp_resphys.io.files import read_array, read_hdf5, read_json
 from warp_resphys.report.identification_section import own_table
 from warp_resphys.settings.body import MaterialSettings

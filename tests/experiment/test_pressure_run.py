@@ -14,16 +14,17 @@ from support.configured import check, composed, settings
 from support.main_job import finish, without_reports
 from support.segment_run import TRACKED, place_segment
 from warp_resphys import pipeline
+from warp_resphys.data.dataset import Dataset, read_dataset
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment
-from warp_resphys.experiment.files import Dataset, read_dataset
 from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
+from warp_resphys.learning.correction import force_frames
 from warp_resphys.settings.stages import LEARNING, NETWORKS, StageSettings
 from warp_resphys.settings.trials import Split
 
@@ -111,7 +112,7 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
         experiment = Experiment(stage.model_copy(update={"force_frame": frame}), finished)
         assert learn.trainer_of(experiment, "resphys", stage.training)[1].force_frame == frame
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
-    frames = experiment.frames(experiment.model_simulator("resphys"), "corotated")
+    frames = force_frames(experiment.model_simulator("resphys"), "corotated")
     size = float(kept.outputs[0].abs().max())
     np.testing.assert_allclose(
         frames.to_world(turned.q, turned.v, turned.outputs[0]), kept.outputs[0], atol=1e-5 * size
@@ -293,9 +294,9 @@ def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(fini
     covariance = 1e-6 * np.linalg.inv(np.linalg.inv(1e6 * covariance) + ranges)
     means = [identified["parameters"][name] for name in names]
     drawn = np.random.default_rng(0).multivariate_normal(means, covariance, 400)
-    replay = experiment.replay(experiment.model_simulator("sysid"), ["t003"], "sysid")
+    replay = experiment.motions.replay(experiment.model_simulator("sysid"), ["t003"], experiment.identified("sysid"))
     sets = {name: torch.from_numpy(drawn[:, column].copy()) for column, name in enumerate(names)}
-    points = replay.varied(experiment.start(replay, "sysid"), sets)[:, 0].numpy()
+    points = replay.varied(experiment.motions.start(replay, experiment.identified("sysid")), sets)[:, 0].numpy()
     with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
         stored = read_array(file, "sysid_spread")[0]
         np.testing.assert_array_equal(read_array(file, "resphys_spread")[0], stored)

@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.configured import settings
+from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.rigid_bodies import angles, motion_between
-from warp_resphys.experiment.files import DATASET, TRUTH, read_dataset
+from warp_resphys.experiment.files import DATASET, TRUTH
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json
 from warp_resphys.io.stages import run_stages

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warp_resphys.experiment.experiment import Experiment
-from warp_resphys.experiment.files import Dataset
+from warp_resphys.data.dataset import Dataset
 from warp_resphys.experiment.without_physics import without_physics
+from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.settings.learning import ReleaseSettings
 
 FRAMES, STEP = 40, 0.01
@@ -37,11 +37,7 @@ def experiment(levels, begins, learned, **changes):
     }
     dataset = Dataset(**given | changes)
     settings = SimpleNamespace(split=SimpleNamespace(train=learned), release=ReleaseSettings())
-    fake = SimpleNamespace(dataset=dataset, settings=settings)
-    fake.begins = lambda name: dataset.begins[dataset.names.index(name)]
-    fake.learned_steps = lambda steps: steps
-    fake.batches = lambda names: Experiment.batches(fake, names)
-    return fake
+    return SimpleNamespace(dataset=dataset, settings=settings, motions=ObservedMotions(dataset))
 
 
 def test_trials_are_predicted_from_training_trials_that_begin_in_the_same_way():
@@ -76,7 +72,7 @@ def test_the_delay_of_a_trial_is_that_of_its_first_frames_as_for_simulators():
 
 def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
-    fake.learned_steps = lambda steps: steps // 2
+    fake.motions = ObservedMotions(fake.dataset, train_fraction=0.5)
     fake.dataset.observed[:2, FRAMES // 2 + 1 :] = 1e6
     values, _, missing = without_physics(fake, ["c"])
     assert missing == {"regression": "needs three training trials that differ in inputs or loads"}

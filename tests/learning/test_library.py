@@ -1,14 +1,13 @@
 """Identification, reconstruction, training and evaluation as functions, on beams."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
 import warp_resphys as wr
 from warp_resphys.data.markers import WHOLE_STATE
-from warp_resphys.learning.library import ObservedMotion, evaluate, fit_force, identify, reconstruct
+from warp_resphys.learning.library import evaluate, fit_force, identify, reconstruct
+from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -38,7 +37,7 @@ def let_go(robot, *newtons, markers=WHOLE_STATE, known_start=False):
     q = robot.rollout(start, STEPS).q
     seen = torch.stack([markers(positions) for positions in q])
     begins = {"start": start} if known_start else {"resting": resting}
-    return ObservedMotion(seen, observation=markers, **begins)
+    return ObservedMotions.of(robot, seen, observation=markers, **begins)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +67,7 @@ def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     force = fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
     unseen = let_go(robot, 0.09, known_start=True)
     corrected, uncorrected = evaluate(wrong, unseen, force), evaluate(wrong, unseen)
-    at_rest = (unseen.observed - wrong.rest_positions).norm(dim=-1).mean(-1)
+    at_rest = (torch.from_numpy(unseen.dataset.observed[0]) - wrong.rest_positions).norm(dim=-1).mean(-1)
     assert corrected.shape == (STEPS + 1, 1)
     assert float(corrected[0]) == 0.0
     assert float(corrected.mean()) < 0.2 * float(uncorrected.mean())
@@ -94,7 +93,7 @@ def test_the_network_has_the_actuation_as_input():
 
     def motion(*rows):
         some = wr.Inputs(tendon_tension=tension[:, rows])
-        return ObservedMotion(q[:, rows], start.map(lambda t: t[list(rows)]), some)
+        return ObservedMotions.of(simulator, q[:, rows], start.map(lambda t: t[list(rows)]), some)
 
     samples = reconstruct(simulator, motion(0, 2))
     assert torch.equal(samples.actuation[:, 0], torch.cat([tension[:, 0, 0], tension[:, 2, 0]]))
@@ -109,9 +108,7 @@ def test_the_network_has_the_actuation_as_input():
 def test_forces_from_markers_bring_the_markers_there(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.1, markers=MARKERS)
-    gaps = seen.observed.clone()
-    gaps[5, 0, 1] = torch.nan
-    seen = dataclasses.replace(seen, observed=gaps)
+    seen.dataset.observed[0, 5, 1] = np.nan
     samples = reconstruct(wrong, seen)
     forces = samples.outputs[0]
     replayed = evaluate(wrong, seen, lambda state, step: forces[step][None])
@@ -121,10 +118,10 @@ def test_forces_from_markers_bring_the_markers_there(robot):
 def test_invalid_motions_are_refused(robot):
     start = robot.rest_state()
     with pytest.raises(wr.InputError, match="observed has shape"):
-        ObservedMotion(torch.zeros(3), start)
+        ObservedMotions.of(robot, torch.zeros(3), start)
     with pytest.raises(wr.InputError, match="5 points were observed, but the body has"):
-        evaluate(robot, ObservedMotion(torch.zeros(3, 5, 3), start))
-    motion = ObservedMotion(robot.rollout(start, 3).q, start)
+        evaluate(robot, ObservedMotions.of(robot, torch.zeros(3, 5, 3), start))
+    motion = ObservedMotions.of(robot, robot.rollout(start, 3).q, start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         identify(robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match="does not train recurrent networks"):

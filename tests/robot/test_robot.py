@@ -1,7 +1,6 @@
 """A finished run as a robot: it does what the evaluation did, by names, with gradients, and from one file."""
 
 import copy
-import dataclasses
 import json
 import pickle
 import re
@@ -327,9 +326,12 @@ def test_the_lines_of_the_readme(tmp_path, monkeypatch):
     exec(compile(lines, "README.md", "exec"), names)
     other = warp_resphys.read_recording("others.csv")
     inputs = warp_resphys.Inputs(tendon_tension=torch.from_numpy(other.actuation[1:, None]))
-    motion = dataclasses.replace(names["motion"], observed=torch.from_numpy(other.positions)[:, None], inputs=inputs)
+    simulator, seen = names["simulator"], torch.from_numpy(other.positions)
+    motion = warp_resphys.ObservedMotions.of(
+        simulator, seen, simulator.rest_state(), inputs, observation=names["markers"]
+    )
     uncorrected, identified, corrected = (
-        warp_resphys.evaluate(names["simulator"], motion, force, parameters=material).mean()
+        warp_resphys.evaluate(simulator, motion, force, parameters=material).mean()
         for force, material in ((None, None), (None, names["material"]), (names["force"], names["material"]))
     )
     assert corrected < 0.4 * identified < 0.4 * uncorrected

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from support.configured import settings
+from warp_resphys.data.dataset import Dataset
 from warp_resphys.experiment.build import build_mesh
-from warp_resphys.experiment.files import Dataset
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
 from warp_resphys.mesh.mesh import box_hexahedra

@@ -8,7 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING, Dataset, read_dataset
+from ..data.dataset import Dataset, read_dataset
+from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING
 from ..experiment.parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from ..io.arrays import FloatArray
 from ..io.errors import InputError

@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import chain, product
 from statistics import mean, pstdev
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.dataset import STATIC, Dataset
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import ConvergenceError, InputError
@@ -26,7 +26,7 @@ from ..settings.stages import StageSettings
 from .build import finer
 from .checks import check_memory
 from .experiment import LEARNED, Experiment
-from .files import ERRORS, MESH_CHECK, ROLLOUTS, STATIC, TIMES, Dataset, first_change, phases_of, reconstruction_file
+from .files import ERRORS, MESH_CHECK, ROLLOUTS, TIMES, first_change, phases_of, reconstruction_file
 from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
@@ -49,7 +49,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     with_intervals = [model for model in INTERVAL_MODELS if model in compared]
     calibrating = _parts(context, experiment, settings.calibration, with_intervals, filmed, "calibration_")
     work_on([*chain(*parts.values(), *calibrating.values())], _rolled_out, workers)
-    order = [*chain(*experiment.batches(names))]
+    order = [*chain(*experiment.dataset.batches(names))]
     rows = [order.index(name) for name in names]
     observed, plain, missing = without_physics(experiment, names)
     frames = experiment.dataset.observed.shape[1]
@@ -57,7 +57,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     test = settings.groups["1"]
     linear = linearised(experiment, test)
     spreads = spreads_of(experiment, test, linear)
-    steps = int(float(experiment.trials([filmed]).times.max()) / settings.time_step + 1e-6)
+    steps = int(experiment.dataset.seconds([filmed]) / settings.time_step + 1e-6)
     shown = np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
     attributes = {"names": names, "time_step": settings.time_step, "film_trial": filmed}
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
@@ -83,7 +83,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
         errors["sideways_mm"] = {name: known[name] for name in test if name in known}
     errors |= remaining(experiment, test, linear, observed)
     if settings.calibration:
-        calibrated = [*chain(*experiment.batches(settings.calibration))]
+        calibrated = [*chain(*experiment.dataset.batches(settings.calibration))]
         known = {model: read_parts(own, "observed", frames) for model, own in calibrating.items()}
         errors |= intervals_of(experiment, calibrated, known, observed, spreads)
     write_json(context.run_dir / ERRORS, errors)
@@ -100,9 +100,9 @@ def _parts(
 ) -> dict[str, list[TrialPart]]:
     """Splits the roll-outs of trials into parts, by model."""
     parts: dict[str, list[TrialPart]] = {model: [] for model in models}
-    for (number, batch), model in product(enumerate(experiment.batches(names)), models):
-        steps = math.ceil(float(experiment.trials(batch).times.max()) / experiment.model_simulator(model).time_step)
-        if model == SIMFREE and experiment.begins(batch[0]) == STATIC:
+    for (number, batch), model in product(enumerate(experiment.dataset.batches(names)), models):
+        steps = math.ceil(experiment.dataset.seconds(batch) / experiment.model_simulator(model).time_step)
+        if model == SIMFREE and experiment.dataset.begin_of(batch[0]) == STATIC:
             steps = POSE_STEPS
         label_of_part = f"{label}{model}{number}"
         parts[model] += split_into_parts(
@@ -136,15 +136,11 @@ def _rolled_out(part: TrialPart, report: Report) -> Arrays:
 
 def _amplitudes(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
     """Root mean square displacement of the observed points [m], by trial."""
-    amplitudes: dict[str, float] = {}
-    for batch in experiment.batches(names):
-        trials = experiment.trials(batch)
-        observed, held = (
-            torch.from_numpy(as_markers(points.cpu().numpy(), experiment.dataset.labels))
-            for points in (trials.observed, trials.held)
-        )
-        seen = replace(trials, observed=observed, held=held)
-        amplitudes |= dict(zip(batch, seen.amplitude.tolist(), strict=True))
+    amplitudes, dataset = dict[str, float](), experiment.dataset
+    for name, row in zip(names, dataset.rows(names), strict=True):
+        frames = slice(1 if dataset.begin_of(name) == STATIC else None)
+        shown, held = (as_markers(own, dataset.labels) for own in (dataset.observed[row, frames], dataset.held[row]))
+        amplitudes[name] = float(np.sqrt(np.nanmean(np.square(shown - held).sum(-1))))
     return amplitudes
 
 
@@ -280,10 +276,11 @@ def time_models(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    names = experiment.moving(settings.groups["1"])
+    names = experiment.dataset.moving(settings.groups["1"])
     simulator = experiment.model_simulator("resphys")
     learned = learned_of(experiment, "resphys")
-    starts = {name: experiment.start(experiment.replay(simulator, [name], "resphys")) for name in names}
+    replays = {name: experiment.motions.replay(simulator, [name], experiment.identified("resphys")) for name in names}
+    starts = {name: experiment.motions.start(replay) for name, replay in replays.items()}
     rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, experiment.simulator("simulation"))}
     target, shared = settings.target, ("mesh", "parts", "time_step")
     if target is not None and all(getattr(target, key) == getattr(settings, key) for key in shared):
@@ -333,16 +330,24 @@ def check_mesh(context: StageContext) -> None:
             raise InputError("its cells are given, and quadratic already; compare it with a finer one.")
         content |= {"cells": [len(mesh.cells) for mesh in meshes], "vertices": [len(m.vertices) for m in meshes]}
         amplitudes = _amplitudes(experiments[0], settings.groups["1"])
-        moving = experiments[0].moving([*amplitudes])
+        moving = experiments[0].dataset.moving([*amplitudes])
         names = [max(moving, key=amplitudes.__getitem__)] if moving else [*amplitudes][:_CHECKED_POSES]
         shown, observed = list[FloatArray](), np.empty(0)
         with Progress(context.name, 2, "meshes") as progress, torch.no_grad():
             for experiment in experiments:
-                replay = experiment.replay(experiment.model_simulator(model), names, model)
+                replay = experiment.motions.replay(
+                    experiment.model_simulator(model), names, experiment.identified(model)
+                )
                 if moving:
                     seconds = first_change(experiment.dataset, names[0]) + CHECKED_SECONDS
                     replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
-                points = replay(experiment.start(replay, model), experiment.parameters(model))[0].cpu().numpy()
+                points = (
+                    replay(
+                        experiment.motions.start(replay, experiment.identified(model)), experiment.parameters(model)
+                    )[0]
+                    .cpu()
+                    .numpy()
+                )
                 shown.append(as_markers(points, experiment.dataset.labels))
                 observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.dataset.labels)
                 progress.advance()

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..data.dataset import RESTING
 from ..data.rigid_bodies import corners_of, independent
 from ..io.errors import ConvergenceError
 from ..io.files import resume_checkpoint, write_checkpoint, write_json
@@ -16,13 +17,14 @@ from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.identification import ParameterSearch
 from ..learning.misfit import Misfit
+from ..learning.observed_motions import Identified
 from ..learning.parameters import Bounds, Prior, configured_parameters, own_name, split_name
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from ..settings.learning import IdentifySettings, LawSettings, RangeSettings
 from ..settings.stages import StageSettings
 from .experiment import MODELS, Experiment
-from .files import IDENTIFICATION, RESTING
+from .files import IDENTIFICATION
 from .trials import evenly
 
 log = logging.getLogger(__name__)
@@ -49,7 +51,7 @@ def identify(context: StageContext) -> None:
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
     searches = {model: search for model, search in searches.items() if search}
-    released = any(experiment.begins(name) == "released" for name in names)
+    released = any(experiment.dataset.begin_of(name) == "released" for name in names)
     evaluations = len(searches) * (wanted.starts + (_MOST_AGAIN if released else 0)) * wanted.max_evaluations
     with Progress(context.name, evaluations, "evaluations at most", kept.evaluations) as progress:
         identified = {
@@ -82,7 +84,7 @@ def _identified(
     """Identifies the parameters of a model; returns its content of identification.json."""
     settings = experiment.settings
     wanted, simulator = settings.identify, experiment.simulator(MODELS[model][0])
-    bounds, replays = _bounds(experiment, search, names), experiment.replays(simulator, names)
+    bounds, replays = _bounds(experiment, search, names), experiment.motions.replays(simulator, names)
     nuisances = _nuisances(experiment, placed=model == "sysid")
     known = configured_parameters(simulator, [split_name(name)[0] for name in bounds])
     guess = {name: _guess(name, limits, {**known, **wanted.first_guess}) for name, limits in bounds.items()}
@@ -94,7 +96,7 @@ def _identified(
                 many = {"count": wanted.starts, "candidates": wanted.candidates, "seed": settings.seed}
             else:
                 first = before["parameters"]
-                begins = [(own, experiment.start(own, parameters=first)) for own, _ in replays]
+                begins = [(own, experiment.motions.start(own, Identified(first))) for own, _ in replays]
             misfit = Misfit(begins, bounds, _seconds(settings, begins), **nuisances)
             return search_parameters(ParameterSearch(misfit), first, wanted, progress, is_last, **many)
 
@@ -165,14 +167,17 @@ def _of_first_frames(
     """
     settings, values, deviations = experiment.settings, dict[str, float](), dict[str, float]()
     wanted = {name: bounds_of(limits) for name, limits in search.items() if limits.per == "trial"}
-    names = [name for name in settings.split.names if name not in learned and experiment.begins(name) in RESTING]
+    names = [
+        name for name in settings.split.names if name not in learned and experiment.dataset.begin_of(name) in RESTING
+    ]
     shared = experiment.identification(model)
     known = {**shared["parameters"], **shared.get("own", {})}
     for name in names if wanted else ():
         bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
         guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
         try:
-            replays = experiment.replays(experiment.simulator(MODELS[model][0]), [name], model)
+            simulator = experiment.simulator(MODELS[model][0])
+            replays = experiment.motions.replays(simulator, [name], experiment.identified(model))
             misfit = Misfit(replays, bounds, settings.release.window, known=known, **_nuisances(experiment))
             result = ParameterSearch(misfit).run([guess], settings.identify.max_evaluations)
         except ConvergenceError as error:

@@ -75,7 +75,7 @@ class _LawSearch(LawTrials):
     def __init__(self, context: StageContext, experiment: Experiment) -> None:
         super().__init__(experiment)
         self.context, self.kept = context, Checkpoint(context)
-        self.released = any(experiment.begins(name) == "released" for name in self.settings.split.train)
+        self.released = any(experiment.dataset.begin_of(name) == "released" for name in self.settings.split.train)
 
     def _names(self, whole: bool) -> tuple[str, ...]:
         """Names of the trials of a search."""
@@ -161,15 +161,15 @@ class _LawSearch(LawTrials):
         simulator, guess = self.simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         for names in (self.settings.split.train, self.settings.split.validation):
-            motions = [self._motion(simulator, own) for own in self.experiment.batches(names)] if names else []
+            motions = [self._motion(simulator, own) for own in self.experiment.dataset.batches(names)] if names else []
             forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
 
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
-        trials = self.experiment.trials(names, simulator)
-        start = self.experiment.start(Replay(simulator, self.experiment.observe, trials))
-        _, inputs, _ = Replay(simulator, self.experiment.observe, trials).prepare(self.others(simulator))
+        trials = self.experiment.motions.trials(names, simulator)
+        start = self.experiment.motions.start(Replay(simulator, self.experiment.motions.observe, trials))
+        _, inputs, _ = Replay(simulator, self.experiment.motions.observe, trials).prepare(self.others(simulator))
         return KnownMotion(trials.observed.transpose(0, 1), start.state.v, inputs)
 
     def _from_markers(self) -> list["_Refined"]:

@@ -13,6 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..data.base_motion import in_frame, rigid
+from ..data.dataset import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..data.input_response import draw_inputs, wave_inputs
 from ..data.recordings.recording import ARM, Recording
 from ..data.recordings.recording_files import write_recording
@@ -31,7 +32,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places
-from .files import RESTING, STATIC, TRUTH, UNDER_INPUTS, payload_inputs
+from .files import TRUTH
 from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from .simulate import distributed, played, substeps_of, target_settings, true_motions
 

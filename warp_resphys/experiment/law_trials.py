@@ -139,7 +139,8 @@ class LawTrials:
 
     def replays(self, simulator: Simulator, names: Sequence[str]) -> Replays:
         """Returns replays of trials, with the markers where SysID has placed them."""
-        return self.experiment.replays(simulator, names, "sysid" if self.sysid else "simulation")
+        identified = self.experiment.identified("sysid" if self.sysid else "simulation")
+        return self.experiment.motions.replays(simulator, names, identified)
 
     def scores(self, laws: Sequence[Mapping[str, float]], others: Mapping[str, float] | None = None) -> "list[Score]":
         """Returns the errors of laws on the trials that they are tested on.

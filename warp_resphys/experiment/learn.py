@@ -9,11 +9,12 @@ from typing import Any
 
 import torch
 
+from ..data.dataset import STATIC
 from ..dynamics.modes import RestStiffness
 from ..io.files import read_array, read_hdf5, resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.correction import Range
+from ..learning.correction import Range, force_frames
 from ..learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from ..learning.networks import ResidualForce, StateMap, build_model
 from ..learning.replay import Replay, Windows
@@ -22,7 +23,7 @@ from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainingSett
 from ..settings.stages import StageSettings
 from .build import choose_device
 from .experiment import LAW, Experiment
-from .files import STATIC, reconstruction_file, training_file, weights_file
+from .files import reconstruction_file, training_file, weights_file
 from .models import SIMFREE, Learned, kind_of, rollout_error
 
 log = logging.getLogger(__name__)
@@ -38,16 +39,11 @@ def samples_of(experiment: Experiment, model: str, names: Sequence[str], device:
     are corotated; for ``simfree`` it is the displacement and velocity at the end of the step. Steps without any visible
     marker are left out.
     """
-    parts = [_samples(experiment, model, batch, device) for batch in experiment.batches(names)]
-    actuation = [part.actuation for part in parts if part.actuation is not None]
-    samples = Samples(
-        q=torch.cat([part.q for part in parts]),
-        v=torch.cat([part.v for part in parts]),
-        outputs=tuple(map(torch.cat, zip(*(part.outputs for part in parts), strict=True))),
-        actuation=torch.cat(actuation) if actuation else None,
-        lengths=tuple(length for part in parts for length in part.lengths),
+    parts = [_samples(experiment, model, batch, device) for batch in experiment.dataset.batches(names)]
+    samples = Samples.joined(parts)
+    frames = (
+        None if model == SIMFREE else force_frames(experiment.model_simulator(model), experiment.settings.force_frame)
     )
-    frames = None if model == SIMFREE else experiment.frames(experiment.model_simulator(model))
     if frames is None:
         return samples
     return dataclasses.replace(samples, outputs=(frames.to_rest(samples.q, samples.v, *samples.outputs),))
@@ -57,21 +53,23 @@ def _samples(experiment: Experiment, model: str, names: Sequence[str], device: t
     """Samples of trials that begin in the same way, with forces in the world frame."""
     simulator = experiment.model_simulator(model)
     q, v, force, seen = _states(experiment, model, names, device, simulated=model == SIMFREE)
-    base, like = experiment.base(names, simulator), simulator.rest_positions
+    base, like = experiment.motions.base(names, simulator), simulator.rest_positions
     if base is not None:
         pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
         inside = [base.enter(x.to(like), w.to(like), k) for k, (x, w) in pairs]
         q, v = (torch.stack(field, 1).to(q) for field in zip(*inside, strict=True))
         forces = enumerate(force.unbind(1))  # The force of a frame belongs to the previous step.
         force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
-    if experiment.begins(names[0]) == STATIC:
+    if experiment.dataset.begin_of(names[0]) == STATIC:
         q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
     steps, whole = q.shape[1] - 1, bool(seen.all())
 
     def pick(field: torch.Tensor) -> torch.Tensor:
         return field.flatten(0, 1) if whole else field[seen]
 
-    inputs = experiment.conditions(experiment.replay(simulator, names), experiment.parameters(model), model == SIMFREE)
+    inputs = experiment.motions.conditions(
+        experiment.motions.replay(simulator, names), experiment.parameters(model), model == SIMFREE
+    )
     if inputs is not None:  # (K, R, A), or (R, A) constant in time
         inputs = inputs[:steps].swapaxes(0, 1) if inputs.ndim == 3 else inputs[:, None].expand(-1, steps, -1)
         inputs = pick(inputs.to(device))
@@ -122,7 +120,7 @@ def trainer_of(experiment: Experiment, model: str, settings: TrainingSettings) -
 def new_network(experiment: Experiment, model: str, train: Samples, settings: TrainingSettings) -> StateMap:
     """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
     rest, network = experiment.like.to(train.q.device), settings.network
-    if not experiment.moving(experiment.settings.split.train):
+    if not experiment.dataset.moving(experiment.settings.split.train):
         network = _limited(network, len(train.q), model)
     torch.manual_seed(settings.seed)
     by_displacement = model != SIMFREE and network.kind == "reduced" and network.force_basis == "displacement"
@@ -180,8 +178,8 @@ def _in_the_loop(
     """
     split = experiment.settings.split
     parameters, simulator = experiment.parameters(model), experiment.model_simulator(model)
-    replays = experiment.replays(simulator, split.train + split.validation, model)
-    frames = experiment.frames(simulator)
+    replays = experiment.motions.replays(simulator, split.train + split.validation, experiment.identified(model))
+    frames = force_frames(simulator, experiment.settings.force_frame)
 
     def loss(names: Sequence[str], window: int | None = None) -> MotionLoss:
         watched = []
@@ -190,8 +188,8 @@ def _in_the_loop(
             rows = [batch.index(name) for name in names if name in batch]
             if rows:
                 part = Replay(simulator, replay.observe, replay.trials.select(rows))
-                inputs = experiment.conditions(part, parameters)
-                base = experiment.base(part.trials.names, simulator)
+                inputs = experiment.motions.conditions(part, parameters)
+                base = experiment.motions.base(part.trials.names, simulator)
                 windows = None
                 if window is not None:
                     like = simulator.rest_positions

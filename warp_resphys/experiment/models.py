@@ -10,18 +10,19 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..data.dataset import GIVEN
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
-from ..learning.correction import CorrectedSimulator, LearnedPredictor, Range, is_lost
+from ..learning.correction import CorrectedSimulator, LearnedPredictor, Range, force_frames, is_lost
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.replay import Start
 from ..stepping.rollout import states
 from ..stepping.state import State
 from .experiment import LEARNED, Experiment
-from .files import GIVEN, weights_file
+from .files import weights_file
 
 SIMFREE: Final = "simfree"
 POSE_STEPS = 200  # after which the roll-out of a network without simulator is taken to be at rest
@@ -101,12 +102,12 @@ class ModelRollout:
     ) -> None:
         self._experiment, self._model = experiment, model
         self._simulator = experiment.model_simulator(model) if simulator is None else simulator
-        self.replay = experiment.replay(self._simulator, names, model)
-        self.start = experiment.start(self.replay, model) if start is None else start
+        self.replay = experiment.motions.replay(self._simulator, names, experiment.identified(model))
+        self.start = experiment.motions.start(self.replay, experiment.identified(model)) if start is None else start
         parameters = experiment.parameters(model)
         self._constants, self._inputs, self._resting = self.replay.prepare(parameters)
         self._conditions = (
-            experiment.conditions(self.replay, parameters, model == SIMFREE) if model in LEARNED else None
+            experiment.motions.conditions(self.replay, parameters, model == SIMFREE) if model in LEARNED else None
         )
         self._first: State | None = None  # of motions, whatever the network
         substeps = round(experiment.settings.time_step / self._simulator.time_step)
@@ -119,8 +120,8 @@ class ModelRollout:
         if learned is None:
             return None
         replaces = isinstance(learned.network, NextState)
-        frames = None if replaces else self._experiment.frames(self._simulator, learned.force_frame)
-        base = self._experiment.base(self.replay.trials.names, self._simulator)
+        frames = None if replaces else force_frames(self._simulator, learned.force_frame)
+        base = self._experiment.motions.base(self.replay.trials.names, self._simulator)
         return LearnedPredictor(learned.network, self._conditions, learned.range_, frames, base)
 
     @torch.no_grad()
@@ -166,9 +167,9 @@ class ModelRollout:
     def errors(self, learned: Learned) -> list[FloatArray]:
         """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged."""
         observed, steps = self.replay.trials.observed, self.steps
-        observed = observed[:, : self._experiment.learned_steps(observed.shape[1] - 1) + 1]
+        observed = observed[:, : self._experiment.motions.learned_steps(observed.shape[1] - 1) + 1]
         if self._experiment.settings.train_fraction < 1.0:
-            steps = min(steps, self._experiment.learned_steps(steps))
+            steps = min(steps, self._experiment.motions.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
             for state in islice(self.roll(self.predictor(learned)), steps + 1):
@@ -185,7 +186,7 @@ class ModelRollout:
 
 def first_frame(experiment: Experiment, names: Sequence[str]) -> int:
     """First frame that counts in errors: 1 if the roll-out starts from the given state, else 0."""
-    return int(experiment.begins(names[0]) == GIVEN)
+    return int(experiment.dataset.begin_of(names[0]) == GIVEN)
 
 
 def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> Callable[[Learned], float]:
@@ -200,7 +201,7 @@ def rollout_error(experiment: Experiment, model: str, names: Sequence[str]) -> C
 
     def error(learned: Learned) -> float:
         if not runs:  # The starts of the trials are estimated once, at the first call.
-            runs.extend(ModelRollout(experiment, model, batch) for batch in experiment.batches(names))
+            runs.extend(ModelRollout(experiment, model, batch) for batch in experiment.dataset.batches(names))
         rows = [row for run in runs for row in run.errors(learned)]
         mean = summarise(rows)["mean"]
         return float("inf") if mean is None else mean

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from ..data.dataset import Dataset, read_dataset
 from ..data.rigid_bodies import as_markers
 from ..io.arrays import FloatArray
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage
 from .experiment import Experiment
-from .files import ROLLOUTS, Dataset, read_dataset, since_change
+from .files import ROLLOUTS, since_change
 from .models import SIMFREE
 from .sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
 from .without_physics import without_physics
@@ -79,7 +80,7 @@ def intervals_of(
     test, observed = settings.groups["1"], dataset.observed[dataset.rows(names)]
     target, rest = counted(experiment, test), _rest(dataset)
     learned = [row for row, name in enumerate(names) if name in settings.split.train]
-    observed[learned, experiment.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
+    observed[learned, experiment.motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
     linear = linearised(experiment, names, uncertain=True)
     changes = {model: left_out_changes(experiment, model, names, own) for model, own in linear.items()}
     simulated, *_ = without_physics(experiment, names, left_out=True)
@@ -104,7 +105,7 @@ def counted(experiment: Experiment, names: Sequence[str]) -> FloatArray:
     observed = experiment.dataset.observed[experiment.dataset.rows(names)]
     for row, name in enumerate(names):
         if name in experiment.settings.split.train:
-            observed[row, : experiment.learned_steps(observed.shape[1] - 1) + 1] = np.nan
+            observed[row, : experiment.motions.learned_steps(observed.shape[1] - 1) + 1] = np.nan
     return observed
 
 

@@ -51,9 +51,9 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
     settings: StageSettings = context.settings
     experiment, model = Experiment(settings, context.run_dir), settings.model
     parts: list[TrialPart] = []
-    for number, names in enumerate(experiment.batches(settings.reconstructed)):
-        last = float(experiment.trials(names).times.max()) / experiment.model_simulator(model).time_step
-        frames = max(experiment.learned_steps(int(last + 1e-6)), 1) + 1
+    for number, names in enumerate(experiment.dataset.batches(settings.reconstructed)):
+        last = experiment.dataset.seconds(names) / experiment.model_simulator(model).time_step
+        frames = max(experiment.motions.learned_steps(int(last + 1e-6)), 1) + 1
         parts += split_into_parts(context, names, frames, f"part{number}", batch=settings.batch)
     work_on(parts, _of_trials, workers)
     order = [name for part in parts for name in part.names]
@@ -70,11 +70,12 @@ def _of_trials(part: TrialPart, report: Report) -> Arrays:
     """Reconstruction of trials that begin in the same way: states, forces, and mean distances (R, K + 1) [mm]."""
     settings: StageSettings = part.context.settings
     experiment = Experiment(settings, part.context.run_dir)
-    simulator = without_ringing(experiment.model_simulator(settings.model), experiment.observe)
-    replay = experiment.replay(simulator, part.names, settings.model)
-    start = experiment.start(replay, settings.model)
-    constants, inputs, resting = replay.prepare(experiment.parameters(settings.model))
-    observed = experiment.targets(replay, start)
+    simulator = without_ringing(experiment.model_simulator(settings.model), experiment.motions.observe)
+    identified = experiment.identified(settings.model)
+    replay = experiment.motions.replay(simulator, part.names, identified)
+    start = experiment.motions.start(replay, identified)
+    constants, inputs, resting = replay.prepare(identified.values(simulator))
+    observed = experiment.motions.targets(replay, start)
     state = replay.initial_state(start, constants, resting)
     if replay.is_static:  # One very long step leads to the static pose.
         simulator = replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..data.dataset import STATIC, Dataset, read_dataset
 from ..data.rigid_bodies import as_markers, owners
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
@@ -45,12 +46,9 @@ from .files import (
     ROLLOUTS,
     SCALED_DATASET,
     SHAPES,
-    STATIC,
     TIMES,
     TRUTH,
-    Dataset,
     fold_folder,
-    read_dataset,
     read_if_there,
     since_change,
     training_file,

@@ -73,7 +73,7 @@ def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> d
     configured = configured_parameters(simulator, moved)
     values = {name: simulator.tensor([value]) for name, value in configured.items()} | experiment.parameters(model)
     with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
-        for whole in experiment.batches(names):
+        for whole in experiment.dataset.batches(names):
             size = experiment.settings.batch or len(whole)
             for batch in (whole[first : first + size] for first in range(0, len(whole), size)):
                 try:
@@ -93,8 +93,12 @@ def _of_batch(
     moved: Mapping[str, float],
 ) -> dict[str, Sensitivity]:
     """Derivatives of trials of one of `Experiment.batches`, from values (1,) of all parameters and steps of some."""
-    replay, observe, dataset = experiment.replay(simulator, names, model), experiment.observe, experiment.dataset
-    start, placement = experiment.start(replay, model), None
+    replay, observe, dataset = (
+        experiment.motions.replay(simulator, names, experiment.identified(model)),
+        experiment.motions.observe,
+        experiment.dataset,
+    )
+    start, placement = experiment.motions.start(replay, experiment.identified(model)), None
     if isinstance(observe, Markers) and not isinstance(observe, ViewedMarkers):
         assert dataset.bound is not None
         count, plain = len(dataset.labels), experiment.identification(model).get("placement")

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.base_motion import check_steps, contact_inputs, prescribed, prescribed_all, rigid
+from ..data.dataset import GIVEN, Dataset
 from ..data.markers import WHOLE_STATE, MarkerMap, Observation
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
@@ -45,7 +46,7 @@ from ..stepping.rollout import states
 from ..stepping.rotations import twisted
 from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
-from .files import DATASET, GIVEN, Dataset
+from .files import DATASET
 from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 
 _LARGEST_DISTANCE = 0.2  # of a vertex from the cell of the other mesh that it is extrapolated from, over its diagonal

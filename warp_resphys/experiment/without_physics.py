@@ -7,13 +7,15 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..data.dataset import GIVEN, RESTING, Dataset
 from ..data.trials import Trials
 from ..io.arrays import BoolArray, FloatArray
 from ..learning.baselines import BASELINES, REST, PlainTrials, at_rest, predictions
+from ..learning.observed_motions import at_steps
 from ..learning.release import least_delays
 from ..learning.replay import sample
-from .experiment import Experiment, at_steps
-from .files import GIVEN, RESTING, Dataset, driving
+from .experiment import Experiment
+from .files import driving
 
 _SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest
 
@@ -47,9 +49,9 @@ def without_physics(
     settings: dict[str, str] = {}
     missing: dict[str, str] = {}
     for batch in _batches(experiment, names, left_out):
-        begins, without = _kind(experiment.begins(batch[0])), batch if left_out else ()
+        begins, without = _kind(experiment.dataset.begin_of(batch[0])), batch if left_out else ()
         train = [name for name in experiment.settings.split.train if name not in without]
-        learned = [name for name in train if _kind(experiment.begins(name)) == begins]
+        learned = [name for name in train if _kind(experiment.dataset.begin_of(name)) == begins]
         shown = _at_steps(dataset, learned, batch) if begins == "released" else dataset
         trials, asked = _motions(experiment, shown, learned, batch)
         trials = trials.select(np.asarray(np.isfinite(trials.values).any((1, 2))))
@@ -113,7 +115,7 @@ def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray
 def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> Iterator[Sequence[str]]:
     """Trials that begin in the same way; training trials by themselves if they are left out."""
     alone = set(experiment.settings.split.train) if left_out else set()
-    for batch in experiment.batches(names):
+    for batch in experiment.dataset.batches(names):
         yield from ([name] for name in batch if name in alone)
         if others := [name for name in batch if name not in alone]:
             yield others
@@ -131,11 +133,11 @@ def _motions(
         )
         acting, loads = driving(dataset, names), dataset.payload[rows][:, None]
         if not made:
-            values[:, experiment.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
+            values[:, experiment.motions.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
             sizes, load = {name: _size(own) for name, own in acting.items()}, _size(loads)
             ends = np.array([_end(own) for own in values]).reshape(-1, first.shape[1])
             rest = np.array([_mean(column) for column in ends.T])
-        settles = experiment.begins(asked[0]) in ("released", GIVEN)  # at rest where the training ends
+        settles = experiment.dataset.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
         frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
         origin = np.where(np.isfinite(rest), rest, first) if settles else first
         made.append(PlainTrials(values, origin, first, np.concatenate(frames, 2), loads / load))

@@ -5,6 +5,7 @@ Trained models are predictors of a roll-out, with a guard against states outside
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 
@@ -15,6 +16,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .networks import NextState, StateMap
 
+COROTATED: Final = "corotated"
 DIVERGENCE_DISTANCE = 10.0  # body lengths from rest beyond which a roll-out has diverged
 
 # Function of the state and the number of the step: a residual force (B, N, 3) [N] to add, or the next state.
@@ -236,6 +238,11 @@ class LearnedPredictor:
             fields[0] = fields[0] * weight[:, None, None]
         force = fields[0] if self._frames is None else self._frames.to_world(q, v, fields[0])
         return force if self._base is None else self._base.force_outside(force, step)
+
+
+def force_frames(simulator: Simulator, kind: str) -> VertexFrames | None:
+    """Returns the corotational frames of residual forces; None for forces in the world's frame (``world``)."""
+    return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions) if kind == COROTATED else None
 
 
 def equilibrium_under_feedback(

@@ -1,9 +1,10 @@
 """Identification, reconstruction, training and evaluation as four functions, without configuration or run folder.
 
-The commands do this work in stages, through files. Here observations are tensors and results stay in memory::
+The commands do this work in stages, through files. Here results stay in memory::
 
-    identified = identify(simulator, motion, {"youngs_modulus": (1e5, 1e6)}).parameters
-    samples = reconstruct(simulator, motion, parameters=identified)
+    motions = ObservedMotions.of(simulator, observed, start)
+    identified = identify(simulator, motions, {"youngs_modulus": (1e5, 1e6)}).parameters
+    samples = reconstruct(simulator, motions, parameters=identified)
     force = fit_force(simulator, samples)
     errors = evaluate(simulator, held_out, force, parameters=identified)
 
@@ -13,78 +14,27 @@ unless others are given. `tests/learning/test_library.py` checks them on a beam.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 
-from ..data.markers import WHOLE_STATE, Observation, WholeState
-from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..io.errors import InputError
 from ..settings.learning import NetworkSettings, ReconstructionSettings, TrainerSettings
-from ..stepping.inputs import Inputs
 from ..stepping.rollout import rollout
-from ..stepping.state import State
 from .correction import CorrectedSimulator, LearnedPredictor, Predictor, known_positions
 from .identification import Identification, ParameterSearch
 from .misfit import Misfit
 from .networks import ResidualForce, build_model
+from .observed_motions import Identified, ObservedMotions
 from .parameters import Bounds, configured_parameters
 from .reconstruction import follow, make_reconstructor, without_ringing
-from .replay import Replay, Start
 from .training import Samples, Trainer
-
-
-@dataclass(frozen=True)
-class ObservedMotion:
-    """B motions of one body, observed at the start and after every time step of the simulator.
-
-    Raises:
-        InputError: observations of a wrong shape or number of vertices, or a motion of which nothing was seen.
-    """
-
-    # (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point was not seen; by default the positions
-    # of all vertices, as in `Trajectory.q`. (T + 1, M, D) is one motion
-    observed: torch.Tensor
-    # initial positions and velocities; None: at rest in equilibrium under `resting`
-    start: State | None = None
-    inputs: Inputs = field(default_factory=Inputs)  # during the motion, with or without a time axis
-    resting: Inputs = field(default_factory=Inputs)  # before the motion, where `start` is None
-    observation: Observation = WHOLE_STATE  # the sensor, such as markers from `bind_markers`
-
-    def __post_init__(self) -> None:
-        """Adds the batch axis to a single motion and checks the shape."""
-        if self.observed.ndim == 3:
-            object.__setattr__(self, "observed", self.observed[:, None])
-        dimension, unit = self.observation.dimension, self.observation.unit
-        if self.observed.ndim != 4 or self.observed.shape[-1] != dimension or len(self.observed) < 2:
-            raise InputError(
-                f"observed has shape {tuple(self.observed.shape)}: it must be (time, motion, point, {dimension}) in "
-                f"{unit}, of two times or more."
-            )
-
-    def replay(self, simulator: Simulator) -> tuple[Replay, Start]:
-        """Returns the replay that simulates these motions, and their start."""
-        like = simulator.rest_positions
-        observed = self.observed.to(like).transpose(0, 1)
-        count, frames = observed.shape[:2]
-        if isinstance(self.observation, WholeState) and observed.shape[2] != len(like):
-            raise InputError(f"{observed.shape[2]} points were observed, but the body has {len(like)} vertices.")
-        times = simulator.time_step * torch.arange(frames).to(like).expand(count, -1)
-        names = tuple(f"motion {number}" for number in range(count))
-        inputs, resting = self.inputs.to(like), self.resting.to(like)
-        trials = Trials(names, times, observed, observed[:, 0], inputs, resting)
-        if self.start is None:
-            start = Start.resting(like.expand(count, -1, -1).clone())
-        else:
-            start = Start(self.start.map(lambda values: values.to(like)), like.new_zeros(count))
-        return Replay(simulator, self.observation.to(like), trials), start
 
 
 def identify(
     simulator: Simulator,
-    motion: ObservedMotion,
+    motions: ObservedMotions,
     parameters: Mapping[str, Bounds | tuple[float, float]],
     first_guess: Mapping[str, float] | None = None,
     *,
@@ -97,7 +47,7 @@ def identify(
 
     Args:
         simulator: gives all other parameters.
-        motion: observed states or markers.
+        motions: observed states or markers.
         parameters: range of every parameter to identify, by a name of `Replay.parameter_names`, in its unit. A pair of
             positive numbers is searched on a logarithmic scale.
         first_guess: start of the search; the simulator's own values where left out.
@@ -114,14 +64,14 @@ def identify(
         ConvergenceError: the simulation fails at every start.
     """
     ranges = {n: b if isinstance(b, Bounds) else Bounds(*b, logarithmic=min(b) > 0.0) for n, b in parameters.items()}
-    search = ParameterSearch(Misfit([motion.replay(simulator)], ranges))
+    search = ParameterSearch(Misfit(motions.replays(simulator), ranges))
     guess = {**configured_parameters(simulator, ranges), **(first_guess or {})}
     return search.run(search.starts(guess, starts, 4 * starts, seed), max_evaluations, tolerance=tolerance)
 
 
 def reconstruct(
     simulator: Simulator,
-    motion: ObservedMotion,
+    motions: ObservedMotions,
     *,
     parameters: Mapping[str, float] | None = None,
     settings: ReconstructionSettings | None = None,
@@ -130,7 +80,7 @@ def reconstruct(
 
     Args:
         simulator: to correct. With markers, BDF2 replaces the midpoint rule.
-        motion: observed states or markers.
+        motions: observed states or markers.
         parameters: values in place of the simulator's own, such as `Identification.parameters`.
         settings: method, regularisation [unit^2/N^2], tolerance and iterations; the defaults of the class.
 
@@ -142,27 +92,31 @@ def reconstruct(
         InputError: a setting out of range, or an input that the body does not take.
         ConvergenceError: a step without a solution.
     """
-    used = without_ringing(simulator, motion.observation)
-    replay, start = motion.replay(used)
-    with torch.no_grad():
-        constants, inputs, resting = replay.prepare(_values(used, parameters))
-        state = replay.initial_state(start, constants, resting)
-        method = make_reconstructor(used, **dict(settings or ReconstructionSettings()), observation=motion.observation)
-        method = method.with_constants(constants)
-        targets = replay.trials.observed[:, 1:].unbind(1)
-        steps = [*follow(method, state, targets, inputs)]
-        states = [state, *(step.state for step in steps)][:-1]
-        series = ([one.q for one in states], [one.v for one in states], [step.force for step in steps])
-        q, v, f = (torch.stack(values, 1).flatten(0, 1) for values in series)
-        context = _context(inputs, len(steps))
-        actuation = None if context is None else context.transpose(0, 1).flatten(0, 1)
-    return Samples(q, v, (f,), actuation, (len(steps),) * replay.trials.observed.shape[0])
+    used = without_ringing(simulator, motions.observe)
+    known, parts = Identified(parameters or {}), list[Samples]()
+    for names in motions.dataset.batches(motions.dataset.names):
+        replay = motions.replay(used, names, known)
+        start = motions.start(replay, known)
+        with torch.no_grad():
+            constants, inputs, resting = replay.prepare(known.values(used))
+            state = replay.initial_state(start, constants, resting)
+            method = make_reconstructor(used, **dict(settings or ReconstructionSettings()), observation=replay.observe)
+            targets = motions.targets(replay, start)[:, 1:].unbind(1)
+            steps = [*follow(method.with_constants(constants), state, targets, inputs)]
+            states = [state, *(step.state for step in steps)][:-1]
+            series = ([one.q for one in states], [one.v for one in states], [step.force for step in steps])
+            q, v, f = (torch.stack(values, 1).flatten(0, 1) for values in series)
+            context = motions.conditions(replay, known.values(used))
+            if context is not None:
+                context = context.expand(len(steps), *context.shape[-2:]).transpose(0, 1).flatten(0, 1)
+        parts.append(Samples(q, v, (f,), context, (len(steps),) * len(names)))
+    return Samples.joined(parts)
 
 
 def fit_force(
     simulator: Simulator,
     samples: Samples,
-    validation: ObservedMotion | None = None,
+    validation: ObservedMotions | None = None,
     *,
     parameters: Mapping[str, float] | None = None,
     network: NetworkSettings | None = None,
@@ -212,7 +166,7 @@ def fit_force(
 
 def evaluate(
     simulator: Simulator,
-    motion: ObservedMotion,
+    motions: ObservedMotions,
     force: ResidualForce | Predictor | None = None,
     *,
     parameters: Mapping[str, float] | None = None,
@@ -221,7 +175,7 @@ def evaluate(
 
     Args:
         simulator: to evaluate.
-        motion: observed states or markers.
+        motions: observed states or markers.
         force: residual force from `fit_force`, or a function of the state and the number of the step that returns
             forces (B, N, 3) [N]; None for the simulator alone.
         parameters: as for `reconstruct`.
@@ -235,30 +189,20 @@ def evaluate(
         ConvergenceError: no initial equilibrium.
     """
     used = replace(simulator, solver=replace(simulator.settings, on_failure="count"))
-    replay, start = motion.replay(used)
-    observed = replay.trials.observed
-    with torch.no_grad():
-        constants, inputs, resting = replay.prepare(_values(used, parameters))
-        predict: Predictor | None
-        if isinstance(force, ResidualForce):
-            predict = LearnedPredictor(force, _context(inputs, observed.shape[1] - 1))
-        else:
+    known, names = Identified(parameters or {}), motions.dataset.names
+    errors = used.rest_positions.new_full((motions.dataset.observed.shape[1], len(names)), torch.nan)
+    for replay, start in motions.replays(used, identified=known):
+        observed = replay.trials.observed
+        with torch.no_grad():
+            constants, inputs, resting = replay.prepare(known.values(used))
             predict = force
-        state = replay.initial_state(start, constants, resting)
-        step = CorrectedSimulator(used, predict, inputs, constants).step
-        seen = rollout(step, state, range(observed.shape[1] - 1), lambda now: replay.observe(known_positions(now)))
-        points = torch.stack(seen, 1)
-        distance = replay.observe.residual(points, observed).norm(dim=-1).nan_to_num(math.inf)
-        mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
-    return mean.transpose(0, 1)
-
-
-def _values(simulator: Simulator, parameters: Mapping[str, float] | None) -> dict[str, torch.Tensor]:
-    """(1,) values of parameters."""
-    return {name: simulator.tensor([value]) for name, value in (parameters or {}).items()}
-
-
-def _context(inputs: Inputs, steps: int) -> torch.Tensor | None:
-    """(K, B, A) actuation during every step, the network's inputs beside the state; None without actuation."""
-    series: list[Any] = [[*inputs.at(step).actuation.values()] for step in range(steps)]
-    return torch.stack([torch.cat(values, 1) for values in series]) if series and series[0] else None
+            if isinstance(force, ResidualForce):
+                predict = LearnedPredictor(force, motions.conditions(replay, known.values(used)))
+            state = replay.initial_state(start, constants, resting)
+            step = CorrectedSimulator(used, predict, inputs, constants).step
+            seen = rollout(step, state, range(replay.steps(start)), lambda now: replay.observe(known_positions(now)))
+            away = replay.observe.residual(replay.at_frames(torch.stack(seen, 1), start), observed)
+            distance = away.norm(dim=-1).nan_to_num(math.inf)
+            mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
+        errors[: mean.shape[1], motions.dataset.rows(replay.trials.names)] = mean.transpose(0, 1)
+    return errors

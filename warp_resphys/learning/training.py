@@ -25,6 +25,18 @@ class Samples:
     actuation: torch.Tensor | None = None  # (S, A) further inputs of the network; None without any
     lengths: tuple[int, ...] = ()  # of the time series that the samples consist of, one after the other
 
+    @classmethod
+    def joined(cls, parts: "Sequence[Samples]") -> "Samples":
+        """Returns the samples of all parts, one after the other."""
+        actuation = [part.actuation for part in parts if part.actuation is not None]
+        return cls(
+            q=torch.cat([part.q for part in parts]),
+            v=torch.cat([part.v for part in parts]),
+            outputs=tuple(map(torch.cat, zip(*(part.outputs for part in parts), strict=True))),
+            actuation=torch.cat(actuation) if actuation else None,
+            lengths=tuple(length for part in parts for length in part.lengths),
+        )
+
 
 class EpochTrainer(ABC, Generic[Model]):
     """Trains epoch by epoch, and keeps the weights with the smallest roll-out error.

@@ -244,7 +244,7 @@ def describe(folder: Path, model: str) -> Description:
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
     own = intervals["models"].get(model, {})
     learned, actuation = learned_of(experiment, model), settings.actuation
-    base = None if learned is None else experiment.base_movement_mask(simulator)
+    base = None if learned is None else experiment.motions.base_movement_mask(simulator)
     moved = dataset.contact_at(dataset.names, simulator.body, dataset.time_step)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),

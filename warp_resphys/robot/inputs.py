@@ -11,13 +11,13 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.base_motion import LARGEST_STEP
+from ..data.dataset import payload_inputs
 from ..data.input_response import InputResponse, response_of, with_means
 from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.contact import MOTION
 from ..energies.strings import PAYLOAD, Strings
-from ..experiment.files import payload_inputs
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR
 from ..stepping.inputs import Inputs

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.dataset import STATIC
 from ..data.rigid_bodies import as_markers
 from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
-from ..experiment.files import STATIC
 from ..io.errors import DataFileError, InputError, listed
 from ..learning.parameters import own_name
 from .description import Description, describe, finished_experiment
@@ -117,7 +117,7 @@ def held_out_names(robot: Robot, moving: bool = False) -> tuple[str, ...]:
     """
     experiment = _experiment(robot)
     names = experiment.settings.split.test
-    return experiment.moving(names) if moving else names
+    return experiment.dataset.moving(names) if moving else names
 
 
 def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
@@ -133,16 +133,17 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
         raise InputError(f"the trial is {name!r}: {robot.folder} has {listed(names)}.")
     simulator, model = experiment.model_simulator(robot.description.model), robot.description.model
     with torch.no_grad():
-        replay = experiment.replay(simulator, [name], model)
-        start = experiment.start(replay, model)
-        constants, _, resting = replay.prepare(experiment.parameters(model))
+        identified = experiment.identified(model)
+        replay = experiment.motions.replay(simulator, [name], identified)
+        start = experiment.motions.start(replay, identified)
+        constants, _, resting = replay.prepare(identified.values(simulator))
         inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
         inputs = _commands(experiment, robot, name, inputs)
         load = float(experiment.dataset.payload[experiment.dataset.rows([name])[0]])
         if load:
             inputs[PAYLOAD.name] = simulator.tensor([load])
         base = experiment.dataset.base_at([name], simulator.time_step)
-        if experiment.begins(name) == STATIC:
+        if experiment.dataset.begin_of(name) == STATIC:
             inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
             begun, steps = robot.settle(1, **inputs), 0
         else:

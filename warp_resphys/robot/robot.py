@@ -13,7 +13,6 @@ from scipy.sparse import csc_array
 from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..energies.materials import MASS_DAMPING
-from ..experiment.experiment import COROTATED
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError, number_of
 from ..learning.correction import (
@@ -21,6 +20,7 @@ from ..learning.correction import (
     CorrectedSimulator,
     LearnedPredictor,
     equilibrium_under_feedback,
+    force_frames,
     is_lost,
 )
 from ..learning.intervals import time_since_change
@@ -79,8 +79,8 @@ class Robot:
         self.frames: VertexFrames | None = None
         if self._learned is not None:
             self._learned.network.requires_grad_(False)
-            if self._learned.force_frame == COROTATED and not self.is_data_driven:
-                self.frames = VertexFrames(self.simulator.body, self.time_step, self.simulator.rest_positions)
+            if not self.is_data_driven:
+                self.frames = force_frames(self.simulator, self._learned.force_frame)
         self.inputs = inputs_of(self.simulator, description)
         self._reader = InputReader(self.inputs, self.simulator)
         self._set_parameters(parameters or {})

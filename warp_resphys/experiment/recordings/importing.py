@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...data.base_motion import at_times, check_steps
+from ...data.dataset import RESTING, SLACK, UNDER_INPUTS, Dataset, read_dataset
 from ...data.input_response import NO_INPUT
 from ...data.recordings.marker_quality import quality
 from ...data.recordings.processing import smooth
@@ -23,7 +24,7 @@ from ...io.errors import DataFileError, InputError, number_of
 from ...io.files import write_json
 from ...io.stages import StageContext
 from ..build import bound_markers
-from ..files import DATASET, QUALITY, REGISTRATION, RESTING, SCALED_DATASET, SLACK, UNDER_INPUTS, Dataset, read_dataset
+from ..files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET
 from ..trials import evenly
 from .registered_trials import RegisteredTrials
 

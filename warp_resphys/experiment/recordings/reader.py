@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...data.dataset import STATIC, payload_inputs
 from ...data.marker_view import MarkerView
 from ...data.recordings.processing import obstacle_motion
 from ...data.recordings.recording import Recording
@@ -21,7 +22,6 @@ from ...settings.trials import ReadingSettings, Trial
 from ...stepping.inputs import Inputs
 from ..actuators import drive_of
 from ..build import bound_markers, build_simulator, marker_view_of, nominal_places
-from ..files import STATIC, payload_inputs
 
 log = logging.getLogger(__name__)
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...data.dataset import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ...data.input_response import draw_inputs
 from ...data.markers import follow_vertices
 from ...data.registration import axes_rotation
@@ -15,7 +16,6 @@ from ...settings.run import RunSettings
 from ...settings.trials import MarkerSettings, RecordedData, Trial
 from ..actuators import Drive, drive_of
 from ..build import build_material, marker_view_of, mounted_on
-from ..files import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..laboratory import largest_input
 from ..simulate import substeps_of
 from ..trials import all_trials, folds_of, split_of, trials_of

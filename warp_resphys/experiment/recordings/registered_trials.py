@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...data.base_motion import followed, in_frame, prescribed, prescribed_all, rigid
+from ...data.dataset import SLACK, STATIC, UNDER_INPUTS
 from ...data.input_response import NO_INPUT, check_inputs
 from ...data.recordings.marker_quality import check_base, check_motion
 from ...data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release, valve_opening
@@ -20,7 +21,6 @@ from ...io.errors import DataFileError, listed
 from ...io.stages import StageContext
 from ...settings.trials import MotionSettings, Trial
 from ..actuators import Drive
-from ..files import SLACK, STATIC, UNDER_INPUTS
 from .reader import POSE_SECONDS, Reader, central_places
 
 log = logging.getLogger(__name__)

@@ -1,0 +1,297 @@
+"""Observed motions of a body: how they begin, and what a simulator and a network need to replay them.
+
+`identification`, `reconstruction`, `training` and `evaluation` learn from them and test on them.
+"""
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..data.dataset import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Dataset
+from ..data.input_response import InputResponse, with_means
+from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
+from ..data.trials import Trials
+from ..dynamics.frames import BaseFrame, base_movement
+from ..dynamics.simulator import Simulator
+from ..energies.strings import PAYLOAD
+from ..io.errors import ConvergenceError, InputError
+from ..settings.learning import ActuationSettings, ReleaseSettings
+from ..settings.mesh import PlaceSettings
+from ..stepping.inputs import Inputs
+from ..stepping.state import State
+from .parameters import split_name
+from .placement import PlacedMarkers, placement_of
+from .release import begin_inputs, estimate_release
+from .replay import Replay, Start, later
+
+_STANDS_STILL = 1e-9  # m/s, rad/s
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Identified parameters of a simulator, and marker places.
+
+    Attributes:
+        parameters: values that all trials share, by name.
+        own: values of single trials and sessions, by `parameters.own_name`.
+        placement: of the markers, see `placement.placement_of`; None if it is exact.
+    """
+
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    own: Mapping[str, float] = field(default_factory=dict)
+    placement: Mapping[str, Any] | None = None
+
+    def values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
+        """Returns (1,) values of all parameters, on the device of a simulator."""
+        return {name: simulator.tensor([value]) for name, value in {**self.parameters, **self.own}.items()}
+
+
+@dataclass(frozen=True)
+class ObservedMotions:
+    """Trials of one body with an observation, as simulators replay them.
+
+    Attributes:
+        dataset: the trials.
+        observe: observation of the body, M points: markers, all vertices, or another sensor.
+        release: how the start of a motion is estimated.
+        payload_at: vertices that carry the payloads of the trials; None if there are none.
+        actuation: inputs of networks beside the state.
+        train_fraction: share of every trial, from its beginning, that is learned from.
+    """
+
+    dataset: Dataset
+    observe: Observation = WHOLE_STATE
+    release: ReleaseSettings = field(default_factory=ReleaseSettings)
+    payload_at: PlaceSettings | None = None
+    actuation: ActuationSettings = field(default_factory=ActuationSettings)
+    train_fraction: float = 1.0
+
+    @classmethod
+    def of(
+        cls,
+        simulator: Simulator,
+        observed: torch.Tensor,
+        start: State | None = None,
+        inputs: Inputs | None = None,
+        resting: Inputs | None = None,
+        observation: Observation = WHOLE_STATE,
+        **more: Any,
+    ) -> Self:
+        """Returns motions of which every step of a simulator was observed.
+
+        Args:
+            simulator: of the same time step and body.
+            observed: (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point was not seen; by
+                default the positions of all vertices, as in `Trajectory.q`. (T + 1, M, D) is one motion.
+            start: initial positions and velocities; None: at rest in equilibrium under `resting`.
+            inputs: during the motion, with or without a time axis.
+            resting: inputs before the motion, where `start` is None.
+            observation: the sensor, such as markers from `bind_markers`.
+            more: further attributes.
+
+        Raises:
+            InputError: observations of a wrong shape or number of vertices, or a motion of which nothing was seen.
+        """
+        observed = observed[:, None] if observed.ndim == 3 else observed
+        if observed.ndim != 4 or observed.shape[-1] != observation.dimension or len(observed) < 2:
+            raise InputError(
+                f"observed has shape {tuple(observed.shape)}: it must be (time, motion, point, "
+                f"{observation.dimension}) in {observation.unit}, of two times or more."
+            )
+        count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
+        if isinstance(observation, WholeState) and observed.shape[2] != len(like):
+            raise InputError(f"{observed.shape[2]} points were observed, but the body has {len(like)} vertices.")
+        points = _array(observed.transpose(0, 1))
+        acting, before = ((own or Inputs()).fitted(simulator.counts, like, count) for own in (inputs, resting))
+        trials = Dataset(
+            names=tuple(f"motion {number}" for number in range(count)),
+            labels=(),
+            begins=(UNDER_INPUTS if start is None else GIVEN,) * count,
+            times=np.tile(simulator.time_step * np.arange(frames), (count, 1)),
+            observed=points,
+            held=points[:, 0],
+            payload=np.zeros(count),
+            gravity=np.asarray(simulator.gravity, dtype=np.float64),
+            time_step=simulator.time_step,
+            initial=None if start is None else _array(torch.stack([start.q, start.v], 1)),
+            inputs={name: _array(x if axis == 0 else x.transpose(0, 1)) for name, (x, axis) in acting.axes().items()},
+            resting={name: _array(x) for name, x in before.fields.items()},
+        )
+        return cls(trials, observation.to(like), **more)
+
+    def trials(self, names: Sequence[str], simulator: Simulator) -> Trials:
+        """Trials that begin in the same way, on the device of a simulator, with inputs at its steps."""
+        trials = self.dataset.trials(names, simulator.body, self.payload_at, simulator.time_step)
+        return trials.to(simulator.rest_positions)
+
+    def replay(self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None) -> Replay:
+        """Replay of trials of one batch of the dataset, with the markers where they were identified."""
+        observe, placement = self.observe, None if identified is None else identified.placement
+        if placement is not None:
+            assert isinstance(observe, Markers)
+            placed = placement_of(placement, self.dataset.labels, self.dataset.session(names[0]))
+            observe = PlacedMarkers.of(observe, placed).to(simulator.rest_positions)
+        return Replay(simulator, observe, self.trials(names, simulator))
+
+    def start(self, replay: Replay, identified: Identified | None = None) -> Start:
+        """Estimates how the trials of a replay begin.
+
+        Args:
+            replay: of trials that begin in the same way.
+            identified: parameters of its simulator; the simulator's constants if None.
+
+        Raises:
+            ConvergenceError: a body cannot be held, or a step of the simulation fails.
+        """
+        simulator, trials = replay.simulator, replay.trials
+        begins = self.dataset.begin_of(trials.names[0])
+        if begins == GIVEN:
+            rows, initial = self.dataset.rows(trials.names), self.dataset.initial
+            if initial is not None:
+                q, v = (simulator.tensor(initial[rows, at]) for at in (0, 1))
+            else:
+                q, velocity = trials.observed[:, 0], self.dataset.velocity
+                v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[rows, 0])
+            return Start(State(q, v), q.new_zeros(len(q)))
+        known = {} if identified is None else identified.values(simulator)
+        values = {name: value for name, value in known.items() if split_name(name)[0] in replay.parameter_names} or None
+        if begins == RELEASED:
+            return estimate_release(replay, self.release, values)
+        guess = simulator.rest_positions.expand(len(trials.names), -1, -1)
+        if begins in (STATIC, UNDER_INPUTS):  # Small changes of a parameter then start close to the solution.
+            with contextlib.suppress(ConvergenceError), torch.no_grad():
+                constants, _, resting = replay.prepare(values)
+                guess = simulator.static_equilibrium(resting, constants).q
+        if begins == STATIC:
+            return Start.resting(guess)
+        return begin_inputs(replay, Start.resting(guess), self.release, values)
+
+    def replays(
+        self, simulator: Simulator, names: Sequence[str] | None = None, identified: Identified | None = None
+    ) -> list[tuple[Replay, Start]]:
+        """Replays of any trials, one for each batch of the dataset, each with its start."""
+        batches = self.dataset.batches(self.dataset.names if names is None else names)
+        replays = [self.replay(simulator, batch, identified) for batch in batches]
+        return [(replay, self.start(replay, identified)) for replay in replays]
+
+    def targets(self, replay: Replay, start: Start) -> torch.Tensor:
+        """(R, K + 1, M, 3) target positions at a simulator's steps [m], NaN where a marker was not seen.
+
+        Only the part of each trial that is used for training is returned.
+        """
+        simulator, trials = replay.simulator, replay.trials
+        if self.dataset.smoothed is not None and self.dataset.begin_of(trials.names[0]) in RESTING:
+            smoothed = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
+            targets = later(smoothed, start.delay, simulator.time_step)
+        elif self.dataset.begin_of(trials.names[0]) in (GIVEN, STATIC) or not self.dataset.labels:
+            targets = trials.observed
+        else:
+            targets = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
+        return targets[:, : self.learned_steps(targets.shape[1] - 1) + 1]
+
+    def learned_steps(self, steps: int) -> int:
+        """Number of steps of a trial that are used for training."""
+        return max(round(self.train_fraction * steps), 1)
+
+    def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
+        """Frame of the base to which the body is fixed in trials; None if the base stands still."""
+        poses = self.dataset.base_at(names, simulator.time_step)
+        return None if poses is None else BaseFrame(poses.to(simulator.rest_positions), simulator.time_step)
+
+    def _base_movement(self, names: Sequence[str], simulator: Simulator) -> torch.Tensor | None:
+        """(K, R, A) motion of the base during each step as network inputs; None if the base stands still."""
+        poses, mask = self.dataset.base_at(names, simulator.time_step), self.base_movement_mask(simulator)
+        if poses is None or mask is None:
+            return None
+        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        return movement[..., mask].to(simulator.rest_positions)
+
+    def base_movement_mask(self, simulator: Simulator) -> torch.Tensor | None:
+        """(15,) bool, components of `base_movement` that vary and are network inputs; None if the base stands still."""
+        poses = self.dataset.base_at(self.dataset.names, simulator.time_step)
+        if poses is None:
+            return None
+        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        return movement.flatten(0, 1).std(0) > _STANDS_STILL
+
+    def conditions(
+        self, replay: Replay, parameters: Mapping[str, torch.Tensor], payload: bool = False
+    ) -> torch.Tensor | None:
+        """Returns the network inputs of trials besides the state; None if there are none.
+
+        Args:
+            replay: replay of the trials.
+            parameters: (1,) identified parameters.
+            payload: whether to include the payload even if ``actuation.sees_payload`` is false.
+
+        Returns:
+            (R, 1) payloads [kg] if nothing else acts; otherwise (K, R, A) during each step: payloads, inputs (of
+            actuators, and those that move obstacles) with their exponential means, and motion of the base
+            (`base_movement`). (R, A) for static poses, under steady inputs.
+        """
+        _, inputs, resting = replay.prepare(parameters)
+        constant = list[torch.Tensor]()
+        if self.payload_at is not None and (payload or self.actuation.sees_payload):
+            rows = self.dataset.rows(replay.trials.names)
+            constant.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
+        filters = self.actuation.filter_time_constants
+        acting = resting if replay.is_static else inputs
+        driven = {name: values for name, values in acting.actuation.items() if name != PAYLOAD.name}
+        moving = self._base_movement(replay.trials.names, replay.simulator)
+        if replay.is_static:
+            constant += [values.repeat(1, 1 + len(filters)) for values in driven.values()]
+            constant += [] if moving is None else [moving[0]]
+            return torch.cat(constant, -1) if constant else None
+        response = InputResponse(replay.simulator.time_step, filters=filters)
+        series = []
+        for name, values in driven.items():
+            values, first = values if values.ndim == 3 else values[None], resting.actuation.get(name)
+            memory = response.steady(0.0 * values[0] if first is None else first)
+            series.append(with_means(*response(memory, values)[:2]))
+        series += [] if moving is None else [moving]
+        if not series:
+            return constant[0] if constant else None
+        at = torch.arange(max(map(len, series)))
+        series = [values[at.clamp_max(len(values) - 1).to(values.device)] for values in series]
+        return torch.cat([*(values.expand(len(at), -1, -1) for values in constant), *series], -1)
+
+
+def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
+    """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
+
+    Interpolates with cubic splines through the frames in which a marker was seen, starting from the held position at
+    time zero. A marker counts as not seen at steps that are more than 1.5 frames away from its nearest frame.
+
+    Args:
+        trials: observed trials.
+        step: time step h [s].
+        delay: (R,) delay of the release after time zero of the frames [s]; zero by default.
+    """
+    from scipy.interpolate import CubicSpline
+
+    since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
+    times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
+    steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
+    positions = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
+    for r, m in np.ndindex(len(times), markers.shape[2]):
+        seen = np.isfinite(markers[r, :, m]).all(1)
+        t, y = times[r, seen], markers[r, seen, m]
+        t, first = np.unique(t, return_index=True)
+        y = y[first]
+        if np.isfinite(held[r, m]).all() and (not len(t) or t[0] > 1e-9):
+            t, y = np.concatenate([[0.0], t]), np.concatenate([held[r, m][None], y])
+        if len(t) < 4:
+            continue
+        nearest = np.abs(steps[:, None] - t).min(1)
+        near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
+        positions[r, near, m] = CubicSpline(t, y)(steps[near])
+    return positions
+
+
+def _array(values: torch.Tensor) -> NDArray[np.float64]:
+    return values.detach().cpu().numpy().astype(np.float64)

@@ -72,7 +72,7 @@ def test_the_delay_of_a_trial_is_that_of_its_first_frames_as_for_simulators():
 
 def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
-    fake.motions = ObservedMotions(fake.dataset, train_fraction=0.5)
+    fake.motions = ObservedMotions(fake.dataset, train_fraction=(FRAMES // 2 - 1) / (FRAMES - 1))
     fake.dataset.observed[:2, FRAMES // 2 + 1 :] = 1e6
     values, _, missing = without_physics(fake, ["c"])
     assert missing == {"regression": "needs three training trials that differ in inputs or loads"}

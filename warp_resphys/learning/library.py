@@ -200,8 +200,9 @@ def evaluate(
                 predict = LearnedPredictor(force, motions.conditions(replay, known.values(used)))
             state = replay.initial_state(start, constants, resting)
             step = CorrectedSimulator(used, predict, inputs, constants).step
-            seen = rollout(step, state, range(replay.steps(start)), lambda now: replay.observe(known_positions(now)))
-            away = replay.observe.residual(replay.at_frames(torch.stack(seen, 1), start), observed)
+            positions = rollout(step, state, range(replay.steps(start)), known_positions)
+            points = torch.stack([replay.observe(q) for q in positions], 1)
+            away = replay.observe.residual(replay.at_frames(points, start), observed)
             distance = away.norm(dim=-1).nan_to_num(math.inf)
             mean = torch.where(replay.trials.seen, distance, torch.nan).nanmean(2)
         errors[: mean.shape[1], motions.dataset.rows(replay.trials.names)] = mean.transpose(0, 1)

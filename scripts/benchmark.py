@@ -3,7 +3,7 @@
     python scripts/benchmark.py step                                 one beam, by solver and Poisson's ratio
     python scripts/benchmark.py batches --device cuda solver.factors=single
     python scripts/benchmark.py step experiment=sopra --materials configured
-    python scripts/benchmark.py sizes mesh=beam_tetrahedra --linear-solvers multigrid pardiso
+    python scripts/benchmark.py sizes mesh=beam_tetrahedra --linear-solvers sparse pardiso
     python scripts/benchmark.py twin RUN engine=reduced              a twin on the trials of a run
     python scripts/benchmark.py gripper
     python scripts/benchmark.py peers --programs newton mujoco        a block in contact, at equal error
@@ -96,7 +96,7 @@ def command_line() -> argparse.ArgumentParser:
     batches.add_argument("--run", type=Path, help="a run folder, whose environments are timed, too")
     sizes = parts.add_parser("sizes", parents=[shared, body], help="by size of the body and linear solver")
     sizes.set_defaults(measure=steps.measure_sizes)
-    linear = ["banded", "sparse", "multigrid", "pardiso"]
+    linear = ["banded", "sparse", "pardiso"]
     sizes.add_argument("--linear-solvers", nargs="+", choices=LINEAR_SOLVERS, default=linear)
     sizes.add_argument("--refinements", nargs="+", type=float, default=[1.0, 2.0, 3.0, 4.0, 5.0])
     follow = parts.add_parser("twin", parents=[shared], help="a twin that follows the trials of a run")

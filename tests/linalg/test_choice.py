@@ -7,6 +7,7 @@ import torch
 from warp_resphys.io.errors import InputError
 from warp_resphys.linalg.banded import BandedSolver, BorderedSolver, hubs
 from warp_resphys.linalg.choice import make_linear_solver
+from warp_resphys.linalg.cholmod import SparseSolver
 from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 
 CPU = torch.device("cpu")
@@ -39,12 +40,13 @@ def test_compact_bodies_take_pardiso_where_it_is_installed(monkeypatch):
     at = np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3)
     near = np.abs(at[:, None] - at).max(-1) <= 1
     rows, cols = np.nonzero(np.tril(near))
-    body = (rows, cols, len(at), 3, CPU, torch.float64, at.astype(float))
+    body = (rows, cols, len(at), 3, CPU, torch.float64)
     expected = PardisoSolver if has_pardiso() else BandedSolver
     assert isinstance(make_linear_solver("auto", *body), expected)
-    assert isinstance(make_linear_solver("auto", *body, keeps=False), BandedSolver)
     monkeypatch.setattr("warp_resphys.linalg.choice.has_pardiso", lambda: False)
     assert isinstance(make_linear_solver("auto", *body), BandedSolver)
+    monkeypatch.setattr("warp_resphys.linalg.choice.MAX_BANDED_FLOPS", 1e9)
+    assert isinstance(make_linear_solver("auto", *body), SparseSolver)
     with pytest.raises(InputError, match="pip install mkl"):
         make_linear_solver("pardiso", *body)
 
@@ -52,5 +54,5 @@ def test_compact_bodies_take_pardiso_where_it_is_installed(monkeypatch):
 def test_bad_choices_are_refused():
     with pytest.raises(InputError, match="linear_solver is 'lu'"):
         make_linear_solver("lu", *chain(3), 3, 3, CPU, torch.float64)
-    with pytest.raises(InputError, match="linear_solver=banded"):
-        make_linear_solver("banded", *chain(3), 3, 3, torch.device("cuda"), torch.float64)
+    with pytest.raises(InputError, match="linear_solver=pardiso runs on the CPU alone"):
+        make_linear_solver("pardiso", *chain(3), 3, 3, torch.device("cuda"), torch.float64)

@@ -25,7 +25,6 @@ class BlockPattern:
 
     Attributes:
         free: (F,) vertices that are not fixed.
-        positions: (F, 3) their rest positions [m].
         rows: (E,) row of each block, an index into ``free``.
         cols: (E,) column of each block; ``rows >= cols``.
         start: (E + 1,) first entry of each block in ``contribution``.
@@ -46,7 +45,6 @@ class BlockPattern:
         is_free = np.ones(len(vertices), dtype=bool)
         is_free[eliminated] = False
         self.free = np.flatnonzero(is_free)
-        self.positions = vertices[self.free]
         reduced = np.where(is_free, np.cumsum(is_free) - 1, -1)
         sources: list[NDArray[np.int64]] = []
         pairs: list[NDArray[np.int64]] = []

@@ -127,7 +127,7 @@ class Workspace:
     def linear_solver(self, name: str, dtype: torch.dtype = torch.float64) -> LinearSolver:
         """Returns a new linear solver for the Hessian."""
         p, k = self.potential, self.pattern
-        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, dtype, k.positions, p.has_pairs)
+        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, dtype)
 
 
 def equilibrium(

@@ -4,8 +4,7 @@ The three solvers differ only in the matrix of the global step:
 
 =======================  ====================================================================================
 ``projective_dynamics``  constant projective-dynamics matrix, accelerated by L-BFGS (Liu et al. 2017)
-``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; refactorised when convergence is slow,
-                         or for every iterate if that is cheap (multigrid)
+``quasi_newton``         Hessian of a recent state, accelerated by L-BFGS; refactorised when convergence is slow
 ``newton``               Hessian of every iterate, clamped to positive eigenvalues where it is not positive definite
 =======================  ====================================================================================
 
@@ -53,7 +52,7 @@ class SolverSettings:
     max_iterations: int = 2000  # iterations after which a solve has failed
     memory: int = 12  # number of L-BFGS pairs
     refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` refactorises
-    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse``, ``multigrid``, ...
+    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``pardiso``
     factors: str = "double"  # or ``single``: factors and L-BFGS pairs in float32; see ``factors`` in docs/settings.md
     on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and continue
 
@@ -109,14 +108,11 @@ class NonlinearSolver:
         self.potential, self.settings = potential, settings
         factors = torch.float32 if settings.factors == "single" else dtype
         self.hessian: HessianApproximation
-        kind = settings.linear_solver
-        where = (potential.device, factors, pattern.positions, potential.has_pairs, settings.name != "newton")
         projective = settings.name == "projective_dynamics"
-        count, block = len(pattern.free), 1 if projective else 3
-        linear = make_linear_solver(kind, pattern.rows, pattern.cols, count, block, *where)
+        blocks = (pattern.rows, pattern.cols, len(pattern.free), 1 if projective else 3)
+        linear = make_linear_solver(settings.linear_solver, *blocks, potential.device, factors)
         self.hessian = (ProjectiveHessian if projective else ExactHessian)(potential, pattern, linear)
-        # With an iterative linear solver the solutions dominate the cost, so the Hessian may as well be up to date.
-        quasi = 0 if linear.iterates else settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
+        quasi = settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
         after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": NEVER}
         self._minimiser = Minimiser(
             potential,

@@ -112,7 +112,7 @@ class _Cholesky(SeparateFactors):
     _solver: BandedSolver
 
     @override
-    def _overwrite(self, factor: torch.Tensor, rows: torch.Tensor, exact: bool) -> None:
+    def _overwrite(self, factor: torch.Tensor, rows: torch.Tensor) -> None:
         self._solver.lapack.solve(factor, rows)
 
     @override
@@ -160,9 +160,7 @@ class BorderedSolver(LinearSolver):
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         border = hubs(rows, cols, n_nodes)
         own_rows, own_cols, number = banded_rest(rows, cols, n_nodes, border)
-        self.band = BandedSolver(
-            own_rows, own_cols, n_nodes - len(border), self.block, self.device, self.dtype, self.positions
-        )
+        self.band = BandedSolver(own_rows, own_cols, n_nodes - len(border), self.block, self.device, self.dtype)
         k, n = self.block, self.n
         place = np.full(n_nodes, -1)
         place[border] = np.arange(len(border))

@@ -29,12 +29,10 @@ class Factor(ABC):
     """A factorised batch of matrices.
 
     Attributes:
-        approximate: whether `solve_in_place` is only approximate.
         failed: (B,) bool; matrices without a factor because they are not positive definite; their solutions are NaN.
     """
 
     failed: NDArray[np.bool_]
-    approximate = False
 
     @abstractmethod
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
@@ -81,9 +79,6 @@ class CorrectedFactor(Factor):
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        if self.factor.approximate:  # Errors along C would be amplified.
-            super().solve_in_place(columns)
-            return
         self.factor.solve_in_place(columns)
         along = self.columns[:, self._order].mT @ columns[:, :, None]
         columns -= (self._solved[:, self._order] @ torch.linalg.lu_solve(*self._small, along))[:, :, 0]
@@ -153,22 +148,22 @@ class SeparateFactors(Factor):
                 self.failed[i] = self.factors[i] is None
 
     @abstractmethod
-    def _overwrite(self, factor: Any, rows: torch.Tensor, exact: bool) -> None:
-        """Overwrites contiguous right-hand sides (m, n) with the solutions, approximate ones unless `exact`."""
+    def _overwrite(self, factor: Any, rows: torch.Tensor) -> None:
+        """Overwrites contiguous right-hand sides (m, n) with the solutions."""
 
-    def _overwrite_all(self, blocks: torch.Tensor, exact: bool) -> None:
+    def _overwrite_all(self, blocks: torch.Tensor) -> None:
         for factor, failed, rows in zip(self.factors, self.failed, blocks, strict=True):
             if failed:
                 rows.fill_(torch.nan)
             elif factor is not None:
-                self._overwrite(factor, rows, exact)
+                self._overwrite(factor, rows)
 
     @override
     def solve(self, rhs: torch.Tensor) -> torch.Tensor:
         b, n, m = rhs.shape
         rows = rhs[:, self._solver.dofs].mT.reshape((1, b * m, n) if len(self.factors) == 1 else (b, m, n))
         rows = rows.contiguous()
-        self._overwrite_all(rows, exact=True)
+        self._overwrite_all(rows)
         return rows.view(b, m, n).mT[:, self._solver.places]
 
     @override
@@ -186,11 +181,11 @@ class SeparateFactors(Factor):
         if factor is None:
             rows.fill_(torch.nan)
         else:
-            self._overwrite(factor, rows, exact=True)
+            self._overwrite(factor, rows)
 
     @override
     def solve_in_place(self, columns: torch.Tensor) -> None:
-        self._overwrite_all(columns[None] if len(self.factors) == 1 else columns[:, None], exact=False)
+        self._overwrite_all(columns[None] if len(self.factors) == 1 else columns[:, None])
 
 
 class LinearSolver(ABC):
@@ -203,7 +198,6 @@ class LinearSolver(ABC):
         block: unknowns per node (3 for a Hessian, 1 for a projective-dynamics matrix).
         device: device of values and right-hand sides.
         dtype: dtype of values and right-hand sides.
-        positions: (n_nodes, 3) node positions [m], for solvers that use them.
 
     Raises:
         InputError: a matrix too large for the layout.
@@ -212,7 +206,6 @@ class LinearSolver(ABC):
         address: (E, block^2) place of each block entry in the value array, -1 if not stored.
         n_values: length of the value array.
         overwrites: whether `factor` overwrites the values.
-        iterates: whether solutions are iterative, so that a factorisation is cheap compared with them.
         keeps_factors: whether a factor takes as long as dozens of solutions, so that it is kept for many states.
         order: (n_nodes,) nodes in the order of the right-hand sides of `Factor.solve_in_place`.
     """
@@ -221,20 +214,12 @@ class LinearSolver(ABC):
     n_values: int
     order: Indices
     overwrites = False
-    iterates = False
     keeps_factors = False
 
     def __init__(
-        self,
-        rows: Indices,
-        cols: Indices,
-        n_nodes: int,
-        block: int,
-        device: torch.device,
-        dtype: torch.dtype,
-        positions: NDArray[np.float64] | None = None,
+        self, rows: Indices, cols: Indices, n_nodes: int, block: int, device: torch.device, dtype: torch.dtype
     ) -> None:
-        self.positions, self._pattern = positions, (rows, cols)
+        self._pattern = rows, cols
         self.n = n_nodes * block
         self.block = block
         self.device = device
@@ -244,7 +229,7 @@ class LinearSolver(ABC):
         if self.n_values > _MOST_VALUES:
             raise InputError(
                 f"a {type(self).__name__} for {self.n} unknowns needs {self.n_values:.1e} numbers, beyond the "
-                f"{_MOST_VALUES:.1e} that a kernel addresses: choose solver.linear_solver=sparse or multigrid."
+                f"{_MOST_VALUES:.1e} that a kernel addresses: choose solver.linear_solver=sparse."
             )
 
     @abstractmethod

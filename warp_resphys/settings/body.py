@@ -237,8 +237,8 @@ class SolveSettings(Settings):
     absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is always solved", "N")
     max_iterations: Natural = setting(500, "iterations after which a step fails")
     memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
-    linear_solver: Literal["auto", "banded", "bordered", "tiled", "dense", "sparse", "multigrid", "pardiso"] = setting(
-        "auto", "linear solver; banded, bordered and pardiso need a CPU"
+    linear_solver: Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"] = setting(
+        "auto", "linear solver; pardiso needs a CPU"
     )
     factors: Literal["double", "single"] = setting(
         "double", "precision of factors and L-BFGS pairs; results stay accurate"

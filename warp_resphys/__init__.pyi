@@ -74,11 +74,11 @@ from .mesh.readers import write_mesh as write_mesh
 from .mesh.rod import rod as rod
 from .mesh.tetrahedra import fill_surface as fill_surface
 from .pictures.clouds import Cloud as Cloud
-from .pictures.misfit import PictureMisfit as PictureMisfit
-from .pictures.motion import ReleasedForce as ReleasedForce
 from .pictures.outlines import ClosedSurface as ClosedSurface
 from .pictures.outlines import Outline as Outline
-from .pictures.reading import read_scan as read_scan
+from .pictures.picture_misfit import PictureMisfit as PictureMisfit
+from .pictures.released_force import ReleasedForce as ReleasedForce
+from .pictures.scene_files import read_scan as read_scan
 from .pictures.seen import Photo as Photo
 from .pictures.seen import SeenPose as SeenPose
 from .robot.loading import load as load

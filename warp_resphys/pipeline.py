@@ -319,7 +319,7 @@ def prepare(run: RunSettings) -> None:
     if run.pictures is None:
         check_run(run)
     else:
-        from .experiment.pictures.stages import check_pictures
+        from .experiment.pictures.picture_stages import check_pictures
 
         check_pictures(run)
 
@@ -342,7 +342,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     """
     prepare(run)
     if run.pictures is not None:
-        from .experiment.pictures.stages import picture_stages, print_pictures
+        from .experiment.pictures.picture_stages import picture_stages, print_pictures
 
         run_stages(picture_stages(run, files_read(run, run)), folder)
         print_pictures(run, folder)

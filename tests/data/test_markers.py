@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from warp_resphys.data.markers import KINDS, bind_markers, closest_rotation
+from warp_resphys.data.markers import KINDS, bind_markers
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, select_vertices
-from warp_resphys.stepping.rotations import twisted
+from warp_resphys.stepping.rotations import closest_rotation, twisted
 
 MESHES = {
     "hexahedra": box_hexahedra(divisions=(5, 2, 2)),

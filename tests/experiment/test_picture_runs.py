@@ -21,15 +21,15 @@ from support.main_job import IN_RUN, QUIET
 from support.tags import draw_tag
 from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.energies.catalogue import read_law
-from warp_resphys.experiment.pictures.laboratory import depth_image, noisy_mask
-from warp_resphys.experiment.pictures.stages import picture_stages
+from warp_resphys.experiment.pictures.camera_laboratory import depth_image, noisy_mask
+from warp_resphys.experiment.pictures.picture_stages import picture_stages
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import run_stages
 from warp_resphys.mesh.mesh import boundary_triangles
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
-from warp_resphys.pictures.reading import read_tracked
+from warp_resphys.pictures.scene_files import read_tracked
 from warp_resphys.report.pictures_page import PictureResult, picture_verdict
 from warp_resphys.settings.run import RunSettings
 

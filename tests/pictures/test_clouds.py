@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
 from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
-from warp_resphys.experiment.pictures.laboratory import depth_image
+from warp_resphys.experiment.pictures.camera_laboratory import depth_image
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
 from warp_resphys.pictures.clouds import Cloud
-from warp_resphys.pictures.misfit import PictureMisfit
 from warp_resphys.pictures.outlines import ClosedSurface
+from warp_resphys.pictures.picture_misfit import PictureMisfit
 from warp_resphys.pictures.seen import Photo, SeenPose
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)

@@ -10,12 +10,12 @@ import torch
 
 import warp_resphys as wr
 from warp_resphys.data.camera import Lens, PlacedCamera
-from warp_resphys.experiment.pictures.laboratory import noisy_mask
+from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.parameters import Bounds, Prior
-from warp_resphys.pictures.misfit import PictureMisfit, values_of
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
+from warp_resphys.pictures.picture_misfit import PictureMisfit, values_of
 from warp_resphys.pictures.seen import Photo, SeenPose
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)

@@ -8,7 +8,7 @@ import trimesh
 from PIL import Image
 
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.pictures.reading import read_depth, read_mask, read_picture, read_scan, read_scene, read_tracked
+from warp_resphys.pictures.scene_files import read_depth, read_mask, read_picture, read_scan, read_scene, read_tracked
 from warp_resphys.settings.pictures import ColourSettings
 
 FRAME = {"image": "00.png", "time": 0.5, "world_to_camera": np.eye(4).tolist()}

@@ -13,9 +13,9 @@ from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.clouds import Cloud
-from warp_resphys.pictures.misfit import PictureMisfit
-from warp_resphys.pictures.motion import ReleasedForce, at_own_times
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
+from warp_resphys.pictures.picture_misfit import PictureMisfit
+from warp_resphys.pictures.released_force import ReleasedForce, at_own_times
 from warp_resphys.pictures.seen import Photo, SeenPose
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1), nodes=20)

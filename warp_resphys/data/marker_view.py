@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
-from .markers import Markers, closest_rotation
+from ..stepping.rotations import closest_rotation
+from .markers import Markers
 
 _AXES = "xyz"
 _LINE = 1e-3  # m: markers closer to a line do not determine the rotation about it

@@ -27,9 +27,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
+from ..stepping.rotations import closest_rotation
 
 _LEAST_PATCH = 4  # number of vertices that determine the rotation of a patch
 KINDS = ("normal", "frame", "rigid", "patch")
@@ -259,34 +261,6 @@ def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tens
     return torch.stack([along, torch.linalg.cross(normal, along), normal], dim=-1)
 
 
-def closest_rotation(matrix: torch.Tensor) -> torch.Tensor:
-    r"""Rotations R (B, 3, 3) that maximise tr(R^T A), differentiable once; identity where A is not finite.
-
-    Where R is optimal, S = R^T A is symmetric. When A changes by dA, R becomes R (1 + [w]) with
-
-        (tr(S) 1 - S) w = axial(R^T dA - dA^T R),
-
-    as [w] S + S [w] = [(tr(S) 1 - S) w]. The matrix on the left has the eigenvalues s2 + s3, s1 + s3 and s1 + s2,
-    s3 with the sign of det A: it is regular for all points that are not on a line, also for plane and symmetric
-    ones, where the singular vectors have no derivative. A step of Newton's method from the optimum is zero and has
-    that derivative; so one step is made, with all other values constant.
-    """
-    identity = torch.eye(3, device=matrix.device, dtype=matrix.dtype)
-    with torch.no_grad():
-        finite = matrix.isfinite().all(-1).all(-1)[:, None, None]
-        u, _, vt = torch.linalg.svd(torch.where(finite, matrix, identity))
-        sign = torch.linalg.det(u @ vt).sign()
-        rotation = u @ torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)) @ vt
-        shape = rotation.mT @ torch.where(finite, matrix, identity)
-        stiffness = torch.diagonal(shape, dim1=-2, dim2=-1).sum(-1)[:, None, None] * identity - shape
-        inverse = torch.linalg.inv(0.5 * (stiffness + stiffness.mT))
-    turned = rotation.mT @ matrix
-    skew = turned - turned.mT
-    axial = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
-    spin = (inverse @ axial[:, :, None])[:, :, 0]
-    return rotation + torch.linalg.cross(rotation, spin[:, None].expand_as(rotation), dim=-1)
-
-
 def bind_markers(
     mesh: Mesh,
     positions: ArrayLike,
@@ -322,16 +296,7 @@ def bind_markers(
     """
     points = np.asarray(positions, dtype=np.float64)
     kinds = [kind] * len(names) if isinstance(kind, str) else list(kind)
-    if points.shape != (len(names), 3) or len(kinds) != len(names) or not len(names):
-        raise InputError(
-            f"{len(names)} markers are named, with {len(kinds)} kinds and positions {points.shape}: there must be a "
-            "kind and three coordinates for each, and one marker at least."
-        )
-    for name, point, kind in zip(names, points, kinds, strict=True):
-        if kind not in KINDS:
-            raise InputError(f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}.")
-        if not np.isfinite(point).all():
-            raise InputError(f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out.")
+    _check_bound(points, names, kinds)
     feet = closest_points(mesh, points)
     worst = int(np.argmax(np.abs(feet.distances)))
     if abs(feet.distances[worst]) > largest_distance:
@@ -339,14 +304,10 @@ def bind_markers(
             f"Marker '{names[worst]}' is {1e3 * abs(feet.distances[worst]):.1f} mm from the surface of the body, more "
             f"than {1e3 * largest_distance:.1f} mm: check its position, the unit of the mesh and the registration."
         )
-    flat = np.array(kinds) == "normal"
-    on_surface = flat | (np.array(kinds) == "frame")
-    parts: list[SurfaceMarkers | RigidMarkers] = []
-    places: list[list[int]] = []
-    if on_surface.any():
-        arrays = (feet.triangles, points, feet.points, flat)
-        parts.append(_on_triangles(mesh, *(array[on_surface] for array in arrays)))
-        places.append(np.flatnonzero(on_surface).tolist())
+    flat, parts, places = np.array(kinds) == "normal", list[SurfaceMarkers | RigidMarkers](), list[list[int]]()
+    if len(surface := np.flatnonzero(flat | (np.array(kinds) == "frame"))):
+        parts.append(_on_triangles(mesh, feet.triangles[surface], points[surface], feet.points[surface], flat[surface]))
+        places.append(surface.tolist())
     if rigid := [number for number, name in enumerate(kinds) if name == "rigid"]:
         parts.append(follow_vertices(mesh, vertices, points[rigid]))
         places.append(rigid)
@@ -362,8 +323,22 @@ def bind_markers(
     return JoinedMarkers.of(parts, places)
 
 
+def _check_bound(points: FloatArray, names: Sequence[str], kinds: Sequence[str]) -> None:
+    """Refuses markers without a place (m, 3) or of an unknown kind."""
+    if points.shape != (len(names), 3) or len(kinds) != len(names) or not len(names):
+        raise InputError(
+            f"{len(names)} markers are named, with {len(kinds)} kinds and positions {points.shape}: there must be a "
+            "kind and three coordinates for each, and one marker at least."
+        )
+    for name, point, kind in zip(names, points, kinds, strict=True):
+        if kind not in KINDS:
+            raise InputError(f"The kind of marker '{name}' is {kind!r}: choose one of {', '.join(KINDS)}.")
+        if not np.isfinite(point).all():
+            raise InputError(f"Marker '{name}' was not seen at rest, so it cannot be bound: leave it out.")
+
+
 def _on_triangles(
-    mesh: Mesh, triangles: np.ndarray, points: np.ndarray, closest: np.ndarray, flat: np.ndarray
+    mesh: Mesh, triangles: IntArray, points: FloatArray, closest: FloatArray, flat: BoolArray
 ) -> SurfaceMarkers:
     """Markers with feet at the closest points; those of `flat` markers at their projections on the triangle's plane."""
     corners = mesh.vertices[triangles]  # (m, 3, 3)
@@ -383,7 +358,7 @@ def _on_triangles(
     return SurfaceMarkers(*map(torch.as_tensor, (triangles, weights, unstretch, offsets, frame)))
 
 
-def follow_vertices(mesh: Mesh, vertices: ArrayLike | None, points: np.ndarray) -> RigidMarkers:
+def follow_vertices(mesh: Mesh, vertices: ArrayLike | None, points: FloatArray) -> RigidMarkers:
     """Returns points (m, 3) of the undeformed body [m] that follow the rigid motion of some of its vertices (S,).
 
     Raises:

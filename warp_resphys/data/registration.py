@@ -1,19 +1,13 @@
-"""Rigid registration of markers: the motion from measured markers to their nominal places on a body, and their names.
+"""Rigid registration of markers (M, 3) [m]: the motion from measured markers to their nominal places on a body."""
 
-Points are (M, 3) [m]. Markers without names are matched with their nominal places by the motion and the pairs with the
-least sum of squares. The best pairs for a motion are those of the Hungarian method (Kuhn, Naval Research Logistics
-Quarterly 2 (1955) 83); the candidate motions carry a few markers, the anchors, onto their nominal places.
-"""
-
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations
 from math import comb
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
@@ -21,9 +15,6 @@ from ..io.errors import DataFileError, InputError, listed
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried in the search for outliers.
-_REFINEMENTS = 3  # of an assignment
-_CLEAR = 1.3  # least ratio of the residual of the next best pairs and that of the best
-_LEAST = 1e-4  # m: smaller residuals of pairs count as this one
 
 
 @dataclass(frozen=True)
@@ -113,11 +104,10 @@ def register_markers(
     """Registers markers at rest to their nominal positions, and detects outliers.
 
     The least-squares fit (Kabsch) is made to the largest set of markers with no residual above `largest_residual`;
-    among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000, so that the best is
-    not missed. The set has more than half of the markers and at least four: two of six markers or seven of fifteen may
-    be anywhere, and three markers that do not fit are an error. Markers that are NaN are ignored. Where the rotation is
-    known, one marker is enough. Where the vertical is known, two are enough, or several on a line, if they do not lie
-    above one another: only the angle about the vertical is unknown.
+    among sets of one size, to that with the least sum of squares. All sets are tried, up to 20 000. The set has more
+    than half of the markers and at least four: two of six markers or seven of fifteen may be anywhere. Markers that are
+    NaN are ignored. With a known rotation one marker is enough; with a known vertical two, or several on a line, if
+    they do not lie above one another.
 
     Args:
         measured: (M, 3) [m] markers of the body at rest, in the frame of the recording.
@@ -145,31 +135,21 @@ def register_markers(
         raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
     wanted = np.array([use is None or name in use for name in names], dtype=bool)
     seen = np.isfinite(a).all(axis=1)
-    used, count = np.flatnonzero(wanted & seen), int(np.count_nonzero(wanted & seen))
+    used = np.flatnonzero(wanted & seen)
     least = 1 if rotation is not None else 3 if vertical is None else 2
-    if count < least:
+    if len(used) < least:
         needed = ["one marker", "two markers", "three markers"][least - 1]
         raise DataFileError(
-            f"{source}: registration needs {needed} at rest, but {count} are left to it; not seen: "
+            f"{source}: registration needs {needed} at rest, but {len(used)} are left to it; not seen: "
             f"{listed(_pick(names, wanted & ~seen))}."
         )
-    fewest, turned, known = max(4, count // 2 + 1), None, ""
+    fewest, turned, known = max(4, len(used) // 2 + 1), None, ""
     if rotation is not None:
-        fewest, turned, known = count // 2 + 1, np.asarray(rotation, dtype=np.float64), " with the axes that are given"
+        fewest, turned = len(used) // 2 + 1, np.asarray(rotation, dtype=np.float64)
+        known = " with the axes that are given"
     elif _distance_from_line(b[used]) <= largest_residual:
-        if vertical is None:
-            raise InputError(
-                f"The nominal positions of {listed(_pick(names, wanted & seen))} lie on one line to within "
-                f"{_MILLI * largest_residual:.1f} mm, so that the rotation about it is open: register with another "
-                "marker."
-            )
-        if (turned := _upright(a[used], b[used], vertical, largest_residual)) is None:
-            raise InputError(
-                f"{listed(_pick(names, wanted & seen))} lie above one another to within "
-                f"{_MILLI * largest_residual:.1f} mm, so that the vertical does not tell how the body is turned: "
-                "register with another marker."
-            )
-        fewest, known = count, " with the vertical that is given"
+        turned = _upright(a[used], b[used], vertical, largest_residual, listed(_pick(names, wanted & seen)))
+        fewest, known = len(used), " with the vertical that is given"
     best = _consensus(a, b, used, fewest, turned, largest_residual)
     if best is None:
         raise DataFileError(
@@ -184,14 +164,24 @@ def register_markers(
     return Registration(tuple(names), motion, moved, residual, inliers, outliers, root_mean_square((moved - b)[rows]))
 
 
-def _upright(a: FloatArray, b: FloatArray, vertical: tuple[ArrayLike, ArrayLike], least: float) -> FloatArray | None:
-    """Rotation (3, 3) that maps one vertical to the other and fits points a to b; None if b lie above one another."""
+def _upright(
+    a: FloatArray, b: FloatArray, vertical: tuple[ArrayLike, ArrayLike] | None, least: float, named: str
+) -> FloatArray:
+    """Rotation (3, 3) that maps one vertical to the other and fits points a to b, which lie on one line."""
+    if vertical is None:
+        raise InputError(
+            f"The nominal positions of {named} lie on one line to within {_MILLI * least:.1f} mm, so that the rotation "
+            "about it is open: register with another marker."
+        )
     up_measured, up = (np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis) for axis in vertical)
     tilt, _ = Rotation.align_vectors(up[None], up_measured[None])
     tilted, nominal = tilt.apply(a - a.mean(axis=0)), b - b.mean(axis=0)
     level = nominal - np.outer(nominal @ up, up)
     if np.linalg.norm(level, axis=1).max() <= least:
-        return None
+        raise InputError(
+            f"{named} lie above one another to within {_MILLI * least:.1f} mm, so that the vertical does not tell how "
+            "the body is turned: register with another marker."
+        )
     angle = np.arctan2(np.sum(np.cross(tilted, level) @ up), np.sum(tilted * level))
     return np.asarray((Rotation.from_rotvec(angle * up) * tilt).as_matrix())
 
@@ -267,130 +257,3 @@ def axes_rotation(axes: Sequence[str]) -> FloatArray:
             f"the axes ({', '.join(axes)}) would mirror the recording: change the sign of one, or exchange two."
         )
     return rotation
-
-
-@dataclass(frozen=True)
-class Assignment:
-    """Named markers."""
-
-    columns: IntArray  # (M,) index of the measured marker of every name
-    transform: RigidTransform  # from the frame of the recording to that of the body
-    rms: float  # root mean square distance of the pairs [m]
-    next_rms: float  # root mean square distance of the next best pairs [m]
-
-
-def assign(
-    seen: ArrayLike,
-    expected: ArrayLike,
-    names: Sequence[str],
-    *,
-    source: str | Path,
-    anchors: Sequence[int] | None = None,
-    rotation: FloatArray | None = None,
-) -> Assignment:
-    """Assigns names to measured markers.
-
-    Args:
-        seen: (S, 3) measured markers in the frame of the recording [m], NaN for one that was not seen; markers in
-            excess of the names stay without a name.
-        expected: (M, 3) nominal places of the named markers, in the frame of the body [m].
-        names: M names.
-        source: of the recording, for messages.
-        anchors: indices of the names at their nominal places, which determine the motion: those on the clamp, for a
-            bent body; all if None.
-        rotation: (3, 3) from the frame of the recording to that of the body, where known. Then one anchor is enough;
-            otherwise it takes three that are not on a line.
-
-    Raises:
-        InputError: arrays of wrong shapes, or too few anchors.
-        DataFileError: fewer markers than names, or other pairs with a similar residual.
-    """
-    points, places = np.asarray(seen, dtype=np.float64), np.asarray(expected, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or places.shape != (len(names), 3) or not np.isfinite(places).all():
-        raise InputError(
-            f"{len(names)} markers are named, with places {places.shape} and {points.shape} seen: both must be "
-            "(markers, 3), and the places finite."
-        )
-    visible = np.flatnonzero(np.isfinite(points).all(axis=1))
-    if len(visible) < len(names):
-        raise DataFileError(
-            f"{source} shows {len(visible)} markers, and {len(names)} are configured ({listed(names)}): leave out "
-            "of the configuration those that it does not have."
-        )
-    points, fixed = points[visible], np.arange(len(names)) if anchors is None else np.asarray(anchors, dtype=np.int64)
-    fits: dict[tuple[int, ...], tuple[float, RigidTransform]] = {}
-    for motion in _motions(points, places, fixed, rotation):
-        pairs = _pairs(motion.apply(points), places)
-        for _ in range(_REFINEMENTS):
-            motion = fitted(points[pairs[fixed]], places[fixed], rotation)
-            before, pairs = pairs, _pairs(motion.apply(points), places)
-            if (pairs == before).all():
-                break
-        for candidate in _best_and_next(motion.apply(points), places, pairs):
-            residual = root_mean_square(motion.apply(points[candidate]) - places)
-            if tuple(candidate) not in fits or residual < fits[tuple(candidate)][0]:
-                fits[tuple(candidate)] = residual, motion
-    if not fits:
-        raise DataFileError(f"{source}: no three of its markers stand as those of the configuration do: check these.")
-    (best, (rms, motion)), *others = sorted(fits.items(), key=lambda fit: fit[1][0])
-    next_rms = others[0][1][0] if others else np.inf
-    if next_rms < _CLEAR * max(rms, _LEAST):
-        moved = [name for name, a, b in zip(names, best, others[0][0], strict=True) if a != b]
-        by_column = dict(zip(visible[list(best)].tolist(), names, strict=True))
-        labels = [by_column.get(column, f"other_{column + 1}") for column in range(len(np.asarray(seen)))]
-        raise DataFileError(
-            f"{source}: which of its markers is which is not clear: they fit to {_MILLI * rms:.1f} mm, and to "
-            f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; correct their places in the "
-            f"configuration or, if the first is right, give the recording labels: [{', '.join(labels)}]."
-        )
-    return Assignment(visible[list(best)], motion, rms, next_rms)
-
-
-def _motions(
-    points: FloatArray, places: FloatArray, anchors: IntArray, rotation: FloatArray | None
-) -> Iterator[RigidTransform]:
-    """Motions that carry one marker, if the rotation is known, or three markers onto anchors."""
-    if not len(anchors):
-        raise InputError("markers are named by those that stand still: configure one at least (markers.reference).")
-    if rotation is not None:
-        for point in points:
-            yield RigidTransform(rotation, places[anchors[0]] - rotation @ point)
-        return
-    if len(anchors) < 3:
-        raise InputError(
-            f"{len(anchors)} markers stand still, and it takes three to find how the recording is turned: configure "
-            "more (markers.reference), or data.axes."
-        )
-    corners = np.array(max(permutations(anchors.tolist(), 3), key=lambda three: _area(places[list(three)])))
-    wanted = places[corners]
-    for three in permutations(range(len(points)), 3):
-        motion, on_a_line = fit(points[list(three)], wanted, np.ones(3))
-        off = motion.apply(points[list(three)]) - wanted
-        if not on_a_line and root_mean_square(off) < 0.1 * np.sqrt(_area(wanted)):
-            yield motion
-
-
-def _area(corners: FloatArray) -> float:
-    return float(0.5 * np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])))
-
-
-def _squares(points: FloatArray, places: FloatArray) -> FloatArray:
-    """Squared distances (M, S) between places and points."""
-    return np.asarray(np.square(places[:, None] - points[None]).sum(axis=2))
-
-
-def _pairs(points: FloatArray, places: FloatArray) -> IntArray:
-    """Index (M,) of the point that is assigned to a place."""
-    return np.asarray(linear_sum_assignment(_squares(points, places))[1])
-
-
-def _best_and_next(points: FloatArray, places: FloatArray, pairs: IntArray) -> Iterator[IntArray]:
-    """Yields the best pairs, then the best pairs without one of them, for every pair."""
-    yield pairs
-    squares = _squares(points, places)
-    for place, point in enumerate(pairs):
-        forbidden = squares.copy()
-        forbidden[place, point] = 1e6 * (1.0 + squares.max())
-        other = linear_sum_assignment(forbidden)[1]
-        if other[place] != point:
-            yield np.asarray(other)

@@ -6,8 +6,8 @@ McKay 1992; with plane triangles this is the point-to-plane distance of Chen and
 triangles on the side from which a point was seen are compared with it: towards the camera of a depth image, or towards
 the outer normal of a scanned surface. Parts of the body that no point shows do not count.
 
-Outliers hardly matter, by the robust loss of `misfit`, and points beyond a reach not at all; before that, most are left
-out by `Cloud.around`.
+Outliers hardly matter, by the robust loss of `picture_misfit`, and points beyond a reach not at all; before that, most
+are left out by `Cloud.around`.
 
 `tests/pictures/test_clouds.py` compares distances with closed forms, and derivatives with differences.
 """

@@ -18,8 +18,8 @@ from ..learning.parameters import constants_of, identifiable_parameters
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
 from .clouds import Cloud
-from .motion import OF_RELEASE, ReleasedForce, at_own_times
 from .outlines import ClosedSurface, Outline, Silhouette, visibility, within
+from .released_force import OF_RELEASE, ReleasedForce, at_own_times
 
 CLAMP_TURN: Final = "clamp_turn"  # rad
 CLAMP_SHIFT: Final = "clamp_shift"  # m

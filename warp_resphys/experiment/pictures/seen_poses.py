@@ -14,16 +14,17 @@ from PIL import Image
 from ...data.camera import Lens, PlacedCamera, tag_poses
 from ...data.markers import bind_markers
 from ...fem.body import Body
+from ...io.arrays import FloatArray, IntArray
 from ...io.atomic import atomic_path, digest
-from ...io.errors import DataFileError, InputError, listed, naming
+from ...io.errors import DataFileError, InputError, listed, naming, number_of
 from ...io.files import atomic_hdf5, create, read_array, read_hdf5
 from ...io.stages import StageContext
 from ...mesh.mesh import Mesh, quadratic, select_vertices
 from ...mesh.readers import METRES, read_mesh
 from ...pictures.clouds import Cloud
-from ...pictures.motion import ReleasedForce
 from ...pictures.outlines import ClosedSurface, Outline
-from ...pictures.reading import (
+from ...pictures.released_force import ReleasedForce
+from ...pictures.scene_files import (
     Frame,
     SceneFile,
     check_times,
@@ -133,59 +134,75 @@ def import_pictures(context: StageContext) -> None:
     data = settings.data
     with atomic_hdf5(context.run_dir / PICTURES, _KIND, {"fingerprint": context.fingerprint}) as file:
         for name, pose in data.poses.items():
-            scene, different = scene_of(data, pose, context.run_dir), dict[str, Frame]()
-            for frame in scene.frames:
-                different.setdefault(digest(frame.files[0]), frame)
-            frames = [*different.values()]
-            if len(frames) < len(scene.frames):
-                log.warning(
-                    "import: %d of the %d pictures of %s are copies of others, and are left out",
-                    *(len(scene.frames) - len(frames), len(scene.frames), name),
-                )
+            scene = _without_copies(scene_of(data, pose, context.run_dir), name)
             if pose.release is not None:
-                check_times(replace(scene, frames=tuple(frames)), pose.release.time)
-            colours = pose.mask or data.mask
-            shares, drawn = list[float](), False
-            for frame in frames:
-                with_depth, pictured = pose.depth and frame.depth is not None, frame.image != frame.depth
-                mask = None
-                if pose.outline or (with_depth and (frame.mask is not None or (colours is not None and pictured))):
-                    mask = read_mask(frame, colours)
-                    create(file, f"{name}/masks/{frame.number}", mask)
-                    if frame.mask is not None:
-                        _check_size(frame.mask, mask, frame.image, read_picture(frame.image))
-                    if pictured and not drawn:  # A picture in which everything but the body is dark.
-                        image, drawn = read_picture(frame.image), True
+                check_times(scene, pose.release.time)
+            arrays, shares = dict[str, tuple[NDArray[Any], str]](), list[float]()
+            for frame in scene.frames:
+                mask, depth = _shown(frame, pose, data)
+                if mask is not None:
+                    arrays[f"masks/{frame.number}"] = mask, "1"
+                    if frame.image != frame.depth and not shares:  # A picture with everything but the body dark.
+                        image = read_picture(frame.image)
                         with atomic_path(context.run_dir / "masks" / f"{name}.png") as partial:
                             Image.fromarray(np.where(mask[..., None], image, image // 4)).save(partial, format="png")
                     shares.append(100.0 * mask.mean())
-                if pose.depth and frame.depth is not None:
-                    depth = read_depth(frame.depth, data.cloud.depth_unit)
-                    if mask is not None:
-                        _check_size(frame.depth, depth, frame.mask or frame.image, mask)
-                    if pictured:
-                        _check_size(frame.depth, depth, frame.image, read_picture(frame.image))
-                    seen = np.isfinite(depth) & (True if mask is None else mask)
-                    shown = np.where(seen, depth, 0.0).astype(np.float32)  # zero where there is nothing of the body
-                    create(file, f"{name}/depths/{frame.number}", shown, "m")
-            numbers = [frame.number for frame in frames]
+                if depth is not None:
+                    arrays[f"depths/{frame.number}"] = depth, "m"
+            numbers = [frame.number for frame in scene.frames]
             if pose.points is not None:
-                path = scene.path.parent / pose.points
-                tracked = read_tracked(path, [*data.points], data.likelihood, numbers)
-                if not np.isfinite(tracked).any():
-                    raise DataFileError(f"{path}: no point was seen in the frames of data.poses.{name}: leave it out.")
-                create(file, f"{name}/tracked", tracked, "px")
+                arrays["tracked"] = _tracked(scene.path.parent / pose.points, name, numbers, data), "px"
             if pose.cloud is not None:
                 points, normals = read_scan(scene.path.parent / pose.cloud, METRES[data.cloud.units], settings.seed)
-                create(file, f"{name}/scan", points, "m")
-                if normals is not None:
-                    create(file, f"{name}/scan_normals", normals)
+                arrays["scan"] = points, "m"
+                arrays |= {} if normals is None else {"scan_normals": (normals, "1")}
                 log.info("import: %s has a scan of %d points", name, len(points))
-            create(file, f"{name}/world_to_camera", _cameras(scene.path, frames, data), "1, m")
-            create(file, f"{name}/frames", numbers)
+            arrays["world_to_camera"] = _cameras(scene.path, scene.frames, data), "1, m"
+            arrays["frames"] = np.array(numbers), "1"
+            for key, (array, unit) in arrays.items():
+                create(file, f"{name}/{key}", array, unit)
             covers = f", of which the body covers {min(shares):.1f} to {max(shares):.1f} %" if shares else ""
-            if frames:
-                log.info("import: %s has %d picture%s%s", name, len(frames), "s"[: len(frames) != 1], covers)
+            if numbers:
+                log.info("import: %s has %s%s", name, number_of(len(numbers), "picture"), covers)
+
+
+def _without_copies(scene: SceneFile, name: str) -> SceneFile:
+    """Returns a scene without frames of a pose that are copies of others, with a warning."""
+    different = dict[str, Frame]()
+    for frame in scene.frames:
+        different.setdefault(digest(frame.files[0]), frame)
+    if len(different) < len(scene.frames):
+        log.warning(
+            "import: %d of the %d pictures of %s are copies of others, and are left out",
+            *(len(scene.frames) - len(different), len(scene.frames), name),
+        )
+    return replace(scene, frames=(*different.values(),))
+
+
+def _shown(frame: Frame, pose: PoseSettings, data: PictureData) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
+    """Returns the mask (H, W) of a frame, and its depths (H, W) of the body, zero elsewhere [m]; None without."""
+    colours, pictured, mask = pose.mask or data.mask, frame.image != frame.depth, None
+    deep = frame.depth if pose.depth else None
+    if pose.outline or (deep is not None and (frame.mask is not None or (colours is not None and pictured))):
+        mask = read_mask(frame, colours)
+        if frame.mask is not None:
+            _check_size(frame.mask, mask, frame.image, read_picture(frame.image))
+    if deep is None:
+        return mask, None
+    depth = read_depth(deep, data.cloud.depth_unit)
+    if mask is not None:
+        _check_size(deep, depth, frame.mask or frame.image, mask)
+    if pictured:
+        _check_size(deep, depth, frame.image, read_picture(frame.image))
+    return mask, np.where(np.isfinite(depth) & (True if mask is None else mask), depth, 0.0).astype(np.float32)
+
+
+def _tracked(path: Path, name: str, frames: Sequence[int], data: PictureData) -> FloatArray:
+    """Returns the pixels (F, M, 2) of the tracked points of a pose in frames by their numbers."""
+    tracked = read_tracked(path, [*data.points], data.likelihood, frames)
+    if not np.isfinite(tracked).any():
+        raise DataFileError(f"{path}: no point was seen in the frames of data.poses.{name}: leave it out.")
+    return tracked
 
 
 def _check_size(path: Path, one: NDArray[Any], picture: Path, other: NDArray[Any]) -> None:
@@ -197,7 +214,7 @@ def _check_size(path: Path, one: NDArray[Any], picture: Path, other: NDArray[Any
         )
 
 
-def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> NDArray[np.float64]:
+def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> FloatArray:
     """(F, 2, 4, 4) the given cameras of frames, or the two that a tag in each allows.
 
     Refused if a standing one sees the origin of the mesh at different places.
@@ -313,14 +330,14 @@ class SeenPoses:
         self._poses[name] = pose
         return pose
 
-    def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: NDArray[np.int64]) -> Cloud:
+    def _cloud(self, path: Path, cloud: Cloud, camera: PlacedCamera, mesh: Mesh, clamped: IntArray) -> Cloud:
         """The points that may be of a body, as many as configured."""
         wanted = self.data.cloud
         cloud = replace(cloud, noise=wanted.noise, reach=wanted.reach)
         with naming(f"{path}: "):
             return cloud.around(camera, mesh, clamped, wanted.points, self.settings.seed)
 
-    def _mesh(self, name: str) -> tuple[Mesh, tuple[NDArray[np.int64], ...]]:
+    def _mesh(self, name: str) -> tuple[Mesh, tuple[IntArray, ...]]:
         """Mesh of a pose, and the vertices in its clamps."""
         own = self.data.poses[name]
         scene = scene_of(self.data, own, self.run_dir)
@@ -344,7 +361,7 @@ class SeenPoses:
         return mesh, (select_vertices(mesh, **self.settings.fixed.arguments()),)
 
 
-def _with_midpoints(mesh: Mesh, corners: NDArray[np.int64]) -> NDArray[np.int64]:
+def _with_midpoints(mesh: Mesh, corners: IntArray) -> IntArray:
     """Vertices of a clamp and, of quadratic elements, the nodes between them."""
     inside = np.isin(np.arange(len(mesh.vertices)), corners)
     within = inside.copy()

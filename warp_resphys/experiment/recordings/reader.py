@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from ...data.dataset import STATIC, payload_inputs
+from ...data.marker_names import assign
 from ...data.marker_view import MarkerView
 from ...data.recordings.processing import obstacle_motion
 from ...data.recordings.recording import Recording
 from ...data.recordings.recording_files import read_recording
-from ...data.registration import assign, axes_rotation, unit_vector
+from ...data.registration import axes_rotation, unit_vector
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed

@@ -24,8 +24,8 @@ from ...io.progress import Progress, show
 from ...io.stages import Stage, StageContext, package_versions, resources_used
 from ...learning.identification import ParameterSearch
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
-from ...pictures.misfit import PictureMisfit, values_of
-from ...pictures.motion import OF_RELEASE
+from ...pictures.picture_misfit import PictureMisfit, values_of
+from ...pictures.released_force import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
 from ...report.identification_section import parameter_rows
 from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
@@ -35,7 +35,7 @@ from ...settings.stages import SIMULATOR, StageSettings
 from ..build import build_mesh, simulation_device
 from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from ..identify import Checkpoint, bounds_of, search_parameters
-from .laboratory import frame_files, play_camera
+from .camera_laboratory import frame_files, play_camera
 from .seen_poses import (
     PICTURES,
     SCENE,

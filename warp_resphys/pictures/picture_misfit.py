@@ -28,7 +28,7 @@ from ..io.errors import ConvergenceError, InputError
 from ..learning.identification import BoundedMisfit
 from ..learning.parameters import Bounds, split_name
 from ..learning.uncertainty import Linearised, LinearMisfit
-from .motion import RELEASE_DELAY
+from .released_force import RELEASE_DELAY
 from .seen import Photo, SeenPose, Shape
 
 _DIFFERENCE: Final = 1e-4  # of a physical parameter, as a fraction of its range
@@ -244,7 +244,7 @@ class PictureMisfit(BoundedMisfit):
         if columns is None:
             return np.zeros((len(self.bounds), len(points), 2))
         by = photo.camera.derivative(points, corrections, moved).numpy()
-        late = photo.row_time * by[len(columns)]  # where rows have times of their own, see `motion`
+        late = photo.row_time * by[len(columns)]  # where rows have times of their own, see `released_force`
         return self._slopes(pose, photo, by + late / (1.0 - late[:, 1:]) * by[..., 1:], columns)
 
     def _slopes(self, pose: SeenPose, photo: Photo, by: FloatArray, columns: Sequence[int]) -> FloatArray:

@@ -32,9 +32,18 @@ from warp_resphys.io.machine import commit, hardware
 from warp_resphys.io.stages import package_versions
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.metrics import PUBLISHED_MM
-from warp_resphys.report.data import MODELS, Errors, trial_errors
-from warp_resphys.report.page import MINUS, NONE, duration_text, error_parts, in_a_row, number_text, published_parts
+from warp_resphys.report.data import Errors, trial_errors
 from warp_resphys.report.verdict import LEAST_TRIALS, best_pair, compared, known_errors, less_error
+from warp_resphys.report.wording import (
+    MINUS,
+    MODELS,
+    NONE,
+    duration_text,
+    error_parts,
+    in_a_row,
+    number_text,
+    published_parts,
+)
 
 ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 RUNS: Final = Path("runs")
@@ -272,7 +281,7 @@ def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str,
         rows.append(
             [
                 f"{title} ({', '.join(small)})" if small else title,
-                f"{number_text(means[best])} {MODELS[best][0].lower()}" if best else NONE,
+                f"{number_text(means[best])} {MODELS[best].name.lower()}" if best else NONE,
                 *(" ".join(error_parts(errors[model])).strip() if model in errors else NONE for model in models),
                 *(_gain_text(row["gains"].get(model)) for model in CORRECTED),
                 f"{100.0 * interval['coverage']:.0f} % (± {interval['half_width_mm']:.2g} mm)" if interval else NONE,
@@ -288,8 +297,8 @@ def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str,
         "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: the "
         "sum over all stages and folds, including those that ran in parallel, on a machine with other load."
     )
-    heads = ["Robot", "Without physics [mm]", *(f"{MODELS[model][0]} [mm]" for model in models)]
-    heads += [*(f"Less error by {MODELS[model][0]}" for model in CORRECTED), "Coverage", "Time"]
+    heads = ["Robot", "Without physics [mm]", *(f"{MODELS[model].name} [mm]" for model in models)]
+    heads += [*(f"Less error by {MODELS[model].name}" for model in CORRECTED), "Coverage", "Time"]
     return [_table(heads, rows), note]
 
 
@@ -376,7 +385,7 @@ def _errors_table(name: str, labels: Sequence[str], columns: Mapping[str, Run]) 
     published, measured = PUBLISHED_MM[name], [run.metrics["errors_mm"] for run in columns.values()]
     rows = [
         [
-            f"**{MODELS[model][0]}**" if model == "resphys" else MODELS[model][0],
+            f"**{MODELS[model].name}**" if model == "resphys" else MODELS[model].name,
             " ".join(published_parts(published[model])) if model in published else NONE,
             *(" ".join(error_parts(errors[model])).strip() if model in errors else NONE for errors in measured),
         ]

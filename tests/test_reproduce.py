@@ -11,7 +11,7 @@ import reproduce
 
 from support.command_line import configuration
 from warp_resphys.io.errors import ResphysError
-from warp_resphys.report.page import error_parts, number_text
+from warp_resphys.report.wording import error_parts, number_text
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce.py"
 DOCS = SCRIPT.parents[1] / "docs"

@@ -19,8 +19,8 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.dynamics.trajectory import Trajectory
-from warp_resphys.report.obstacles import ObstacleSurface
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

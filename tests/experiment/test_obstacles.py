@@ -13,6 +13,7 @@ from support.played_run import check_robots
 from warp_resphys import Body
 from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
 from warp_resphys.data.dataset import read_dataset
+from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.energies.contact import Contact
@@ -27,7 +28,6 @@ from warp_resphys.io.files import read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report.obstacles import ObstacleSurface
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings

@@ -20,7 +20,7 @@ from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.mesh.mesh import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
 from warp_resphys.report.error_section import mesh_text
-from warp_resphys.report.page import NO_BREAK_SPACE
+from warp_resphys.report.wording import NO_BREAK_SPACE
 from warp_resphys.settings.stages import StageSettings
 
 PLAIN = ("rest", "interpolation", "linear")  # two training trials are too few for a regression

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from support.tags import draw_tag
-from warp_resphys.data.camera import Lens, tag_poses
+from warp_resphys.data.camera import Lens
 from warp_resphys.io.errors import InputError
+from warp_resphys.pictures.tags import tag_poses
 from warp_resphys.settings.pictures import TagSettings
 from warp_resphys.stepping.rotations import rotations
 

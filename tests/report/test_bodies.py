@@ -13,10 +13,10 @@ from warp_resphys.experiment.build import shipped_arm
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
 from warp_resphys.report import body_picture, render
-from warp_resphys.report.bodies import ComparedMotion
-from warp_resphys.report.body_picture import NOMINAL, MeshSummary, draw_mesh, draw_registration
+from warp_resphys.report.body_picture import NOMINAL, MeshSummary, mesh_picture, registration_picture
 from warp_resphys.report.data import Recordings
-from warp_resphys.report.render import INK, MEASURED
+from warp_resphys.report.layers import INK, MEASURED
+from warp_resphys.report.motions import ComparedMotion
 
 DOWN = np.array([0.0, 0.0, -9.8])
 
@@ -85,7 +85,8 @@ def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
     places = arm.vertices[nearest]
     below = np.append(places, [[0.0, 0.0, arm.vertices[:, 2].min() - 0.05]], axis=0)  # on a stem below the tip
     for name, markers in (("plain", None), ("dots", places), ("below", below)):
-        draw_mesh(tmp_path / f"{name}.png", body, markers)
+        picture = mesh_picture(body, markers)
+        picture.save(tmp_path / f"{name}.png", picture.draw())
     plain, dots, longer = (imread(tmp_path / f"{name}.png")[..., :3] for name in ("plain", "dots", "below"))
     changed = np.abs(plain - dots).max(axis=2) > 0.2
     left, middle, right = (part.sum() for part in np.array_split(changed, 3, axis=1))
@@ -124,8 +125,8 @@ def drawn(measured, path, **options):
     fit = {key: dict(zip(registered.names, values, strict=True)) for key, values in fit.items()}
     fits = {"Beam": {**fit, "rms_mm": 0.0, "outliers": registered.outliers}}
     nominal = dict(zip(NAMES, POINTS, strict=True))
-    draw_registration(path, Recordings({}, fits, nominal, (), MESH), select_vertices(MESH, x=0.0))
-    return imread(path)[..., :3]
+    picture = registration_picture(Recordings({}, fits, nominal, (), MESH), select_vertices(MESH, x=0.0))
+    return imread(picture.save(path, picture.draw()))[..., :3]
 
 
 def pixels(picture, colour):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from warp_resphys.report.control_section import DrivenBodies
-from warp_resphys.report.figures import TONES
-from warp_resphys.report.render import path_axes
+from warp_resphys.data.camera import path_axes
+from warp_resphys.report.motions import DrivenBodies
+from warp_resphys.report.wording import TONES
 
 X, Y, Z = np.eye(3)
 

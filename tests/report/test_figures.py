@@ -7,22 +7,23 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.mesh.mesh import box_hexahedra
 from warp_resphys.report import figures
 from warp_resphys.report.body_section import body_section, input_sequences, marker_paths
 from warp_resphys.report.control_section import followed_paths
 from warp_resphys.report.data import Driven, FollowedPath, TrialResults
-from warp_resphys.report.error_section import error_over_time
-from warp_resphys.report.figures import CHAMBER_COLOURS, TONES, use_logarithm
+from warp_resphys.report.error_section import error_over_time, training_curves
+from warp_resphys.report.figures import CHAMBER_COLOURS, use_logarithm
 from warp_resphys.report.identification_section import loss_histories
 from warp_resphys.report.motion_section import _tip_figure
-from warp_resphys.report.training_section import training_curves
+from warp_resphys.report.wording import TONES
 
 TIMES = np.arange(20) * 0.01
 MEASURED = np.zeros((20, 1, 3))
 MEASURED[:, 0, 2] = 0.01 * np.sin(30.0 * TIMES)
-CANVAS = SimpleNamespace(figure=lambda name, figure, alt, caption: figure, attempt=lambda file, draw: [])
+CANVAS = SimpleNamespace(figure=lambda name, figure, alt, caption: figure, rendered=lambda *arguments: None)
 
 
 def trials_of(target, positions, times=TIMES, labels=("A",)):
@@ -154,7 +155,8 @@ class TestInputs:
         """Figures of the section on the inputs."""
         trials = SimpleNamespace(names=tested, time_step=0.5, labels=())
         mesh = box_hexahedra(divisions=(1, 1, 1))
-        return body_section(SimpleNamespace(trials=trials, driven=driven, mesh=mesh, fixed=[]), CANVAS).blocks
+        shape = {"mesh": mesh, "fixed": [], "chambers": (), "tendons": {}, "obstacles": ObstacleSurface()}
+        return body_section(SimpleNamespace(trials=trials, driven=driven, **shape), CANVAS).blocks[1:]
 
     def test_pressures_are_in_kilopascal_in_the_chambers_colours(self):
         pressure = np.array([[0.0, 1e3], [2e4, 3e3]])

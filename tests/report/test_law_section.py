@@ -24,8 +24,8 @@ from warp_resphys.report.law_section import (
     uniaxial_stress,
     wording,
 )
-from warp_resphys.report.page import number_text
 from warp_resphys.report.run_page import range_texts
+from warp_resphys.report.wording import number_text
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.learning import LawSettings
 

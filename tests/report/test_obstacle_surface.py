@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from warp_resphys import Body
+from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
 from warp_resphys.mesh.mesh import box_hexahedra
-from warp_resphys.report.bodies import obstacle_layers
-from warp_resphys.report.obstacles import ObstacleSurface
+from warp_resphys.report.layers import obstacle_layers
 from warp_resphys.stepping.rotations import rotations
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (4, 1, 1))
@@ -63,4 +63,5 @@ def test_parameters_move_the_obstacle_that_they_name():
 
 
 def test_a_body_without_obstacles_draws_none():
-    assert obstacle_layers(ObstacleSurface.of(Body(MESH))) == []
+    surface = ObstacleSurface.of(Body(MESH))
+    assert obstacle_layers(surface.points, surface.triangles) == []

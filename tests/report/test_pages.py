@@ -35,7 +35,8 @@ from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report import run_page
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
-from warp_resphys.report.page import NONE, Canvas, Drawn, number_text
+from warp_resphys.report.page import Canvas, Drawn
+from warp_resphys.report.wording import NONE, number_text
 
 FIGURES_OF_AN_ARM = {
     *("error_over_time", "loss_history", "markers", "inputs"),

@@ -8,8 +8,9 @@ import pytest
 
 from support.scenes import MARGIN, SHADE, TOWARDS_VIEWER, body_scene
 from warp_resphys.mesh.mesh import Mesh, boundary_triangles, box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.plotting import BODY
 from warp_resphys.report import render
-from warp_resphys.report.bodies import sharp_edges
+from warp_resphys.report.layers import OUTLINE, sharp_edges
 
 MESHES = {
     "hexahedra": box_hexahedra(divisions=(3, 2, 2)),
@@ -22,7 +23,7 @@ VIEWER = np.asarray(TOWARDS_VIEWER) / np.linalg.norm(TOWARDS_VIEWER)
 def shaded(normal: tuple[float, float, float]) -> np.ndarray:
     """(3,) colour of the body on a face that looks along a normal."""
     facing = max(0.0, float(np.dot(normal, render.TOWARDS_LIGHT) / np.linalg.norm(render.TOWARDS_LIGHT)))
-    return np.asarray(matplotlib.colors.to_rgb(render.BODY)) * (1.0 - SHADE * (1.0 - facing))
+    return np.asarray(matplotlib.colors.to_rgb(BODY)) * (1.0 - SHADE * (1.0 - facing))
 
 
 def share(pixels: np.ndarray, colour: np.ndarray) -> float:
@@ -57,7 +58,7 @@ def test_the_undeformed_outline_shows_where_the_body_has_left() -> None:
     mesh = box_hexahedra(divisions=(3, 1, 1))
     (pixels,) = render.draw(body_scene(mesh, moved=(0.0, 0.0, 0.05)))
     pixels = pixels / 255.0
-    assert share(pixels, np.asarray(matplotlib.colors.to_rgb(render.OUTLINE))) > 0.03
+    assert share(pixels, np.asarray(matplotlib.colors.to_rgb(OUTLINE))) > 0.03
 
 
 def test_sharp_edges_are_those_of_the_box_and_the_rim_of_a_part():

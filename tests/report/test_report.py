@@ -13,7 +13,7 @@ from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json
 from warp_resphys.report import figures
 from warp_resphys.report.error_section import error_over_time
-from warp_resphys.report.page import error_parts, number_text
+from warp_resphys.report.wording import error_parts, number_text
 
 SETTINGS = vertex_settings()
 DRAWN = {"error_over_time", "tip_displacement", "training_resphys", "training_simfree", "motion"}

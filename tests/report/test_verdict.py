@@ -10,8 +10,9 @@ from support.configured import settings
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.report.data import trial_errors, untrained
-from warp_resphys.report.page import NO_BREAK_SPACE, write_page
-from warp_resphys.report.verdict import LEAST_TRIALS, model_name, results_table, verdict
+from warp_resphys.report.page import write_page
+from warp_resphys.report.verdict import LEAST_TRIALS, results_table, verdict
+from warp_resphys.report.wording import NO_BREAK_SPACE, model_words
 from warp_resphys.settings.learning import IdentifySettings
 
 MODELS = (*BASELINES, "simulation", "sysid", "law", "simfree", "resphys")
@@ -56,11 +57,11 @@ def test_what_holds_for_any_errors(seed):
     assert 1 <= len(advice) <= 2
     assert all(text.endswith(".") for text in (first, *advice))
     best = min(models, key=lambda model: np.mean(errors[model]))
-    assert first.lower().startswith(model_name(best).lower())
+    assert first.lower().startswith(model_words(best).lower())
     assert f"{count} trial" in first
     assert ("too few for an interval" in advice[0]) == (count < LEAST_TRIALS)
     (marked,) = (head for head, (_, mark) in table_of(errors).items() if mark == "best")
-    assert (model_name(best) in marked) or best not in BASELINES
+    assert (model_words(best) in marked) or best not in BASELINES
     assert not {"helps", "harm", "rest", "simfree", "resphys_uncorrected"} & {*" ".join([first, *advice]).split()}
 
 
@@ -197,5 +198,5 @@ def test_a_quick_look_says_so_in_the_table_and_at_the_top_of_the_page(tmp_path):
     run = settings("budget=quick")
     assert results_table(metrics_of({"sysid": [1.0]}), run).head.startswith("Oscillating beam, quick look: mean error")
     metrics = {"seconds": {}, "peak_memory_gib": 1.0, "versions": {}, "device": "cpu"}
-    write_page(tmp_path / "report.html", [], run, [], metrics)
+    write_page(tmp_path / "report.html", lambda _: [], run, [], metrics)
     assert "<h1>Oscillating beam, quick look</h1>" in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -12,11 +12,12 @@ from support.browser import until
 from support.made_up_run import arm_settings, vertex_settings, write_arm_run, write_vertex_run
 from support.report_page import FAILING, Page, report
 from warp_resphys import Body, Capsule, Contact, Sphere
+from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
 from warp_resphys.report import render
-from warp_resphys.report.bodies import ComparedMotion
-from warp_resphys.report.obstacles import OBSTACLE, ObstacleSurface
-from warp_resphys.report.view import reduced, view_in_space
+from warp_resphys.report.layers import OBSTACLE
+from warp_resphys.report.motion_section import reduced, view_in_space
+from warp_resphys.report.motions import ComparedMotion
 
 RUNS = {"markers": (write_arm_run, arm_settings), "vertices": (write_vertex_run, vertex_settings)}
 

@@ -4,9 +4,10 @@ from typing import Final
 
 import numpy as np
 
+from warp_resphys.data.camera import frame_of, view_axes
 from warp_resphys.mesh.mesh import Mesh, boundary_triangles
-from warp_resphys.report.bodies import sharp_edges
-from warp_resphys.report.render import BODY, OUTLINE, Layer, RenderScene, View, frame_of, picture_size, view_axes
+from warp_resphys.mesh.plotting import BODY
+from warp_resphys.report.layers import OUTLINE, Layer, RenderScene, View, sharp_edges
 
 TOWARDS_VIEWER: Final = (0.40, -1.0, 0.40)
 MARGIN: Final = 0.02  # around the body, over its longer side
@@ -22,4 +23,6 @@ def body_scene(mesh: Mesh, views: int = 1, moved: tuple[float, float, float] = (
         Layer("surface", placed, triangles, BODY, light=(1.0 - SHADE, SHADE)),
         Layer("lines", mesh.vertices, sharp_edges(mesh.vertices, triangles), OUTLINE, size=4.0, shift=-1e-3),
     ]
-    return RenderScene([View(layers, axes, focus, half[1])] * views, picture_size(half, 1100))
+    return RenderScene(
+        [View(layers, axes, focus, half[1])] * views, [int(side) for side in np.ceil(1100 * half / half.max())]
+    )

@@ -19,7 +19,7 @@ from ..io.progress import Progress
 from ..io.settings import parse
 from ..io.stages import StageContext, finished_record
 from ..mesh.motion_files import input_columns, write_csv
-from ..report.control_section import DrivenBodies
+from ..report.motions import DrivenBodies
 from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stages import StageSettings

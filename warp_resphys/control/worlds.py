@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ..data.obstacle_surface import ObstacleSurface
 from ..data.registration import kabsch
 from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
@@ -20,7 +21,6 @@ from ..io.files import read_json
 from ..io.settings import parse
 from ..io.stages import finished_record
 from ..mesh.mesh import boundary_triangles
-from ..report.obstacles import ObstacleSurface
 from ..robot.description import Description
 from ..robot.robot import Robot
 from ..robot.state import RobotState

@@ -1,4 +1,4 @@
-r"""Cameras: lens, place up to corrections, and the pixels of markers as an observation.
+r"""Cameras: lens, place up to corrections, the pixels of markers as an observation, and views of drawings.
 
 A body's point X [m] is seen at the pixel p = lens(M (R (X - c) + c + t)): M is the given pose of the camera, from the
 axes of the scene to its own (x right, y down, z forward), R = exp([w]x) a small turn about a point c of the body's
@@ -15,8 +15,8 @@ A `Lens` moves the point (x, y) = (X / Z, Y / Z) of the image at distance one, w
 (Brown 1966, with OpenCV's names), which the matrix K takes to pixels (Hartley and Zisserman, Multiple View Geometry,
 2nd edition, eq. 6.8). Its focal lengths are corrected by a factor, its principal point by a shift.
 
-The picture of one small square tag (ArUco or AprilTag), by OpenCV, has two poses that fit nearly as well (Collins and
-Bartoli 2014): both are returned, the better one first.
+Drawings of bodies have cameras without perspective: orthonormal axes (3, 3) with rows to the right, up and towards the
+viewer (`view_axes` and the functions after it), and a frame in the first two of them (`frame_of`).
 
 `tests/data/test_camera.py` compares with a camera of closed form and with differences, and identifies Young's modulus.
 """
@@ -29,13 +29,12 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 import torch
 import yaml
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from typing_extensions import override
 
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.text import read_text
-from ..settings.pictures import TagSettings
 from ..stepping.rotations import rotations
 from .markers import Markers, Observation
 
@@ -51,7 +50,10 @@ _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs
 _COUNTS = (0, 4, 5, 8)  # of the coefficients of a lens
 _UNDISTORTING = 30  # steps of Newton's method
 _UNDISTORTED = 0.01  # px: error of a ray
-_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])  # in the order of OpenCV
+_FRAME: Final = 0.06  # margin around the points in a drawing, over their longer side
+_TILT: Final = (0.30, 0.30)  # of the view of a motion, to the right and upwards
+_LEVEL: Final = 1.2  # tilt of the view of a path in a level plane, towards its near side
+_UPRIGHT: Final = 0.3  # tilt of the view of a path in an upright plane, upwards
 
 
 @dataclass(frozen=True)
@@ -264,46 +266,82 @@ class CameraMarkers(Observation):
         return self.camera.pixels(self.markers(positions).double(), corrections).to(positions)
 
 
-def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[FloatArray]:
-    """Returns the one or two world_to_camera (4, 4) that a picture (H, W, 3) allows; none without the tag.
+def view_axes(towards_viewer: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
+    """Returns orthonormal rows (3, 3): to the right, up, towards the viewer."""
+    towards = np.array(towards_viewer, dtype=np.float64)
+    right = np.cross(np.array(up, dtype=np.float64), towards)
+    rows = np.stack([right, np.cross(towards, right), towards])
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
 
-    Raises:
-        InputError: OpenCV is not installed, or has no such dictionary; or the edges are not perpendicular.
+
+def upwards(gravity: FloatArray) -> FloatArray:
+    """Returns the direction (3,) against gravity; z where there is no gravity."""
+    length = float(np.linalg.norm(gravity))
+    return -gravity / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+
+
+def side_axes(up: FloatArray, azimuth: float, elevation: float) -> FloatArray:
+    """Returns axes (3, 3) of a view from the side, turned about the upward direction (3,) and raised [rad]."""
+    up = up / np.linalg.norm(up)
+    side = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
+    side /= np.linalg.norm(side)
+    level = np.cos(azimuth) * np.cross(side, up) + np.sin(azimuth) * side
+    return view_axes(np.cos(elevation) * level + np.sin(elevation) * up, up)
+
+
+def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
+    """Returns axes (3, 3) whose right is the direction of largest extent or motion across gravity.
+
+    Args:
+        gravity: (3,) direction of gravity; -z is taken for zero.
+        positions: (T, N, 3) [m], the first frame at rest; NaN is left out.
     """
-    try:
-        import cv2
-    except ModuleNotFoundError:
-        raise InputError("data.tag needs a package that is not installed: pip install 'warp-resphys[tags]'.") from None
-    constant = getattr(cv2.aruco, f"DICT_{tag.dictionary.upper()}", None)
-    if constant is None:
-        raise InputError(f"OpenCV has no tags {tag.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11.")
-    right, up = np.array(tag.right), np.array(tag.up)
-    if not abs(right @ up) <= 1e-3 * np.linalg.norm(right) * np.linalg.norm(up) or not (right.any() and up.any()):
-        raise InputError("right and up of a tag are directions of two of its edges: they must be perpendicular.")
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    dictionary = cv2.aruco.getPredefinedDictionary(constant)
-    corners, numbers, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(
-        np.ascontiguousarray(image[..., ::-1])
-    )
-    seen = [] if numbers is None else zip(corners, numbers.ravel(), strict=True)
-    found = [own[0] for own, number in seen if number == tag.number]
-    if not found:
-        return []
-    distortion = None if lens.distortion is None else lens.distortion.numpy()
-    _, turns, shifts, _ = cv2.solvePnPGeneric(
-        0.5 * tag.size * _CORNERS,
-        found[0].astype(np.float64),
-        lens.matrix.numpy(),
-        distortion,
-        flags=cv2.SOLVEPNP_IPPE_SQUARE,
-    )
-    right, up = (own / np.linalg.norm(own) for own in (right, up))
-    axes = np.stack([right, up, np.cross(right, up)])  # from the scene to the tag
-    poses = []
-    for turn, shift in zip(turns, shifts, strict=True):
-        rotation = cv2.Rodrigues(turn)[0] @ axes
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, shift.ravel() - rotation @ np.array(tag.centre)
-        poses.append(pose)
-    return poses
+    up = upwards(gravity)
+    points = positions[np.isfinite(positions).all(axis=2)]
+    flat = points - np.outer(points @ up, up)
+    _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
+    right = directions[0] - (directions[0] @ up) * up
+    right /= np.linalg.norm(right)
+    moved = np.nanmax(np.linalg.norm(positions - positions[0], axis=2), axis=0)  # (N,)
+    towards_end = moved @ (positions[0] - positions[0].mean(axis=0))
+    right = -right if towards_end @ right < 0.0 else right
+    return view_axes(np.cross(right, up) + _TILT[0] * right + _TILT[1] * up, up)
+
+
+def axes_from_below(axes: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Returns axes (3, 3) of a view against gravity (3,) that has the right of another view (3, 3)."""
+    towards = -upwards(gravity)
+    return np.stack([axes[0], np.cross(towards, axes[0]), towards])
+
+
+def path_axes(plane: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Returns axes (3, 3) in which letters in a plane are readable.
+
+    Args:
+        plane: (2, 3) directions to the right and upwards in the plane.
+        gravity: (3,) direction of gravity.
+    """
+    up, normal = upwards(gravity), np.cross(*plane)
+    normal /= np.linalg.norm(normal)
+    level = float(normal @ up)
+    near = plane[1] / np.linalg.norm(plane[1])
+    return view_axes(normal - _LEVEL * level * near + _UPRIGHT * (1.0 - level**2) * up, up)
+
+
+def frame_of(points: FloatArray, axes: FloatArray, margin: float = _FRAME) -> tuple[FloatArray, FloatArray]:
+    """Returns the middle (3,) of points (P, 3), and half the width and height (2,) of a view that contains them [m].
+
+    Args:
+        points: [m]; those that are not finite are left out.
+        axes: (3, 3) of the view.
+        margin: on each side, over the longer side of the points.
+    """
+    turned = points[np.isfinite(points).all(axis=1)] @ axes.T
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    extent = (high - low)[:2] + 2.0 * margin * (high - low)[:2].max()
+    return 0.5 * (low + high) @ axes, 0.5 * extent
+
+
+def height_of(half: FloatArray, size: tuple[int, int]) -> float:
+    """Returns half the height of a view of a size [px] that contains half a width and height (2,)."""
+    return float(max(half[1], half[0] * size[1] / size[0]))

@@ -15,6 +15,7 @@ from ..control.plan import tracked_of
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
+from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact import Contact
 from ..energies.obstacles import HalfSpace
 from ..energies.surfaces import SurfaceContact
@@ -22,7 +23,6 @@ from ..fem.body import Body, Rigid
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.mesh import Mesh, boundary_triangles, box_hexahedra
-from ..report.obstacles import ObstacleSurface
 from ..robot.inputs import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..control.worlds import World
+from ..data.camera import frame_of, side_axes
+from ..data.obstacle_surface import ObstacleSurface
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from ..report.bodies import BODIES, BODY_LIGHT, obstacle_layers, sharp_edges
-from ..report.obstacles import ObstacleSurface
-from ..report.render import INK, Layer, Pixels, Renderer, RenderScene, View, chain, frame_of, view_axes
+from ..report.layers import INK, Layer, RenderScene, View, body_layers, chain, obstacle_layers
+from ..report.render import Pixels, Renderer
 from .tasks import RobotTask
 
 Observation = NDArray[np.float32]
@@ -28,7 +29,7 @@ _TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # azimuth and elevation of t
 _MARGIN: Final = 0.12  # around the scene, relative to its longer side
 _GOAL: Final = "#d1495b"
 _RADII: Final = {"marker": 0.015, "goal": 0.022}  # relative to half the height of the picture
-_BEFORE: Final = {"edges": 0.01, "goals": 4.0, "markers": 5.0}  # shift towards the camera, in the same units
+_BEFORE: Final = {"goals": 4.0, "markers": 5.0}  # shift towards the camera, in the same units
 
 
 @dataclass(frozen=True)
@@ -280,14 +281,10 @@ class Camera:
     """
 
     def __init__(self, up: FloatArray, points: FloatArray, obstacles: ObstacleSurface) -> None:
-        up = up / np.linalg.norm(up)
-        side = np.cross(up, np.eye(3)[int(np.abs(up).argmin())])
-        side /= np.linalg.norm(side)
-        level = np.cos(_TURN) * np.cross(side, up) + np.sin(_TURN) * side
-        self._axes = view_axes(np.cos(_TILT) * level + np.sin(_TILT) * up, up)
+        self._axes = side_axes(up, _TURN, _TILT)
         self._focus, half = frame_of(np.concatenate([points, obstacles.near(points)]), self._axes, _MARGIN)
         self._half = float(half.max())
-        self._around = obstacle_layers(obstacles)
+        self._around = obstacle_layers(obstacles.points, obstacles.triangles)
         self._renderer = Renderer()
 
     def pictures(
@@ -322,9 +319,7 @@ class Camera:
         if most > 1:
             layers.append(Layer("lines", paths, chain(most), _GOAL, size=2.0, shift=before["goals"]))
         if len(triangles):
-            edges = sharp_edges(vertices[0], triangles)
-            layers.append(Layer("surface", vertices, triangles, BODIES[1], light=BODY_LIGHT))
-            layers.append(Layer("lines", vertices, edges, INK, size=1.5, shift=before["edges"]))
+            layers += body_layers(vertices, triangles, self._half, width=1.5)
         view = View(layers, self._axes, self._focus, self._half)
         return list(self._renderer.frames(RenderScene([view], _SIZE, background="white", texts=texts)))
 

@@ -17,7 +17,7 @@ from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.stages import Stage
 from ..learning.reconstruction import make_reconstructor
-from ..report.page import duration_text
+from ..report.wording import duration_text
 from ..settings.stages import StageSettings
 from .evaluate import CHECKED_SECONDS
 from .experiment import MODELS, Experiment

@@ -139,6 +139,31 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
     return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}
 
 
+def half_widths_of(
+    dataset: Dataset,
+    names: Sequence[str],
+    errors: Mapping[str, Any],
+    simulated: Mapping[str, FloatArray],
+    spreads: Mapping[str, FloatArray],
+) -> dict[str, FloatArray]:
+    """Half-widths (R, T, M) of the intervals of markers and rigid bodies [m], by model that has intervals.
+
+    Args:
+        dataset: with the trials.
+        names: names of R trials.
+        errors: content of errors.json.
+        simulated: (R, T, M, 3) [m] by model.
+        spreads: (R, T, M) variances due to the parameters [m^2], by model.
+    """
+    known = {m: Intervals.from_plain(own) for m, own in errors.get("intervals", {}).get("models", {}).items()}
+    since = since_change(dataset, names)
+    return {
+        model: own.half_widths(as_markers(simulated[model], dataset.labels), _rest(dataset), since, spreads.get(model))
+        for model, own in known.items()
+        if own is not None and model in simulated
+    }
+
+
 def _rest(dataset: Dataset) -> FloatArray:
     """(M, 3) markers on the undeformed body [m]; a rigid body is one."""
     assert dataset.bound is not None

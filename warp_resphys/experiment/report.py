@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ..data.dataset import STATIC, Dataset, read_dataset
+from ..data.obstacle_surface import ObstacleSurface
 from ..data.rigid_bodies import as_markers, owners
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
@@ -24,8 +25,8 @@ from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.mesh import Mesh, select_vertices
-from ..report.data import MODELS, Driven, Film, FollowedPath, Recordings, RunReport, TrialResults, models_in_figures
-from ..report.obstacles import ObstacleSurface
+from ..report.data import Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
+from ..report.wording import MODELS, models_in_figures
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
 from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
@@ -50,9 +51,9 @@ from .files import (
     TRUTH,
     fold_folder,
     read_if_there,
-    since_change,
     training_file,
 )
+from .prediction_intervals import half_widths_of
 
 
 def make_report(context: StageContext) -> None:
@@ -208,8 +209,8 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         rolled = tuple(map(str, file.attrs["names"]))
         scaled = _read_scaled(folder)
         test = [name for name in rolled if scaled is None or name not in scaled.names]
-        errors = read_json(folder / ERRORS)["errors_mm"]
-        models = [model for model in models_in_figures(errors) if f"{model}_observed" in file]
+        errors = read_json(folder / ERRORS)
+        models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
         unknown = sorted(set(test) - set(dataset.names))
         if unknown or not models:
             what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
@@ -218,6 +219,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
         spread = (*shape[:2], len(owners(dataset.labels)))
         spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in models if f"{m}_spread" in file}
+    half_widths = half_widths_of(dataset, test, errors, positions, spreads)
     markers = run.markers
     unseen = None if markers is None else marker_view_of(markers, dataset.labels, dataset.sets).unseen
     rows = dataset.rows(test)
@@ -239,8 +241,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         bound=as_markers(bound, dataset.labels),
         gravity=dataset.gravity,
         time_step=dataset.time_step,
-        since=since_change(dataset, test)[:, :length],
-        spreads={model: values[:, :length] for model, values in spreads.items()},
+        half_widths={model: widths[:, :length] for model, widths in half_widths.items()},
         axes=tuple(axis for axis in range(3) if axis != unseen),
     )
 

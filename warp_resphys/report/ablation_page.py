@@ -1,6 +1,6 @@
 """The page of the marker ablation: a box plot, a table, and the method of reconstruction."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 
 from ..io.arrays import FloatArray
 from ..settings.run import RunSettings
-from .figures import TONES, new_figure, use_logarithm
-from .page import NO_BREAK_SPACE, Cell, PageTable, Part, Row, Text, canvas_beside, number_text, write_page
+from .figures import new_figure, use_logarithm
+from .page import Canvas, Cell, PageTable, Part, Row, Text, write_page
+from .wording import NO_BREAK_SPACE, TONES, number_text
 
 _COLUMNS: Final[Mapping[str, str]] = {
     "median_mm": "Median [mm]",
@@ -26,18 +27,15 @@ _COLUMNS: Final[Mapping[str, str]] = {
 def write_ablation_report(
     path: Path, metrics: Mapping[str, Any], settings: RunSettings, *, vertices: int, surface: int, free: int
 ) -> None:
-    """Write the page, and its figure into `figures/` beside it.
+    """Writes the page, see `write_page`.
 
     Args:
-        path: The page's file, such as `report.html`; missing folders are made.
+        path: The page's file, such as `report.html`.
         metrics: `uncorrected_mm`, `by_markers` (a row a number of markers), resources and versions.
         settings: The run's configuration.
         vertices: Number of vertices of the mesh.
         surface: Number of vertices on its surface.
         free: Number of surface vertices that are not clamped.
-
-    Raises:
-        DataFileError: A file could not be written.
     """
     rows, uncorrected, ablation = metrics["by_markers"], metrics["uncorrected_mm"], settings.ablation
     assert ablation is not None
@@ -57,23 +55,20 @@ def write_ablation_report(
             f" Sets of {', '.join(more)} markers exceed these, and are drawn from all {surface} surface vertices, as "
             "published."
         )
-    how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
     medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
     alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
-    with canvas_beside(path) as canvas:
+    how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
+
+    def sections(canvas: Canvas) -> Iterator[Part]:
         boxes = marker_boxes({row["markers"]: np.array(row["errors_mm"]) for row in rows}, uncorrected)
-        figure = canvas.figure("marker_ablation", boxes, alt, caption)
-    write_page(
-        path,
-        [Part("", [figure, ablation_table(rows, note)]), Part("How it was reconstructed", [Text(how)])],
-        settings,
-        [verdict(rows, uncorrected)],
-        metrics,
-    )
+        yield Part("", [canvas.figure("marker_ablation", boxes, alt, caption), ablation_table(rows, note)])
+        yield Part("How it was reconstructed", [Text(how)])
+
+    write_page(path, sections, settings, [verdict(rows, uncorrected)], metrics)
 
 
 def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure:
-    """Draw a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
+    """Draws a box for each number of markers: median, quartiles, and whiskers to the smallest and largest draw.
 
     Args:
         errors: (D,) errors [mm] of the draws, by number of markers.
@@ -99,7 +94,7 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure
 
 
 def ablation_table(rows: Sequence[Mapping[str, Any]], note: str = "") -> PageTable:
-    """Return the errors by number of markers."""
+    """Returns the errors by number of markers."""
     body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
     return PageTable("Markers", [*_COLUMNS.values()], body, note)
 
@@ -114,7 +109,7 @@ def _how_reconstructed(modes: int | None, regularisation: float) -> str:
 
 
 def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
-    """Return the number of markers needed for the published thresholds, and the uncorrected error [mm], in words."""
+    """Returns the number of markers needed for the published thresholds, and the uncorrected error [mm], in words."""
     needed = _markers_below(rows, "median_mm", 0.1)
     text = (
         "With none of these numbers of markers does the median error stay below 0.1 mm."

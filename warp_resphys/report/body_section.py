@@ -2,20 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
-from ..learning.intervals import Intervals
+from . import figures
+from .body_picture import MeshSummary, mesh_picture
 from .data import Driven, RunReport, TrialResults, best_and_worst, drawn_markers, shown_markers
-from .page import Canvas, Drawn, Part, mm_text, unbroken
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from .page import Block, Canvas, Drawn, Part
+from .wording import TONES, mm_text, unbroken
 
 # Models whose coordinates are drawn, as more would overlap.
 _DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "simfree", "resphys")
@@ -36,7 +36,7 @@ _LIMIT: Final[dict[str, Any]] = {"linewidth": 1.0, "linestyle": (0, (4, 3))}  # 
 
 
 def body_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the picture of the body with its chambers or tendons, and the inputs."""
+    """Returns the picture of the body with its chambers or tendons, and the inputs."""
     trials, driven = data.trials, data.driven
     if trials is None or driven is None:
         return None
@@ -47,30 +47,28 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     caption = f"The simulated body: {len(data.mesh.vertices)} vertices, {parts} under {quantity.words}{dots}.{dark}"
     alt = f"The body at rest from outside, cut open and translucent, with {parts} in colours."
 
-    def body(path: Path) -> Drawn:
-        from .body_picture import MeshSummary, draw_mesh
-
-        coloured = f"{quantity.per}s".capitalize()
-        summary = MeshSummary(data.mesh, data.fixed, data.chambers, data.tendons, coloured, data.obstacles)
-        draw_mesh(path, summary, trials.bound if trials.labels else None, canvas.renderer)
-        return Drawn.of(path, alt, caption)
-
+    summary = MeshSummary(
+        data.mesh, data.fixed, data.chambers, data.tendons, f"{quantity.per}s".capitalize(), data.obstacles
+    )
+    picture = mesh_picture(summary, trials.bound if trials.labels else None)
+    blocks: list[Block] = [
+        canvas.rendered("body.png", picture.draw, lambda path, drawn: Drawn.of(picture.save(path, drawn), alt, caption))
+    ]
     limit = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
     what, words = f"{quantity.plural.capitalize()} of {parts}", quantity.plural.capitalize()
-    blocks = canvas.attempt("body.png", body)
     if over_time := input_sequences(driven, trials):
-        figure, alt = _sequences(driven, trials.time_step, over_time), f"{what} over time: {', '.join(over_time)}."
+        figure, shown = _sequences(driven, trials.time_step, over_time), f"{what} over time: {', '.join(over_time)}."
         whose = "a few trials" if len(driven.values) > 1 else "the trial"
-        blocks.append(canvas.figure("inputs", figure, alt, unbroken(f"{words} of {whose}{limit}.")))
+        blocks.append(canvas.figure("inputs", figure, shown, unbroken(f"{words} of {whose}{limit}.")))
     if driven.poses:
-        caption = f"{words} of the poses; unused {quantity.per}s are left out{limit}."
-        figure, alt = _poses(driven, trials.names), f"{what} by pose: {', '.join(driven.poses)}."
-        blocks.append(canvas.figure("pose_inputs", figure, alt, unbroken(caption)))
+        said = f"{words} of the poses; unused {quantity.per}s are left out{limit}."
+        figure, shown = _poses(driven, trials.names), f"{what} by pose: {', '.join(driven.poses)}."
+        blocks.append(canvas.figure("pose_inputs", figure, shown, unbroken(said)))
     return Part(f"The body and its {quantity.plural}", blocks)
 
 
 def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArray]:
-    """Return inputs of a few trials by the titles of their panels: test, training, and highest inputs."""
+    """Returns inputs of a few trials by the titles of their panels: test, training, and highest inputs."""
     values = {name: inputs for name, inputs in driven.values.items() if name not in driven.poses}
     test = [name for name in trials.names if name in values]
     others = [name for name in values if name not in test and name not in driven.scaled][:1]
@@ -83,10 +81,8 @@ def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArra
     return {title: values[name] for name, title in titles.items()}
 
 
-def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatArray]) -> "Figure":
+def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatArray]) -> Figure:
     """Draws inputs over time, with a panel for each trial."""
-    from . import figures
-
     figure = figures.new_figure(0.9 + 1.35 * len(sequences))
     panels = figure.subplots(len(sequences), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for axes, (title, rows) in zip(panels, sequences.items(), strict=True):
@@ -96,24 +92,20 @@ def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatAr
     return figure
 
 
-def _inputs(axes: "Axes", times: FloatArray, rows: FloatArray, driven: Driven, title: str) -> None:
+def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven, title: str) -> None:
     """Draws steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
-    from . import figures
-
     quantity = driven.quantity
     for values, colour in zip(rows.T, cycle(figures.CHAMBER_COLOURS), strict=False):
         axes.stairs(quantity.shown_factor * values, times, baseline=None, color=colour, linewidth=1.2)
     if driven.limit is not None:
-        axes.axhline(quantity.shown_factor * driven.limit, color=figures.TONES["muted"].light, **_LIMIT)
+        axes.axhline(quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT)
     axes.set_ylabel(f"{quantity.words} [{quantity.shown_unit}]")
     axes.set_title(title)
     figures.few_ticks(axes.yaxis, 4)
 
 
-def _poses(driven: Driven, tested: Sequence[str]) -> "Figure":
+def _poses(driven: Driven, tested: Sequence[str]) -> Figure:
     """Draws the last inputs of each pose as bars beside its name; parts without inputs are left out."""
-    from . import figures
-
     quantity, names = driven.quantity, [f"{name} (test)" if name in tested else name for name in driven.poses]
     values = quantity.shown_factor * np.stack([driven.values[name][-1] for name in driven.poses])
     used = np.flatnonzero(values.any(axis=0))
@@ -125,9 +117,9 @@ def _poses(driven: Driven, tested: Sequence[str]) -> "Figure":
         colour = figures.CHAMBER_COLOURS[part % len(figures.CHAMBER_COLOURS)]
         axes.barh(middle, values[:, part], 0.9 * _BARS / count, color=colour)
     if driven.limit is not None:
-        axes.axvline(quantity.shown_factor * driven.limit, color=figures.TONES["muted"].light, **_LIMIT)
+        axes.axvline(quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT)
     axes.set_yticks(range(len(names)), names)
-    axes.tick_params(axis="y", length=0, labelcolor=figures.TONES["ink"].light)
+    axes.tick_params(axis="y", length=0, labelcolor=TONES["ink"].light)
     axes.set(xlabel=f"{quantity.words} [{quantity.shown_unit}]", ylim=(len(names) - 0.5, -0.5))
     figures.few_ticks(axes.xaxis, 6)
     axes.grid(visible=False, axis="y")
@@ -135,23 +127,19 @@ def _poses(driven: Driven, tested: Sequence[str]) -> "Figure":
     return figure
 
 
-def _part_legend(figure: "Figure", driven: Driven, used: Sequence[int]) -> None:
+def _part_legend(figure: Figure, driven: Driven, used: Sequence[int]) -> None:
     """Draws a legend of the used parts below the figure."""
-    from matplotlib.lines import Line2D
-
-    from . import figures
-
     colours = figures.CHAMBER_COLOURS
     handles: list[Any] = [
         Line2D([], [], color=colours[at % len(colours)], label=driven.channels[at].replace("_", " ")) for at in used
     ]
     if driven.limit is not None:
-        handles.append(Line2D([], [], color=figures.TONES["muted"].light, label="limit", **_LIMIT))
+        handles.append(Line2D([], [], color=TONES["muted"].light, label="limit", **_LIMIT))
     figure.legend(handles=handles, loc="outside lower left", ncols=_LEGEND_ROW, columnspacing=1.4)
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the coordinates of markers over time; of a driven body, of two of them, with its inputs below."""
+    """Returns the coordinates of markers over time; of a driven body, of two of them, with its inputs below."""
     trials, driven = data.trials, data.driven
     if trials is None or not trials.labels or not trials.moves:
         return None
@@ -178,7 +166,8 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
             alt += f"{driven.quantity.per}s."
             models = [m for m in _DRAWN if m in trials.positions and m != "simulation"] or list(trials.positions)
             start = np.where(np.isfinite(target[0]), target[0], trials.bound)
-        bands = _bands(data, trials, row, kept)
+        banded = [model for model in ("resphys", "law", "sysid") if model in trials.half_widths][:1]
+        bands = {model: trials.half_widths[model][row][:, kept] for model in banded}
         figure = marker_paths(trials, row, kept, models, start, bands, driven)
         file = f"paths_{place}" if driven is None else "markers"
         blocks.append(canvas.figure(file, figure, alt, f"{caption}{_band_note(data, bands)}{after}"))
@@ -195,8 +184,8 @@ def marker_paths(
     start: FloatArray,
     bands: Mapping[str, FloatArray],
     driven: Driven | None = None,
-) -> "Figure":
-    """Draw coordinates of some markers of a trial, measured as dots, simulated as lines, and below them the inputs.
+) -> Figure:
+    """Draws coordinates of some markers of a trial, measured as dots, simulated as lines, and below them the inputs.
 
     Args:
         trials: Measured and simulated positions.
@@ -207,8 +196,6 @@ def marker_paths(
         bands: (T, kept) half-widths of prediction intervals [m], by model.
         driven: Inputs; all panels are then stacked.
     """
-    from . import figures
-
     with np.errstate(invalid="ignore", over="ignore"):
         measured_and_simulated = [trials.target, *(trials.positions[model] for model in models)]
         target, *paths = (1e3 * (q[row] - start)[:, kept] for q in measured_and_simulated)  # [mm]
@@ -220,7 +207,7 @@ def marker_paths(
     panels = figure.subplots(len(ratios), columns, sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
-    dots: dict[str, Any] = {"color": figures.TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Measured"}
+    dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Measured"}
     for place, axes in enumerate(panels[:rows].flat):
         marker, column = divmod(place, many)
         axis = trials.axes[column]
@@ -231,7 +218,7 @@ def marker_paths(
             axes.plot(times, moved, **figures.model_line(model, 1.1))
             if model in bands:
                 ends = [moved + sign * 1e3 * bands[model][:, marker] for sign in (-1.0, 1.0)]
-                colour = figures.TONES[model].light
+                colour = TONES[model].light
                 axes.fill_between(times, *ends, color=colour, alpha=_BAND, linewidth=0.0, zorder=0.5)
         figures.keep_in_view(axes, seen, 0.6, least)
         figures.few_ticks(axes.yaxis, 4)
@@ -248,18 +235,6 @@ def marker_paths(
     figure.align_ylabels(panels[:, 0])
     figures.legend_above(figure, panels[0, 0])
     return figure
-
-
-def _bands(data: RunReport, trials: TrialResults, row: int, kept: Sequence[int]) -> dict[str, FloatArray]:
-    """Half-widths (T, M) [m] of the prediction intervals of some markers, of the last model with intervals."""
-    intervals = data.metrics.get("intervals", {}).get("models", {})
-    since = None if trials.since is None else trials.since[row]
-    for model in ("resphys", "law", "sysid"):
-        own = Intervals.from_plain(intervals.get(model))
-        if own is not None and model in trials.positions:
-            spread = trials.spreads[model][row] if model in trials.spreads else None
-            return {model: own.half_widths(trials.positions[model][row], trials.bound, since, spread)[:, kept]}
-    return {}
 
 
 def _band_note(data: RunReport, bands: Mapping[str, FloatArray]) -> str:

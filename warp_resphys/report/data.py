@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..data.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PublishedError, mean_distance, published_errors
@@ -16,24 +17,7 @@ from ..mesh.mesh import Mesh
 from ..settings.run import RunSettings
 from ..settings.trials import ReleaseFromLoad
 from ..stepping.quantity import Quantity
-from .obstacles import ObstacleSurface
-
-# In the order of the tables: name and description.
-MODELS: Final[Mapping[str, tuple[str, str]]] = {
-    "rest": ("At rest", "without physics: nothing moves"),
-    "interpolation": ("Interpolation", "without physics: straight lines between the training trials"),
-    "regression": ("Kernel regression", "without physics: ridge regression over the training trials"),
-    "linear": ("Linear model", "without physics: linear from frame to frame, with powers of the inputs (DMDc)"),
-    "published": ("Published setting", "the simulator as the published code sets it up"),
-    "simulation": ("Uncorrected simulator", "with the values of the data sheet"),
-    "reconstruction": ("Reconstruction", "the simulator with forces fitted to the test trial itself"),
-    "sysid_elastic": ("SysID of E and ν", "the elastic parameters that fit best"),  # noqa: RUF001
-    "sysid": ("SysID", "the simulator with the parameters that fit best"),
-    "law": ("Law", "the simulator with the identified law of its material"),
-    "simfree": ("SimFree", "a network in place of the simulator"),
-    "resphys_uncorrected": ("ResPhys, data sheet", "the learned force on the uncorrected simulator"),
-    "resphys": ("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
-}
+from .wording import MODELS
 
 Errors = Mapping[str, Sequence[float | None]]  # Of each model on the same held-out trials [mm]; None: it diverged.
 _TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
@@ -55,9 +39,8 @@ class TrialResults:
     gravity: FloatArray  # (3,) [m/s^2]
     time_step: float  # Of the simulation [s].
     axes: tuple[int, ...] = (0, 1, 2)  # Observed axes of the body.
-    since: FloatArray | None = None  # (R, T) since the last change of the inputs [s].
-    # (R, T, M) variance due to the identified parameters [m^2], by model.
-    spreads: Mapping[str, FloatArray] = field(default_factory=dict)
+    # (R, T, M) half-widths of the markers' prediction intervals [m], by model.
+    half_widths: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @cached_property
     def errors_mm(self) -> dict[str, FloatArray]:
@@ -185,12 +168,12 @@ class RunReport:
 
 
 def other_trials(settings: RunSettings) -> tuple[str, ...]:
-    """Return the names of the test trials outside of the training loads; empty for most experiments."""
+    """Returns the names of the test trials outside of the training loads; empty for most experiments."""
     return tuple(settings.data.others) if isinstance(settings.data, ReleaseFromLoad) else ()
 
 
 def folds_in(metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the metrics of each fold, or those of a split alone."""
+    """Returns the metrics of each fold, or those of a split alone."""
     return list(metrics.get("folds", {}).values()) or [metrics]
 
 
@@ -239,7 +222,7 @@ def missing_baselines(metrics: Mapping[str, Any]) -> dict[str, str]:
 
 
 def best_and_worst(trials: TrialResults) -> list[int]:
-    """Return the motions with the largest and the least error of the last model of the table; one if there is one."""
+    """Returns the motions with the largest and the least error of the last model of the table; one if there is one."""
     moving = [row for row, begins in enumerate(trials.begins) if begins != "static"]
     errors = trials.errors_mm[next(m for m in reversed(list(MODELS)) if m in trials.positions)][moving]
     means = np.array([row[~np.isnan(row)].mean() if (~np.isnan(row)).any() else np.inf for row in errors])
@@ -247,24 +230,8 @@ def best_and_worst(trials: TrialResults) -> list[int]:
     return [worst] if worst == best else [worst, best]
 
 
-def shown_models(positions: Mapping[str, Any]) -> list[str]:
-    """Return the models that are drawn as bodies: the uncorrected one, then the best available one."""
-    plain = next((m for m in ("simulation", "published") if m in positions), None)
-    solid = next(
-        (m for m in ("resphys", "resphys_uncorrected", "law", "sysid", "sysid_elastic") if m in positions), None
-    )
-    return [m for m in (plain, solid) if m is not None]
-
-
-def models_in_figures(errors: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the models that figures show: of those without physics only the one of least mean error."""
-    plain = [model for model in BASELINES if model in errors]
-    best = min(plain, key=lambda model: np.inf if (e := errors[model]["mean"]) is None else e, default="")
-    return [model for model in MODELS if model in errors and (model not in plain or model == best)]
-
-
 def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> FloatArray:
-    """Return positions (T, N, 3) at given times, interpolated linearly between the frames.
+    """Returns positions (T, N, 3) at given times, interpolated linearly between the frames.
 
     Args:
         positions: (F, N, 3) [m]; values that are not finite are ignored where their weight is zero.
@@ -281,7 +248,7 @@ def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> Fl
 
 
 def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
-    """Return distances (M,) of markers from the clamped end, along the direction from it to their mean [m].
+    """Returns distances (M,) of markers from the clamped end, along the direction from it to their mean [m].
 
     Args:
         bound: (M, 3) [m] on the undeformed body.
@@ -289,24 +256,16 @@ def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
     """
     start = clamped.mean(axis=0) if len(clamped) else bound[0]
     axis = bound.mean(axis=0) - start
-    length = float(np.linalg.norm(axis))
-    along: FloatArray = (bound - start) @ (axis / length) if length > 0.0 else np.zeros(len(bound))
-    return along
-
-
-def tip_markers(bound: FloatArray, clamped: FloatArray) -> IntArray:
-    """Return the indices of the markers at the tip: those that are farthest by `along_body`."""
-    away = along_body(bound, clamped)
-    return np.flatnonzero(away >= (1.0 - _TIP) * away.max())
+    return np.asarray((bound - start) @ (axis / (np.linalg.norm(axis) or 1.0)))
 
 
 def shown_markers(target: FloatArray) -> IntArray:
-    """Return the indices of the markers (T, M, 3) of a trial that were seen in a frame; NaN where one was not."""
+    """Returns the indices of the markers (T, M, 3) of a trial that were seen in a frame; NaN where one was not."""
     return np.flatnonzero(np.isfinite(target).all(axis=2).any(axis=0))
 
 
 def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) -> list[int]:
-    """Return the marker at the tip that moves most and, of those well above the tip, the one that moves most.
+    """Returns the marker at the tip that moves most and, of those well above the tip, the one that moves most.
 
     Args:
         target: (T, M, 3) [m], NaN where a marker was not seen.
@@ -314,9 +273,8 @@ def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) ->
         clamped: (F, 3) [m] vertices of the clamped end.
     """
     moved = np.nanmax(np.linalg.norm(target - bound, axis=2), axis=0, initial=0.0)  # (M,) [m]
-    away = along_body(bound, clamped)
-    others = np.flatnonzero(away < (1.0 - _OTHER) * away.max())
-    shown = shown_markers(target)
-    groups = [np.intersect1d(group, shown) for group in (tip_markers(bound, clamped), others)]
+    away, shown = along_body(bound, clamped), shown_markers(target)
+    tip, above = away >= (1.0 - _TIP) * away.max(), away < (1.0 - _OTHER) * away.max()
+    groups = [np.intersect1d(np.flatnonzero(group), shown) for group in (tip, above)]
     groups = [group for group in groups if len(group)] or [shown]
     return [int(group[np.argmax(moved[group])]) for group in groups]

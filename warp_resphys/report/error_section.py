@@ -1,27 +1,30 @@
-"""The section on the errors over time, of each marker and of each rigid body."""
+"""The sections on errors over time, of each marker and of each rigid body, and on the training of the networks."""
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ..io.arrays import FloatArray
 from ..io.errors import listed, number_of
 from ..learning.metrics import median_filter
-from .data import MODELS, RunReport, grouped_errors
-from .page import Canvas, Part, Text, largest_text, mm_text, unbroken
+from . import figures
+from .data import RunReport, grouped_errors
+from .page import Canvas, Part, Text
 from .sections import model_table, numbers
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from .wording import MODELS, TONES, largest_text, mm_text, number_text, unbroken
 
 _FILTER: Final = 1.0  # Window of the median filter [s], as published.
 _LENGTHS: Final = 4.0  # Least length of a roll-out that is filtered, in windows.
+_TRAINED: Final = (
+    "Losses, and the roll-out error on the trials by which the weights are chosen; the dot marks the lowest."
+)
 _BETWEEN: Final = 0.07  # Space between panels, so that labels of their ends do not meet.
 
 
 def error_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors over time, of each trial and of each marker."""
+    """Returns the errors over time, of each trial and of each marker."""
     trials, metrics = data.trials, data.metrics
     if trials is None:
         return None
@@ -30,7 +33,7 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         times = np.nanmean(trials.times, axis=0)
         window = _FILTER if times[-1] >= _LENGTHS * _FILTER - 1e-9 else None
         of = "marker" if data.sees_markers else "vertex"
-        reached = "; ".join(f"{MODELS[model][0]} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
+        reached = "; ".join(f"{MODELS[model].name} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
         panels: dict[str, Any] = {"": slice(None)}
         if len(grouped_errors(metrics, data.settings)) > 1:
@@ -57,7 +60,7 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def mesh_text(check: Mapping[str, Any]) -> str:
-    """Return sentences on what a finer mesh changes.
+    """Returns sentences on what a finer mesh changes.
 
     Args:
         check: Content of `mesh_check.json`.
@@ -67,7 +70,7 @@ def mesh_text(check: Mapping[str, Any]) -> str:
     cells, finer = check["cells"]
     vertices = "{:,} instead of {:,} vertices".format(*check["vertices"][::-1])
     mesh = f"quadratic cells ({vertices})" if cells == finer else f"{finer:,} instead of {cells:,} cells"
-    model, (before, after) = MODELS[check["model"]][0], map(mm_text, check["errors_mm"])
+    model, (before, after) = MODELS[check["model"]].name, map(mm_text, check["errors_mm"])
     return unbroken(
         f"With {mesh} and the same parameters, {model} moves the markers by {mm_text(check['moved_mm'])}, and its "
         f"error is {after} instead of {before}, at the beginning of {listed(check['trials'])}. Parameters that are "
@@ -81,8 +84,8 @@ def error_over_time(
     of: str = "vertex",
     window: float | None = None,
     panels: Mapping[str, Any] | None = None,
-) -> "Figure":
-    """Draw each model's mean error over time and, for the main models, the range of the trials.
+) -> Figure:
+    """Draws each model's mean error over time and, for the main models, the range of the trials.
 
     Args:
         errors: (R, T) errors [mm] of R trials by model; NaN where nothing was seen, infinite where it diverged.
@@ -92,8 +95,6 @@ def error_over_time(
             unfiltered one as a thin line. None for no filter.
         panels: Rows of the trials of each panel, by title; by default one panel has all trials.
     """
-    from . import figures
-
     groups = panels or {"": slice(None)}
     figure, lowest = figures.new_figure(3.5), list[float]()
     every = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)
@@ -138,3 +139,59 @@ def _error_caption(data: RunReport, window: float | None) -> str:
     if any(summary["diverged"] for summary in data.metrics["errors_mm"].values()):
         text += " A line ends where the first roll-out has diverged."
     return unbroken(text)
+
+
+def training_section(data: RunReport, canvas: Canvas) -> Part | None:
+    """Returns the curves of the trainings, and which weights were kept."""
+    blocks: list[Any] = []
+    for model, (name, *_) in MODELS.items():
+        if records := data.training.get(model):
+            alt = f"Losses and validation roll-out error of the training of {name}, {len(records)} epochs."
+            figure = canvas.figure(f"training_{model}", training_curves(records), alt, _TRAINED)
+            blocks += [Text(name, heading=True), figure]
+    return Part("Training", blocks) if blocks else None
+
+
+def training_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draws the losses and, where they were recorded, the validation roll-out error and the learning rate.
+
+    Args:
+        records: One for each epoch, with `epoch`, `train_loss`, `validation_loss`, and in some or all epochs
+            `rollout_error_mm` and `learning_rate`; values that were not measured are None or absent.
+    """
+
+    def measured(key: str) -> tuple[FloatArray, FloatArray]:  # Epochs and values.
+        known = [(record["epoch"], record[key]) for record in records if record.get(key) is not None]
+        epochs, values = np.asarray(known, dtype=np.float64).reshape(-1, 2).T
+        return epochs, figures.positive(values)
+
+    heights = {"losses": 3, "rollout_error_mm": 3, "learning_rate": 1}
+    heights = {key: height for key, height in heights.items() if key == "losses" or len(measured(key)[0])}
+    muted, strong = TONES["muted"].light, TONES["resphys"].light
+    thin: dict[str, Any] = {"linewidth": 1.1, "marker": "." if len(records) == 1 else ""}
+    figure = figures.new_figure(0.6 + 0.57 * sum(heights.values()))
+    rows = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=[*heights.values()])[:, 0]
+    axes = dict(zip(heights, rows, strict=True))
+    for key, label, colour in (("train_loss", "Training loss", muted), ("validation_loss", "Validation loss", strong)):
+        epochs, losses = measured(key)
+        if len(epochs):
+            axes["losses"].plot(epochs, losses, color=colour, label=label, **thin)
+    axes["losses"].set_ylabel("loss")
+    axes["losses"].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=2)
+    if (curve := axes.get("rollout_error_mm")) is not None:
+        epochs, errors = measured("rollout_error_mm")
+        curve.plot(epochs, errors, color=strong)
+        curve.set_ylabel("roll-out\nerror [mm]")
+        if np.isfinite(errors).any():
+            best = int(np.nanargmin(errors))
+            curve.plot(epochs[best], errors[best], "o", color=TONES["simulation"].light, markersize=5)
+            curve.set_title(f"lowest: {number_text(errors[best])} mm, epoch {epochs[best]:.0f}", loc="right")
+    if "learning_rate" in axes:
+        axes["learning_rate"].plot(*measured("learning_rate"), color=muted, drawstyle="steps-mid", **thin)
+        axes["learning_rate"].set_ylabel("learning\nrate")
+    for row in rows:
+        figures.use_logarithm(row)
+    rows[-1].set_xlabel("epoch")
+    figures.count(rows[-1].xaxis, 6)
+    figure.align_ylabels()
+    return figure

@@ -6,10 +6,10 @@ Their colours follow the reader's theme.
 import io
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
@@ -20,37 +20,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocato
 
 from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
-from .data import MODELS
+from .wording import MODELS, TONES
 
-
-class Tone(NamedTuple):
-    """Colour of a role on a light page and on a dark one."""
-
-    light: str
-    dark: str
-
-
-# matplotlib draws the light tones, and `themed_svg` replaces them, so they must differ.
-TONES: Final[Mapping[str, Tone]] = {
-    "ink": Tone("#1c2127", "#e4e7eb"),
-    "muted": Tone("#5c6670", "#9aa4af"),
-    "rule": Tone("#dde1e6", "#343b44"),
-    "target": Tone("#b4bcc6", "#5d6875"),
-    "rest": Tone("#7d6b4f", "#c8b594"),
-    "interpolation": Tone("#7d6b50", "#c8b595"),
-    "regression": Tone("#7d6b51", "#c8b596"),
-    "linear": Tone("#7d6b52", "#c8b597"),
-    "simulation": Tone("#c4481b", "#ff9a6c"),
-    "reconstruction": Tone("#1d7a55", "#62d2a2"),
-    "sysid": Tone("#7a4aa0", "#c9a2ea"),
-    "law": Tone("#0f766e", "#5eead4"),
-    "simfree": Tone("#8f6a00", "#e2bd4f"),
-    "resphys": Tone("#1a5fb4", "#7fb3f5"),
-    "published": Tone("#b0307b", "#f08bc5"),
-    "sysid_elastic": Tone("#a57cc4", "#d9bdf0"),
-    "resphys_uncorrected": Tone("#1f93b0", "#6fd0e8"),
-}
-LABELS: Final[Mapping[str, str]] = {model: name for model, (name, _) in MODELS.items()}
 # Okabe and Ito (2008): distinguishable with colour vision deficiencies.
 CHAMBER_COLOURS: Final = ("#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442", "#7f7f7f")
 LARGEST_SHOWN: Final = 1e5  # Largest error [mm] or loss that is drawn.
@@ -100,18 +71,18 @@ STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def in_style() -> Iterator[None]:
-    """Apply the style of all figures; also as a decorator."""
+    """Applies the style of all figures; also as a decorator."""
     with mpl.rc_context(STYLE):
         yield
 
 
 def save_png(figure: Figure, path: Path) -> None:
-    """Write a figure with a white background."""
+    """Writes a figure with a white background."""
     figure.savefig(path, format="png", dpi=200, facecolor="white")
 
 
 def themed_svg(figure: Figure, name: str) -> bytes:
-    """Return a figure as an SVG file with text as text, whose colours follow the reader's theme.
+    """Returns a figure as an SVG file with text as text, whose colours follow the reader's theme.
 
     Identifiers in the file depend on the name alone, so that they are the same in every run.
     """
@@ -130,33 +101,33 @@ def themed_svg(figure: Figure, name: str) -> bytes:
 
 @in_style()
 def settle(figure: Figure) -> None:
-    """Compute the layout of a figure once, for all files that are written of it."""
+    """Computes the layout of a figure once, for all files that are written of it."""
     if (engine := figure.get_layout_engine()) is not None:
         engine.execute(figure)
         figure.set_layout_engine(None)
 
 
 def model_line(model: str, width: float = 1.4) -> dict[str, Any]:
-    """Return style and label of a model's line; that of ResPhys is thicker, and dashed ones are drawn over it."""
+    """Returns style and label of a model's line; that of ResPhys is thicker, and dashed ones are drawn over it."""
     width += 0.5 if model == "resphys" else 0.0
     look = {"color": TONES[model].light, "linestyle": _DASHED.get(model, "-"), "zorder": 2.1 if model in _DASHED else 2}
-    return {**look, "linewidth": width, "label": LABELS[model]}
+    return {**look, "linewidth": width, "label": MODELS[model].name}
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure of the page's width and a height [in]."""
+    """Returns an empty figure of the page's width and a height [in]."""
     return Figure(figsize=(WIDE, height), layout="constrained")
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
-    """Put the legend above the figure, in rows of four if there are many names."""
+    """Puts the legend above the figure, in rows of four if there are many names."""
     handles, labels = axes.get_legend_handles_labels()
     columns = len(labels) if len(labels) <= _LEGEND_ROW else _LEGEND_ROW - 1
     figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.6)
 
 
 def keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0) -> None:
-    """Limit an axis to a measured motion (T,) and a margin, a share of it, with a least span.
+    """Limits an axis to a measured motion (T,) and a margin, a share of it, with a least span.
 
     A model that diverges then does not set the scale, and noise does not look like motion.
     """
@@ -170,22 +141,22 @@ def keep_in_view(axes: Axes, seen: FloatArray, share: float, least: float = 0.0)
 
 
 def few_ticks(axis: Axis, most: int) -> None:
-    """Label an axis at a few round numbers."""
+    """Labels an axis at a few round numbers."""
     axis.set_major_locator(MaxNLocator(most, steps=(1, 2, 5, 10)))
 
 
 def count(axis: Axis, most: int) -> None:
-    """Label an axis at whole numbers only, even if there is just one."""
+    """Labels an axis at whole numbers only, even if there is just one."""
     axis.set_major_locator(MaxNLocator(most, integer=True, min_n_ticks=1))
 
 
 def positive(values: FloatArray) -> FloatArray:
-    """Return values for a logarithmic axis: NaN where they are not positive or exceed `LARGEST_SHOWN`."""
+    """Returns values for a logarithmic axis: NaN where they are not positive or exceed `LARGEST_SHOWN`."""
     return np.where((values > 0.0) & (values < LARGEST_SHOWN), values, np.nan)
 
 
 def use_logarithm(axes: Axes, least: float = 0.0) -> None:
-    """Make the y axis logarithmic, over at least a factor of five and from a least value; call it after drawing.
+    """Makes the y axis logarithmic, over at least a factor of five and from a least value; call it after drawing.
 
     Labels are 0.1, 1, 10 or, on long axes, powers of ten; on short axes 2 and 5 are labelled too. Where no value can be
     shown, such as errors that are all zero, a sentence is written instead.

@@ -3,19 +3,19 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ..data.registration import root_mean_square
 from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.parameters import own_name, split_name
 from ..settings.learning import RangeSettings
-from .data import MODELS, RunReport
-from .page import MINUS, NO_BREAK_SPACE, NONE, Canvas, Cell, PageTable, Part, Row, Text
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from . import figures
+from .data import RunReport
+from .page import Canvas, Cell, PageTable, Part, Row, Text
+from .wording import MINUS, MODELS, NO_BREAK_SPACE, NONE, TONES
 
 # Name, unit on the page, and its number in an SI unit.
 Wording = tuple[str, str, float]
@@ -44,13 +44,13 @@ _UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the 
 
 
 def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the identified parameters, and how well the data determine them."""
+    """Returns the identified parameters, and how well the data determine them."""
     identified = {name: data.identification[name] for name in MODELS if name in data.identification}
     if not identified:
         return None
     columns = ["Data sheet", "Identified", *(["True"] if data.truth else []), "At a bound"]
     blocks: list[Any] = [
-        PageTable(MODELS[name][0], columns, parameter_rows(result, data.start, data.truth))
+        PageTable(MODELS[name].name, columns, parameter_rows(result, data.start, data.truth))
         for name, result in identified.items()
     ]
     blocks += [table for result in identified.values() if (table := own_table(result)) is not None]
@@ -78,14 +78,12 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Identification", blocks)
 
 
-def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> "Figure":
-    """Draw the best loss so far over the evaluations of each start, with a panel for each identification.
+def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> Figure:
+    """Draws the best loss so far over the evaluations of each start, with a panel for each identification.
 
     Args:
         histories: By identification: for every start its records with `loss`, one for each evaluation.
     """
-    from . import figures
-
     figure = figures.new_figure(2.6)
     panels = list(figure.subplots(1, len(histories), sharey=True, squeeze=False).flat)
     for axes, (name, starts) in zip(panels, histories.items(), strict=True):
@@ -93,10 +91,10 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
         for start in filter(None, starts):
             losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
             best = bool(ends) and losses[-1] <= min(ends)
-            tone, width = figures.TONES["sysid" if best else "muted"].light, 1.8 if best else 0.9
+            tone, width = TONES["sysid" if best else "muted"].light, 1.8 if best else 0.9
             shown = figures.positive(losses)
             axes.plot(np.arange(1, len(losses) + 1), shown, ".-", color=tone, linewidth=width, markersize=3.5)
-        axes.set(title=MODELS[name][0], xlabel="evaluation")
+        axes.set(title=MODELS[name].name, xlabel="evaluation")
         figures.count(axes.xaxis, 5)
     for axes in panels:  # Once everything is drawn, as they share their axis.
         figures.use_logarithm(axes)
@@ -105,7 +103,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
 
 
 def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:
-    """Return a row for each parameter: values of data sheet, identification and truth if known; if at a bound."""
+    """Returns a row for each parameter: values of data sheet, identification and truth if known; if at a bound."""
     deviations = (identified.get("uncertainty") or {}).get("deviation", {})
     rows = []
     for parameter, value in identified["parameters"].items():
@@ -120,7 +118,7 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
 
 
 def own_table(identified: Mapping[str, Any]) -> PageTable | None:
-    """Return the values of single trials and sessions, with their standard deviations; None if there are none."""
+    """Returns the values of single trials and sessions, with their standard deviations; None if there are none."""
     own, deviations = identified.get("own", {}), identified.get("own_deviation", {})
     if not own:
         return None
@@ -138,32 +136,32 @@ def own_table(identified: Mapping[str, Any]) -> PageTable | None:
 
 
 def parameter_wording(parameter: str) -> Wording:
-    """Return the name of a parameter as in the settings but with spaces, its unit on the page, and the factor."""
+    """Returns the name of a parameter as in the settings but with spaces, its unit on the page, and the factor."""
     words = parameter.replace("_", " ").replace("youngs", "Young's").replace("poissons", "Poisson's")
     fits = ((unit, factor) for pattern, unit, factor in _UNITS if re.fullmatch(pattern, parameter))
     return words[0].upper() + words[1:], *next(fits, ("", 1.0))
 
 
 def in_sentence(parameter: str) -> str:
-    """Return the name of a parameter as it stands within a sentence."""
+    """Returns the name of a parameter as it stands within a sentence."""
     words = parameter_wording(parameter)[0]
     return words if words.startswith(("Young", "Poisson", "Prony")) else words[0].lower() + words[1:]
 
 
 def with_unit(parameter: str, value: float) -> str:
-    """Return a value of a parameter in its unit."""
+    """Returns a value of a parameter in its unit."""
     _, unit, factor = parameter_wording(parameter)
     return f"{digits(value, factor)} {unit}".rstrip()
 
 
 def identified_cell(value: float | None, factor: float, deviation: float | None) -> Cell:
-    """Return a value in its unit with its standard deviation, if that is known."""
+    """Returns a value in its unit with its standard deviation, if that is known."""
     beside = f"± {digits(deviation, factor, deviation)}" if deviation else ""
     return Cell(digits(value, factor, deviation), beside=beside)
 
 
 def digits(value: float | None, factor: float, deviation: float | None = None) -> str:
-    """Return a value in its unit, with two digits of its standard deviation, or with four digits without one."""
+    """Returns a value in its unit, with two digits of its standard deviation, or with four digits without one."""
     if value is None:
         return NONE
     if not deviation:
@@ -173,7 +171,7 @@ def digits(value: float | None, factor: float, deviation: float | None = None) -
 
 
 def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, float]) -> str:
-    """Return a sentence on the identified displacements of markers and recordings from their nominal positions.
+    """Returns a sentence on the identified displacements of markers and recordings from their nominal positions.
 
     Args:
         name: Of the model.
@@ -185,7 +183,7 @@ def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, f
     furthest = max(away, key=lambda label: away[label])
     shift, turn = (math.hypot(*placed[key]) for key in ("shift", "turn"))
     text = (
-        f"{MODELS[name][0]}, identified with the parameters: markers are displaced from their nominal positions, "
+        f"{MODELS[name].name}, identified with the parameters: markers are displaced from their nominal positions, "
         f"{furthest} the most, by {away[furthest]:.1f} mm; the recordings are shifted by {1e3 * shift:.1f} mm and "
         f"rotated by {math.degrees(turn):.1f}°"
     )
@@ -197,7 +195,7 @@ def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, f
 
 
 def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, RangeSettings]) -> str:
-    """Return sentences on the parameters that the data do not determine or separate; empty without uncertainties.
+    """Returns sentences on the parameters that the data do not determine or separate; empty without uncertainties.
 
     Args:
         name: Of the model.
@@ -213,7 +211,7 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     along = " with ".join(words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest)
     share = 100.0 * uncertainty["poorest_deviation"]
     known = f"{along} is least certain ({share:.2g} % of the range)."
-    text = f"{MODELS[name][0]}: {known if share < _WHOLE else f'the data do not constrain {along}: set a prior.'}"
+    text = f"{MODELS[name].name}: {known if share < _WHOLE else f'the data do not constrain {along}: set a prior.'}"
     correlation = np.array(uncertainty["correlation"], dtype=np.float64)
     tied = [
         f"{words[names[i]]} and {words[names[j]]} (correlation {correlation[i, j]:+.2f})".replace("-", MINUS)

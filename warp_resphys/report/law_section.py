@@ -19,11 +19,12 @@ from ..io.arrays import FloatArray
 from ..learning.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
+from . import figures
 from .data import RunReport
 from .identification_section import Wording, identified_cell, parameter_wording
-from .page import NONE, Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, in_a_row, significant, unbroken
+from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 from .sections import BEYOND
-from .verdict import model_name
+from .wording import NONE, TONES, in_a_row, model_words, significant, unbroken
 
 _NOT_FACTORS: Final = ("ms", "%", "°")  # Units of constants that multiply no term: times, slacks, directions.
 _NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
@@ -70,7 +71,7 @@ ACROSS: Final = (0.0, 1.0, 0.0)
 
 
 def law_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the law, whether it is used, what the trials determine of it, and the classes that were tried."""
+    """Returns the law, whether it is used, what the trials determine of it, and the classes that were tried."""
     law, settings = data.law, data.settings.law
     if not law or settings is None:
         return None
@@ -86,12 +87,12 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def law_text(law: Mapping[str, Any]) -> str:
-    """Return a sentence on whether the identified law is used, and why.
+    """Returns a sentence on whether the identified law is used, and why.
 
     Args:
         law: From metrics.json, with `accepted`, `validation` and the model `against` which it was tested.
     """
-    checked, base = law["validation"], model_name(law.get("against", "simulation"))
+    checked, base = law["validation"], model_words(law.get("against", "simulation"))
     where = f"{checked.get('split', 'validation')} trials ({', '.join(checked['trials'])})"
     head = f"The identified law is {'used' if law['accepted'] else 'not used'}"
     tail = ""
@@ -107,7 +108,7 @@ def law_text(law: Mapping[str, Any]) -> str:
 
 
 def wording(name: str) -> tuple[Wording, str]:
-    """Return the name, unit and factor of a constant of a law, and its meaning."""
+    """Returns the name, unit and factor of a constant of a law, and its meaning."""
     if name in _TERMS:
         words, meaning, (unit, factor) = _TERMS[name]
         return (words, unit, factor), meaning
@@ -142,7 +143,7 @@ def _lower(words: str) -> str:
 
 
 def outside_text(data: RunReport) -> str:
-    """Return a sentence on test trials outside of the stretches of the training; empty if they hardly are."""
+    """Returns a sentence on test trials outside of the stretches of the training; empty if they hardly are."""
     if data.outside is None or data.outside < BEYOND:
         return ""
     low, high = data.stretches["the training"]
@@ -154,7 +155,7 @@ def outside_text(data: RunReport) -> str:
 
 
 def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
-    """Return a sentence on the terms of the library that the law does not have; empty if it has all of them."""
+    """Returns a sentence on the terms of the library that the law does not have; empty if it has all of them."""
     constants = law["constants"]
     names = [name for name in settings.terms if name not in constants]
     exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
@@ -205,22 +206,20 @@ def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
 
 def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> list[Drawn]:
     """Draws the stress in slow tension and compression, and the stretches of trials as shades."""
-    from . import figures
-
     stretches, fibres = drawn_stretches(data.stretches), families(constants)
     directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "law, along the fibres": ALONG}
     curves = {label: 1e-3 * uniaxial_stress(constants, stretches, d) for label, d in directions.items()}  # [kPa]
     modulus = 1e-3 * small_strain(constants).youngs_modulus
-    figure, law = figures.new_figure(3.3), figures.TONES["law"].light
+    figure, law = figures.new_figure(3.3), TONES["law"].light
     axes = figure.subplots()
     for (name, (low, high)), tone in zip(data.stretches.items(), ("rule", "target"), strict=False):
-        colour = figures.TONES[tone].light
+        colour = TONES[tone].light
         axes.axvspan(low, high, color=colour, alpha=_SHADE, linewidth=0.0, label=f"stretches in {name}")
     for (label, stress), dashes in zip(curves.items(), ("-", (0, (4, 1.5))), strict=False):
         axes.plot(stretches, stress, color=law, linewidth=1.9, label=label, linestyle=dashes)
-    dashed: dict[str, Any] = {"color": figures.TONES["ink"].light, "linewidth": 1.0, "linestyle": (0, (6, 3))}
+    dashed: dict[str, Any] = {"color": TONES["ink"].light, "linewidth": 1.0, "linestyle": (0, (6, 3))}
     axes.plot(stretches, modulus * (stretches - 1.0), **dashed, label=f"E at small strains, {modulus:.3g} kPa")
-    axes.axhline(0.0, color=figures.TONES["muted"].light, linewidth=0.6)
+    axes.axhline(0.0, color=TONES["muted"].light, linewidth=0.6)
     low, high = (extreme([extreme(stress) for stress in curves.values()]) for extreme in (np.nanmin, np.nanmax))
     margin = 0.1 * (high - low)
     axes.set(xlim=(stretches[0], stretches[-1]), ylim=(low - margin, high + margin))
@@ -241,7 +240,7 @@ def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> l
 
 
 def drawn_stretches(ranges: Mapping[str, tuple[float, float]]) -> FloatArray:
-    """Return the stretches (S,) of the curves: those of the trials and a margin, or 0.8 to 1.3 without any."""
+    """Returns the stretches (S,) of the curves: those of the trials and a margin, or 0.8 to 1.3 without any."""
     low = min((low for low, _ in ranges.values()), default=0.8)
     high = max((high for _, high in ranges.values()), default=1.3)
     low, high = min(low, 1.0 - _LEAST), max(high, 1.0 + _LEAST)
@@ -296,7 +295,7 @@ class SmallStrain(NamedTuple):
 
 
 def small_strain(constants: Mapping[str, float]) -> SmallStrain:
-    """Return the moduli of a law without its fibres, from its constants by name."""
+    """Returns the moduli of a law without its fibres, from its constants by name."""
     ogden, value = ogden_terms(constants), constants.get
     mu = 2.0 * (value("c10", 0.0) + value("c01", 0.0)) + sum(ogden.values())
     lame = 2.0 * (value("dilation", 0.0) + value("bulk_1", 0.0))
@@ -304,7 +303,7 @@ def small_strain(constants: Mapping[str, float]) -> SmallStrain:
 
 
 def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
-    """Return the moduli of a material at small strains; None for one with regions."""
+    """Returns the moduli of a material at small strains; None for one with regions."""
     if material.regions:
         return None
     own = make_material(material.model, **material.constants)
@@ -316,20 +315,20 @@ def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
 
 
 def ogden_terms(constants: Mapping[str, float]) -> dict[int, float]:
-    """Return the moduli of Ogden's terms [Pa], by exponent."""
+    """Returns the moduli of Ogden's terms [Pa], by exponent."""
     found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in constants}
     return {int(m[2]) * (-1 if m[1] else 1): constants[name] for name, m in found.items() if m}
 
 
 def families(constants: Mapping[str, float]) -> int:
-    """Return the number of families of fibres."""
+    """Returns the number of families of fibres."""
     return sum(name.startswith("fibre_tension_") for name in constants)
 
 
 def uniaxial_stress(
     constants: Mapping[str, float], stretches: FloatArray, direction: Sequence[float] | None = None
 ) -> FloatArray:
-    """Return the nominal stress (S,) [Pa] at stretches (S,); NaN where no state with free sides was found.
+    """Returns the nominal stress (S,) [Pa] at stretches (S,); NaN where no state with free sides was found.
 
     Args:
         constants: Of the law, by name.

@@ -1,38 +1,48 @@
-"""The section of the page of a run on the motion in a trial: a film, a view in space, pictures, and the tip."""
+"""The section of the page of a run on the motion in a trial: a film, a view in space, pictures, and the tip.
 
-from concurrent.futures import Executor, Future
+The view in space is turned and played in a browser (`view.js`). Vertices of a motion are stored for it in a reduced
+basis: rest positions, singular vectors of the displacements of all models, and their weights in each frame. Ten seconds
+of an arm take a few hundred kilobytes.
+"""
+
+import base64
+import json
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 from markupsafe import Markup
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
 
+from ..data.camera import frame_of, motion_axes, upwards
+from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
-from .bodies import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion
-from .data import MODELS, Film, RunReport, TrialResults, at_times, shown_markers, shown_models
-from .page import Block, Canvas, Drawn, Part, largest_text, unbroken
-from .render import Renderer, draw, hangs, write_film
+from ..learning.metrics import mean_distance
+from ..mesh.mesh import boundary_triangles, surface_vertices
+from . import figures
+from .data import Film, RunReport, TrialResults, at_times, shown_markers
+from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
+from .motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
+from .page import Block, Canvas, Drawn, Part, ViewInSpace
+from .render import Pixels, draw, write_film
+from .wording import MODELS, TONES, largest_text, shown_models, unbroken
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
-_MOST_FRAMES: Final = 256  # Of the interactive view.
-
-
-def start_drawing(data: RunReport, folder: Path, pool: Executor) -> "dict[str, Future[Any]]":
-    """Start a process that draws the motion: instants, and the film where markers are observed."""
-    motion = motion_of(data)
-    if motion is None:
-        return {}
-    renderer = Renderer()
-    started: dict[str, Future[Any]] = {"pictures": pool.submit(draw, motion.scene(), renderer)}
-    # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
-    if data.sees_markers and len(motion.times) > 1:
-        started["video"] = pool.submit(write_film, folder / "motion.mp4", motion.film(), renderer)
-    return started
+_MOST_FRAMES: Final = 256  # Of the view in space.
+_TOLERANCE: Final = 2e-4  # Largest error of a vertex of the view in space, over the body's size,
+_MOST_MODES: Final = 96  # unless it takes more modes than these.
+_DIVERGED: Final = 3.0  # Distance from rest beyond which a body is not drawn there, over the body's size.
+_COLOUR_MAP: Final = "viridis"
+_STOPS: Final = 32  # Of the colour map.
+_LEVELS: Final = 255  # Of the errors of a model, from zero to the largest.
 
 
 def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
-    """Return the motion that is drawn: that of the film or, where vertices are observed, of the worst trial.
+    """Returns the motion that is drawn: that of the film or, where vertices are observed, of the worst trial.
 
     Args:
         data: Data of the page.
@@ -41,7 +51,7 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     trials, film = data.trials, data.film
     if trials is None:
         return None
-    seen_from_below, away = hangs(data.mesh, data.fixed, trials.gravity)
+    from_below, away = hangs(data.mesh, data.fixed, trials.gravity)
     points = None
     if not trials.labels:
         row = trials.worst
@@ -60,85 +70,82 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
     if len(frames) > len(film.times):  # The frames that are closest to those of the film.
         nearest = np.abs(times[frames][:, None] - film.times).argmin(axis=0)
         frames = frames[np.unique(nearest)]
-    bodies = {m: at_times(film.positions[m], film.times, times[frames]) for m in models}
-    target, *markers = (q[row][frames][:, points] for q in (trials.target, *(trials.positions[m] for m in models)))
-    seen = dict(zip(models, markers, strict=True))
-    whole = None if trials.labels else trials.target[row][frames]
-    at_rest = trials.bound[points]
-    around = data.obstacles_at(film.trial, times[frames])
     observed = LABORATORY_MARKERS if "laboratory" in data.settings.targets else MEASURED_MARKERS
-    observed = observed if trials.labels else TARGET_VERTICES
     return ComparedMotion(
-        data.mesh,
-        times[frames],
-        target,
-        bodies,
-        seen,
-        at_rest,
-        trials.gravity,
-        seen_from_below,
-        whole,
-        around,
-        observed,
+        mesh=data.mesh,
+        times=times[frames],
+        measured=trials.target[row][frames][:, points],
+        positions={m: at_times(film.positions[m], film.times, times[frames]) for m in models},
+        markers={m: trials.positions[m][row][frames][:, points] for m in models},
+        bound=trials.bound[points],
+        gravity=trials.gravity,
+        from_below=from_below,
+        target=None if trials.labels else trials.target[row][frames],
+        obstacles=data.obstacles_at(film.trial, times[frames]),
+        observed=observed if trials.labels else TARGET_VERTICES,
     )
 
 
 def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return a film, a view in space and a few instants of a trial and, where vertices are observed, its tip."""
+    """Returns a film, a view in space and a few instants of a trial and, where vertices are observed, its tip."""
     motion, trials = motion_of(data), data.trials
     if motion is None or trials is None:
         return None
     models = list(motion.positions)
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
-    colours = f"Grey: {MODELS[models[0]][0]}. " if len(models) > 1 else ""
-    colours += f"Blue: {MODELS[models[-1]][0]}."
+    colours = f"Grey: {MODELS[models[0]].name}. " if len(models) > 1 else ""
+    colours += f"Blue: {MODELS[models[-1]].name}."
     blocks: list[Block] = []
-    if "video" in canvas.started:
+    # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
+    if data.sees_markers and len(motion.times) > 1:
         views = "from the side and from below" if motion.from_below else "the whole body, and its markers from nearby"
         pace = "four times slower than real time" if motion.is_fast else "in real time"
         caption = Markup(
             "The trial {}, {}: {}. {} Dots: {}; rings: simulated. The film lies in <code>figures/motion.mp4</code>."
         ).format(name, pace, views, colours, motion.observed)
-
-        def film(path: Path) -> Drawn:
-            canvas.started["video"].result()
-            alt = "The simulated bodies and what was observed, in motion"
-            return replace(Drawn.of(path, alt, caption), name="video")
-
-        blocks += canvas.attempt("motion.mp4", film)
+        alt = "The simulated bodies and what was observed, in motion"
+        blocks.append(
+            canvas.rendered(
+                "motion.mp4",
+                lambda renderer: write_film(canvas.folder / "motion.mp4", motion.film(), renderer),
+                lambda path, _: replace(Drawn.of(path, alt, caption), name="video"),
+            )
+        )
     blocks += _in_space(data, name)
     blocks += [] if data.sees_markers else _tip_figure(data, trials, canvas)
     same = "The same trial" if blocks else f"The trial {name}"
-    blocks += canvas.attempt("motion.png", lambda _: _instants_figure(data, motion, same, colours, canvas))
+    instants = canvas.rendered(
+        "motion.png",
+        lambda renderer: draw(motion.scene(), renderer),
+        lambda _, frames: _instants_figure(data, motion, frames, same, colours, canvas),
+    )
     where = ", beyond the training loads" if name in data.others else ""
-    return Part(f"One test trial: {name}{where}", blocks)
+    return Part(f"One test trial: {name}{where}", [*blocks, instants])
 
 
 def _in_space(data: RunReport, name: str) -> list[Block]:
     """Returns an interactive view of the bodies of all models."""
-    from .view import view_in_space
-
     motion = motion_of(data, every_model=True)
     if motion is None:
         return []
     if (count := len(motion.times)) > _MOST_FRAMES:
         motion = motion.at(np.unique(np.linspace(0, count - 1, _MOST_FRAMES).round().astype(int)))
-    shown, compared = shown_models(motion.positions), "markers" if data.sees_markers else "vertices"
-    against = "the measured ones" if data.sees_markers else "the target"
+    compared, against = ("markers", "the measured ones") if data.sees_markers else ("vertices", "the target")
     caption = (
         f"The trial {name} in space: drag to turn, with Shift to move, pinch or scroll to zoom; arrow keys turn, plus "
         f"and minus zoom, the space bar plays, comma and full stop step, 0 resets. Colours show the distance of the "
         f"{compared} of the solid body from {against}, from zero to the largest in this trial."
     )
-    alt = f"An interactive view of the bodies of {', '.join(MODELS[model][0] for model in motion.positions)} in motion."
-    return [view_in_space("view", motion, shown, unbroken(caption), alt)]
+    alt = (
+        f"An interactive view of the bodies of {', '.join(MODELS[model].name for model in motion.positions)} in motion."
+    )
+    return [view_in_space("view", motion, shown_models(motion.positions), unbroken(caption), alt)]
 
 
-def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours: str, canvas: Canvas) -> Drawn:
-    """Shows the body at a few instants, each with a second view of its markers."""
-    from . import figures
-
-    frames = canvas.started["pictures"].result()  # (F, H, 2 W, 4)
+def _instants_figure(
+    data: RunReport, motion: ComparedMotion, frames: Pixels, name: str, colours: str, canvas: Canvas
+) -> Drawn:
+    """Shows the body at a few instants (F, H, 2 W, 4), each with a second view of its markers."""
     titles = [f"{motion.times[frame]:.2f} s" for frame in motion.instants]
     caption, when = f"{name} at {len(titles)} instants, one with the largest error of the grey body.", ", ".join(titles)
     if len(motion.times) == 1:  # A pose.
@@ -149,7 +156,7 @@ def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours
         caption += f" {colours} Dots: the target’s tip; rings: simulated."  # noqa: RUF001
     last = list(motion.positions)[-1]
     if data.metrics["errors_mm"][last]["diverged"]:
-        caption += f" Where {MODELS[last][0]} is not drawn, it has diverged."
+        caption += f" Where {MODELS[last].name} is not drawn, it has diverged."
     alt = f"The deformed body at {when}, with observed and simulated markers."
     count, height, width, _ = frames.shape
     figure = figures.new_figure(4.0 * height / width * figures.WIDE / count + 0.35)
@@ -164,8 +171,6 @@ def _instants_figure(data: RunReport, motion: ComparedMotion, name: str, colours
 
 def _tip_figure(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
     """Draws the tip over time and, below it, the distance of each model's tip from that of the target."""
-    from . import figures
-
     if not trials.moves or not len(data.tip):
         return []
     row = trials.worst
@@ -176,7 +181,7 @@ def _tip_figure(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[B
     axis, time = int(np.argmax(np.ptp(target, axis=0))), trials.times[row]
     figure = figures.new_figure(3.9)
     motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    motion.plot(time, target[:, axis], color=figures.TONES["target"].light, linewidth=4.0, label="Target")
+    motion.plot(time, target[:, axis], color=TONES["target"].light, linewidth=4.0, label="Target")
     reached = []
     for model, path in zip(drawn, paths, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
@@ -184,19 +189,133 @@ def _tip_figure(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[B
         motion.plot(time, path[:, axis], **figures.model_line(model))
         distance.plot(time, figures.positive(gap), **figures.model_line(model))
         largest = largest_text(np.where(np.isnan(gap), np.inf, gap))
-        reached.append(f"{MODELS[model][0]} leaves the target by up to {largest}")
+        reached.append(f"{MODELS[model].name} leaves the target by up to {largest}")
     figures.keep_in_view(motion, target[:, axis], 0.8)
     motion.set_ylabel(f"tip displacement\nalong {'xyz'[axis]} [mm]")
     figures.few_ticks(motion.yaxis, 5)
     figures.use_logarithm(distance)
     distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, np.nanmax(time)))
     figures.legend_above(figure, motion)
-    return [
-        canvas.figure(
-            "tip_displacement",
-            figure,
-            f"Tip displacement over time. {'; '.join(reached)}.",
-            "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
-            "the target’s, on a logarithmic axis.",  # noqa: RUF001
-        )
+    caption = (
+        "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
+        "the target’s, on a logarithmic axis."  # noqa: RUF001
+    )
+    return [canvas.figure("tip_displacement", figure, f"Tip displacement over time. {'; '.join(reached)}.", caption)]
+
+
+def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
+    """Returns the view of all bodies of a motion.
+
+    Args:
+        name: Its identifier on the page.
+        motion: With a target, vertices are compared with it; without one, markers are compared.
+        shown: Models that are shown at first.
+        caption: Below the view.
+        alt: Description of the view.
+    """
+    mesh, obstacles, surface = motion.mesh, motion.obstacles, surface_vertices(motion.mesh)
+    rest, faces = mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(mesh))
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    finite = partial(without_diverged, far=_DIVERGED * size)
+    places = np.stack([finite(q[:, surface], rest) for q in motion.positions.values()])  # (B, F, S, 3)
+    axes = motion_axes(motion.gravity, np.concatenate([rest[None], *places]))
+    points = np.concatenate([rest, places.reshape(-1, 3)])
+    centre, half = frame_of(np.concatenate([points, obstacles.near(points)]), axes)
+    has_markers, simulated, target = True, np.stack([*motion.markers.values()]), motion.measured
+    compared = np.arange(len(motion.bound))
+    if motion.target is not None:
+        has_markers, target, compared = False, motion.target, surface
+        simulated = np.stack([finite(q, mesh.vertices) for q in motion.positions.values()])
+    means = mean_distance(simulated, np.broadcast_to(target, simulated.shape))  # (B, F) [mm]
+    largest, shares = _error_shares(simulated[:, :, compared], target[:, compared], places)
+    models = [
+        {
+            "name": MODELS[model].name,
+            "light": TONES[model].light,
+            "dark": TONES[model].dark,
+            "shown": model in shown,
+            "largest": float(f"{most:.4g}"),
+            "means": [float(f"{mean:.4g}") if np.isfinite(mean) else None for mean in by_frame],
+        }
+        for model, most, by_frame in zip(motion.positions, largest, means, strict=True)
     ]
+    data = {
+        "times": [float(f"{time:.6g}") for time in motion.times],
+        "rest": _encoded(rest, "<f4"),
+        "faces": _encoded(faces, "<u4"),
+        "edges": _encoded(np.searchsorted(surface, face_edges(mesh)), "<u4"),
+        "sharp": _encoded(sharp_edges(rest, faces), "<u4"),
+        "obstacles": _encoded(obstacles.local, "<f4"),
+        "owners": _encoded(obstacles.owners, "<u4"),
+        "poses": _encoded(obstacles.poses, "<f4"),
+        "sides": _encoded(obstacles.triangles, "<u4"),
+        **_encoded_motion(places - rest, size),
+        "errors": None if has_markers else _encoded(np.rint(shares), "u1"),
+        "markers": motion.measured.shape[1] if has_markers else 0,
+        "measured": _encoded(motion.measured if has_markers else [], "<f4"),
+        "simulated": _encoded(simulated if has_markers else [], "<f4"),
+        "models": models,
+        **{"axes": axes.tolist(), "up": upwards(motion.gravity).tolist()},
+        **{"centre": centre.tolist(), "half": half.tolist()},
+        "colours": [to_hex(stop) for stop in colormaps[_COLOUR_MAP](np.linspace(0.0, 1.0, _STOPS))],
+        "ink": TONES["ink"]._asdict(),
+        **{"outline": OUTLINE, "solid": OBSTACLE, "seen": MEASURED},
+    }
+    payload = Markup(json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+    kind, speed = "markers" if has_markers else "vertices", 0.25 if motion.is_fast else 1.0
+    return ViewInSpace(name, caption, alt, payload, models, len(motion.times), speed, kind)
+
+
+def _error_shares(simulated: FloatArray, target: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The largest distances (B,) [mm] of points (B, F, P, 3) from a target (F, P, 3), and all over it, up to `_LEVELS`.
+
+    Frames in which a body (B, F, S, 3) is not drawn do not count.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        away = 1e3 * np.linalg.norm(simulated - target, axis=3)
+    drawn = np.isfinite(places.reshape(*places.shape[:2], -1).sum(axis=2))[..., None]  # (B, F, 1)
+    away = np.where(drawn, away, np.nan)
+    largest = np.where(np.isfinite(away), away, 0.0).max(axis=(1, 2), initial=0.0)
+    return largest, np.nan_to_num(_LEVELS * away / np.maximum(largest, 1e-300)[:, None, None])
+
+
+def _encoded_motion(displacements: FloatArray, size: float) -> dict[str, Any]:
+    """Basis of displacements (B, F, S, 3) of bodies of a size [m], with its scales, and their weights."""
+    basis, weights = reduced(displacements, _TOLERANCE * size, _MOST_MODES)
+    scales = np.maximum(np.abs(basis).max(axis=1), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
+    modes = _encoded(np.rint(basis / scales[:, None]), "<i2")
+    return {"modes": modes, "scales": scales.tolist(), "weights": _encoded(weights, "<f4")}
+
+
+def reduced(displacements: FloatArray, tolerance: float, most: int) -> tuple[FloatArray, FloatArray]:
+    """Returns the fewest singular vectors (K, 3 S) that represent displacements, and their weights (B, F, K).
+
+    Args:
+        displacements: (B, F, S, 3) [m] of S points in F frames of B bodies, NaN in frames that are left out.
+        tolerance: Largest error of a coordinate [m], unless it takes more vectors than `most`.
+        most: Largest number of vectors.
+
+    Returns:
+        Vectors of unit length, or one of zeros for bodies at rest, and weights [m], NaN in frames that are left out.
+    """
+    count, frames, *_ = displacements.shape
+    rows = displacements.reshape(count * frames, -1)
+    finite = np.isfinite(rows).all(axis=1)
+    remaining = rows[finite].copy()
+    _, left = np.linalg.eigh(remaining @ remaining.T)  # Most often there are fewer frames than coordinates.
+    basis = np.empty((0, rows.shape[1]))
+    while len(basis) < min(most, left.shape[1]) and np.abs(remaining).max(initial=0.0) > tolerance:
+        vector = left[:, -1 - len(basis)] @ remaining
+        vector /= np.linalg.norm(vector)
+        remaining -= np.outer(remaining @ vector, vector)
+        basis = np.concatenate([basis, vector[None]])
+    if not len(basis):  # At rest, a vector of zeros, whose weights tell which frames are finite.
+        basis = np.zeros((1, rows.shape[1]))
+    weights = np.full((len(rows), len(basis)), np.nan)
+    weights[finite] = rows[finite] @ basis.T
+    return basis, weights.reshape(count, frames, -1)
+
+
+def _encoded(values: npt.ArrayLike, kind: str) -> str:
+    """Encodes numbers for the script of the page."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")

@@ -1,47 +1,39 @@
-"""Self-contained HTML pages of text, tables and figures, and the formats of numbers."""
+"""Self-contained HTML pages of sections, which have texts, lists, tables, figures, films and views in space."""
 
 import base64
 import hashlib
 import logging
-import math
-import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
-import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from ..io.atomic import disk_full_error, is_disk_full
 from ..io.errors import DataFileError
 from ..io.files import write_text
-from ..learning.metrics import PublishedError
 from ..settings.run import RunSettings
 from .render import DrawingError, Renderer
+from .wording import NO_BREAK_SPACE, duration_text, flatten
 
 if TYPE_CHECKING:
     import rich.console
     import rich.table
-    from matplotlib.figure import Figure as Drawing
+    from matplotlib.figure import Figure
 
 _LOG = logging.getLogger(__name__)
-NO_BREAK_SPACE = "\u00a0"
-NONE = "\N{EN DASH}"
-MINUS = "\N{MINUS SIGN}"
-_TIMED = {  # Models whose computing times are shown.
+_TIMED: Final = {  # Models whose computing times are shown.
     "simulation": "Uncorrected simulator",
     "target": "Simulation with the true parameters",
     "resphys": "Simulation with the learned force",
     "inference": "of which the network",
 }
 _WIDEST, _NARROW = 1000, 78  # characters: beyond every table; terminals below it wrap the heads of rows as well
-_LEAST_DECIMAL = 1e-4  # Smaller numbers are written with a power of ten.
+Result = TypeVar("Result")
 
 
 class Cell(NamedTuple):
@@ -150,7 +142,7 @@ class Drawn:
     def of(cls, path: Path, alt: str, caption: str) -> "Drawn":
         """Returns a PNG or MP4 file as a picture or a film."""
         kind = {".png": "image/png", ".mp4": "video/mp4"}[path.suffix]
-        return cls(path.stem, caption, alt, data_address(path.read_bytes(), kind))
+        return cls(path.stem, caption, alt, _address(path.read_bytes(), kind))
 
 
 @dataclass(frozen=True)
@@ -167,7 +159,15 @@ class ViewInSpace:
     observed: str  # "markers" or "vertices".
 
 
-Block = Text | Items | PageTable | Drawn | ViewInSpace
+@dataclass(frozen=True)
+class Rendered:
+    """A picture or a film that the drawing process is working on; its block is made once all sections are."""
+
+    path: Path  # Of its file.
+    finish: Callable[[], Drawn]  # Waits for the process; raises a DrawingError where this machine cannot draw.
+
+
+Block = Text | Items | PageTable | Drawn | ViewInSpace | Rendered
 
 
 @dataclass(frozen=True)
@@ -183,73 +183,68 @@ class Canvas:
     """Draws the figures of a page into a folder."""
 
     folder: Path  # Of their files.
-    started: dict[str, "Future[Any]"] = field(default_factory=dict)  # Pictures drawn by other processes, by name.
-    missing: set[str] = field(default_factory=set)  # Reasons why pictures cannot be drawn on this machine.
-    renderer: Renderer = field(default_factory=Renderer)  # Of the pictures that are drawn here.
+    renderer: Renderer = field(default_factory=Renderer)  # Of pictures of bodies.
+    pool: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1))  # Waits for the renderer.
 
-    def figure(self, name: str, figure: "Drawing", alt: str, caption: str) -> Drawn:
-        """Return a figure with its description and caption, and save it as a PNG file of its name too."""
+    def figure(self, name: str, figure: "Figure", alt: str, caption: str) -> Drawn:
+        """Returns a figure with its description and caption, and saves it as a PNG file of its name too."""
         from . import figures
 
         figures.settle(figure)
         figures.save_png(figure, self.folder / f"{name}.png")
-        return Drawn(name, caption, alt, data_address(figures.themed_svg(figure, name), "image/svg+xml"))
+        return Drawn(name, caption, alt, _address(figures.themed_svg(figure, name), "image/svg+xml"))
 
-    def attempt(self, file: str, draw: Callable[[Path], Drawn]) -> list[Block]:
-        """Return a picture drawn into a file, or a sentence why it cannot be drawn, once for each reason.
+    def rendered(
+        self, file: str, draw: Callable[[Renderer], Result], finish: Callable[[Path, Result], Drawn]
+    ) -> Rendered:
+        """Starts to draw a picture or film of bodies, which other sections need not wait for.
 
-        Where it cannot be drawn, the file of an earlier page is removed.
+        Args:
+            file: Name of its file.
+            draw: Draws by a renderer, in another thread: figures of matplotlib belong to `finish`.
+            finish: Makes the block from the path and what was drawn, after all sections.
         """
         path = self.folder / file
-        try:
-            return [draw(path)]
-        except DrawingError as error:
-            path.unlink(missing_ok=True)
-            reason = f"{error}, then delete this page and run the same command again."
-            if reason in self.missing:
-                return []
-            _LOG.warning("the report lacks a picture: %s", error)
-            self.missing.add(reason)
-            return [Text(reason, path.stem, note=True)]
-
-
-@contextmanager
-def canvas_beside(path: Path) -> Iterator[Canvas]:
-    """Yield the canvas of a page, whose files are in the folder `figures` beside it, and apply the style of figures.
-
-    Raises:
-        DataFileError: A figure could not be written there.
-    """
-    from . import figures
-
-    folder = path.parent / "figures"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with figures.in_style():
-            yield Canvas(folder)
-    except OSError as error:
-        if is_disk_full(error):
-            raise disk_full_error(folder) from error
-        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
+        future: Future[Result] = self.pool.submit(draw, self.renderer)
+        return Rendered(path, lambda: finish(path, future.result()))
 
 
 def write_page(
-    path: Path, parts: Sequence[Part], run: RunSettings, verdict: Sequence[str], metrics: Mapping[str, Any]
+    path: Path,
+    sections: Callable[[Canvas], Iterable[Part | None]],
+    run: RunSettings,
+    verdict: Sequence[str],
+    metrics: Mapping[str, Any],
 ) -> None:
-    """Write the page of a run.
+    """Draws the sections and writes their page, with the files of its figures in `figures/` beside it.
+
+    The page is written to a temporary file first, so that it is never incomplete. Pictures that cannot be drawn on this
+    machine are replaced by a sentence with the reason.
 
     Args:
-        path: The page's file.
-        parts: Its sections.
+        path: The page's file, such as `report.html`; missing folders are made.
+        sections: Yields the sections, drawn on a canvas; None for those with nothing to show.
         run: Settings, with the title.
         verdict: Sentences below the title.
         metrics: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
 
     Raises:
-        DataFileError: The file cannot be written.
+        DataFileError: A file could not be written.
     """
     import jinja2
 
+    from . import figures
+
+    folder = path.parent / "figures"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with figures.in_style(), ThreadPoolExecutor(1) as pool, Renderer() as renderer:
+            canvas = Canvas(folder, renderer, pool)
+            parts = [*_finished([part for part in sections(canvas) if part is not None]), *_times(metrics)]
+    except OSError as error:
+        if is_disk_full(error):
+            raise disk_full_error(folder) from error
+        raise DataFileError(f"cannot write figures to {folder}: {error.strerror or error}") from error
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("warp_resphys", "report"),
         undefined=jinja2.StrictUndefined,
@@ -265,7 +260,7 @@ def write_page(
         title=run.heading,
         experiment=run.name,
         verdict=verdict,
-        parts=[*parts, *_times(metrics)],
+        parts=parts,
         script=Markup(script),
         digest=digest,
         kind_of=lambda block: type(block).__name__,
@@ -274,6 +269,30 @@ def write_page(
     )
     write_text(path, page)
     _LOG.debug("report written: %s", path)
+
+
+def _finished(parts: Sequence[Part]) -> Iterator[Part]:
+    """Yields the sections with their pictures of bodies, or a sentence why there are none, once for each reason.
+
+    Where one cannot be drawn, the file of an earlier page is removed.
+    """
+    missing = set[str]()
+    for part in parts:
+        blocks = list[Block]()
+        for block in part.blocks:
+            if not isinstance(block, Rendered):
+                blocks.append(block)
+                continue
+            try:
+                blocks.append(block.finish())
+            except DrawingError as error:
+                block.path.unlink(missing_ok=True)
+                reason = f"{error}, then delete this page and run the same command again."
+                if reason not in missing:
+                    _LOG.warning("the report lacks a picture: %s", error)
+                    missing.add(reason)
+                    blocks.append(Text(reason, block.path.stem, note=True))
+        yield replace(part, blocks=blocks)
 
 
 def _times(metrics: Mapping[str, Any]) -> Iterator[Part]:
@@ -290,86 +309,6 @@ def _times(metrics: Mapping[str, Any]) -> Iterator[Part]:
         yield Part("Time taken", [*tables, *memory])
 
 
-def number_text(value: float | None) -> str:
-    """Return a number with three digits, or two below 0.1, such as "1.07", "0.0038" or "4.3e-07"; None: diverged."""
-    if value is None:
-        return "diverged"
-    return f"{value:.1e}" if 0.0 < abs(value) < _LEAST_DECIMAL else f"{value:,.{_decimals(value)}f}"
-
-
-def _decimals(value: float) -> int:
-    return max(0, (2 if abs(value) >= 0.1 else 1) - math.floor(math.log10(abs(value)))) if value else 0
-
-
-def mm_text(value: float | None) -> str:
-    """Return a mean error with its unit; None stands for divergence."""
-    return number_text(value) + ("" if value is None else " mm")
-
-
-def largest_text(errors: NDArray[np.float64]) -> str:
-    """Return the largest of errors [mm] as text; NaN is left out, an infinite error has diverged."""
-    values = errors[~np.isnan(errors)]
-    return mm_text(float(values.max())) if len(values) and np.isfinite(values).all() else "infinity (it diverged)"
-
-
-def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a mean and its "± deviation", if there is one, with the same decimals."""
-    mean, std = summary["mean"], summary["std"]
-    if mean is None:
-        return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
-    if std is None:
-        return number_text(mean), ""
-    deviation = number_text(std) if mean < _LEAST_DECIMAL else f"{std:,.{_decimals(mean)}f}"
-    return number_text(mean), f"± {deviation}"
-
-
-def duration_text(seconds: float) -> str:
-    """Return a duration as "0.42 s", "12.3 s" or "3 min 05 s"."""
-    if seconds < 60.0:
-        return f"{seconds:.2f} s" if seconds < 10.0 else f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s"
-
-
-def published_parts(error: PublishedError) -> tuple[str, str]:
-    """Return mean and deviation as they were published: both with the same decimals."""
-    decimals = max(len(repr(float(part)).partition(".")[2]) for part in error)
-    return f"{error.mean:.{decimals}f}", f"± {error.std:.{decimals}f}"
-
-
-def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield settings as dotted keys, as on the command line, with their values."""
-    for key, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            yield from flatten(value, f"{prefix}{key}.")
-        elif isinstance(value, list | tuple):
-            yield f"{prefix}{key}", f"[{', '.join(map(str, value))}]"
-        else:
-            yield f"{prefix}{key}", "null" if value is None else str(value)
-
-
-def data_address(content: bytes, kind: str) -> str:
-    """Return content as a data address."""
+def _address(content: bytes, kind: str) -> str:
+    """Returns content as a data address."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-def significant(value: float, digits: int = 2) -> str:
-    """Return a number with some significant digits, without an exponent."""
-    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0}f}"
-
-
-def share_text(share: float) -> str:
-    """Return a share as a percentage, such as "63 %" or "99.8 %", with a digit of what is left of it."""
-    left = 100.0 * (1.0 - share)
-    digits = max(0, -math.floor(math.log10(left))) if left > 0.0 else 0
-    return f"{100.0 * share:.{digits}f} %".replace("-", MINUS)
-
-
-def unbroken(text: str) -> str:
-    """Return a text with no-break spaces between numbers and their units or symbols."""
-    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, text)  # noqa: RUF001
-
-
-def in_a_row(words: Sequence[str]) -> str:
-    """Return words as a list in a sentence: "a, b and c"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

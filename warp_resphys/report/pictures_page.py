@@ -1,8 +1,7 @@
 """The page of an identification from pictures: outlines on the pictures, their distances, and the parameters."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,23 +17,10 @@ from ..io.files import read_array, read_hdf5
 from ..learning.parameters import TILTS
 from ..pictures.seen import NEUTRAL
 from ..settings.run import RunSettings
-from .figures import TONES
 from .identification_section import parameter_rows
-from .page import (
-    NONE,
-    Block,
-    Cell,
-    Drawn,
-    PageTable,
-    Part,
-    Row,
-    Text,
-    canvas_beside,
-    number_text,
-    share_text,
-    write_page,
-)
+from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, write_page
 from .verdict import counted
+from .wording import NONE, TONES, number_text, share_text
 
 _NAMES: Final = {"undeformed": "an undeformed body", "simulation": "the uncorrected simulator"}
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}
@@ -117,7 +103,7 @@ def write_pictures_report(
     outlines: Path,
     picture: Callable[[str, int], NDArray[np.uint8]],
 ) -> None:
-    """Writes the page, and its figure into `figures/` beside it.
+    """Writes the page, see `write_page`.
 
     Args:
         path: of the page.
@@ -131,42 +117,32 @@ def write_pictures_report(
     Raises:
         DataFileError: a file cannot be read or written.
     """
-    results = [PictureResult(**row) for row in metrics["poses"]]
-    assert run.pictures is not None
-    played = run.pictures.simulated
-    as_played = {**dict.fromkeys(TILTS, 0.0), **NEUTRAL}
+    results, settings = [PictureResult(**row) for row in metrics["poses"]], run.pictures
+    assert settings is not None
+    played, as_played = settings.simulated, {**dict.fromkeys(TILTS, 0.0), **NEUTRAL}
     truth = {} if played is None else {**as_played, **start, **played.material, **played.corrections}
-    parameters = PageTable(
-        "Parameter",
-        ["Data sheet", "Identified", *(["True"] if truth else []), "At a bound"],
-        parameter_rows(identified, start, truth),
-        "± is one standard deviation in the Gauss-Newton approximation, for distances that are correlated along the "
-        "outlines.",
-    )
-    with canvas_beside(path) as canvas:
-        drawn = list[Block]()
-        panels = [(own, picture(own.pose, own.drawn)) for own in results if own.outline_mm["sysid"] is not None]
-        clouds = [own for own in results if own.cloud_mm["sysid"] is not None]
-        # Pictures without outlines are shown as well, where there is nothing else to see.
-        panels = panels or [(own, picture(own.pose, own.drawn)) for own in results if not clouds]
-        if panels:
-            drawn += canvas.attempt("outlines.png", partial(draw_outlines, panels, outlines))
-        if clouds:
-            up = [-np.array(run.pictures.poses[own.pose].gravity or run.gravity) for own in clouds]
-            drawn += canvas.attempt("clouds.png", partial(draw_clouds, list(zip(clouds, up, strict=True)), outlines))
-    write_page(
-        path,
-        [
-            Part("", [*drawn, distance_table(results)]),
-            Part("Identification", [parameters]),
-            Part("How it is compared", [Text(_HOW)]),
-        ],
-        run,
-        picture_verdict(results),
-        metrics,
-    )
+    columns = ["Data sheet", "Identified", *(["True"] if truth else []), "At a bound"]
+    panels = [(own, picture(own.pose, own.drawn)) for own in results if own.outline_mm["sysid"] is not None]
+    clouds = [own for own in results if own.cloud_mm["sysid"] is not None]
+    # Pictures without outlines are shown as well, where there is nothing else to see.
+    panels = panels or [(own, picture(own.pose, own.drawn)) for own in results if not clouds]
+    up = [-np.array(settings.poses[own.pose].gravity or run.gravity) for own in clouds]
+
+    def sections(canvas: Canvas) -> Iterator[Part]:
+        drawn: list[Block] = [draw_outlines(panels, outlines, canvas.folder / "outlines.png")] if panels else []
+        seen = list(zip(clouds, up, strict=True))
+        drawn += [draw_clouds(seen, outlines, canvas.folder / "clouds.png")] if seen else []
+        yield Part("", [*drawn, distance_table(results)])
+        yield Part("Identification", [PageTable("Parameter", columns, parameter_rows(identified, start, truth), _NOTE)])
+        yield Part("How it is compared", [Text(_HOW)])
+
+    write_page(path, sections, run, picture_verdict(results), metrics)
 
 
+_NOTE: Final = (
+    "± is one standard deviation in the Gauss-Newton approximation, for distances that are correlated along the "
+    "outlines."
+)
 _HOW: Final = (
     "A distance is the mean over both outlines of that to the closest point of the other, at the mean depth of the "
     "body; parts that a clamp hides do not count. The overlap is the common area over that of both together. The "
@@ -177,7 +153,7 @@ _HOW: Final = (
 
 
 def distance_table(results: Sequence[PictureResult]) -> PageTable:
-    """Return the distances, with a row for each pose."""
+    """Returns the distances, with a row for each pose."""
     others = {"Overlap": "overlap", "Cloud [mm]": "cloud_mm", "Tracked points [mm]": "points_mm"}
     others = {
         name: key

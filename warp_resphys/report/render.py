@@ -1,7 +1,8 @@
-"""Pictures and films of bodies: scenes, their views, and the process that draws them with pyvista, off screen.
+"""Pictures and films of scenes, drawn with pyvista off screen in a process of their own.
 
-Without a working OpenGL driver, VTK ends its process. Hence pyvista is imported in a separate process only,
-`warp_resphys.report.render_process`, which reads scenes and returns frames through pipes of this process alone.
+Without a working OpenGL driver, VTK ends its process. Hence pyvista is imported in a separate process only, whose
+program is `main`: it reads scenes from stdin until that is closed, and writes the pixels of every frame to stdout, and
+None after each scene.
 """
 
 import logging
@@ -13,178 +14,38 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..io.arrays import FloatArray, IntArray
+from ..io.arrays import FloatArray
 from ..io.atomic import atomic_path
 from ..io.errors import ResphysError
 from ..io.progress import Progress
-from ..mesh.mesh import Mesh
+from .layers import INK, OUTLINE, Layer, RenderScene
 
 Pixels = NDArray[np.uint8]
 
 _LOG = logging.getLogger(__name__)
-COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render_process")
+COMMAND: Final = (sys.executable, "-P", "-m", "warp_resphys.report.render")
 TIME_OUT: Final = 300.0  # [s] for a scene; a picture takes about one.
-LARGEST_RATE: Final = 25.0  # Frames a second of a film, at most.
-BODY: Final = "#a9bccf"
-CLAMPED: Final = "#33485e"
-MEASURED: Final = "#d55e00"  # Vermilion of Okabe and Ito (2008).
-INK: Final = "#1c2127"
-OUTLINE: Final = "#808891"  # Of the undeformed body: a grey that is visible on light and dark pages.
 TOWARDS_LIGHT: Final = (0.15, -0.75, 1.0)
-_FRAME: Final = 0.06  # Margin around the points in a view, over their longer side.
-_TILT: Final = (0.30, 0.30)  # Of the view, to the right and upwards.
-_HANGING: Final = 0.7  # Least cosine between gravity and the axis of a hanging body.
-_LEVEL: Final = 1.2  # Tilt of the view of a path in a level plane, towards its near side.
-_UPRIGHT: Final = 0.3  # Tilt of the view of a path in an upright plane, upwards.
+_FAR: Final = 20.0  # Distance of the eye, in half heights of the view.
+_PEELS: Final = 12  # Sorted layers of translucent surfaces.
+_SAMPLES: Final = 8  # Samples a pixel, in scenes that are not sorted.
+_CORNERS: Final = 48  # Of a ring.
+_RING_WIDTH: Final = 2.5  # [px]
 _CODEC: Final = ["-f", "mp4", "-crf", "23", "-preset", "fast", "-threads", "1", "-movflags", "+faststart", "-bitexact"]
 
 
 class DrawingError(ResphysError):
     """A picture that cannot be drawn on this machine."""
-
-
-@dataclass(frozen=True, eq=False)
-class Layer:
-    """An object of a scene. Moving points have a first axis of F frames; it is not drawn where they are not finite."""
-
-    kind: str  # surface, lines, balls, rings (towards the viewer), slice or slice_edges (of solid cells, by a plane).
-    points: FloatArray  # (P, 3) or (F, P, 3) [m] corners, or centres of balls and rings, which are hidden one by one.
-    cells: IntArray | None = None  # (S, 3) triangles, (E, 2) lines or (C, 4 | 8) solid cells.
-    colour: str = INK
-    size: float = 1.0  # Radius of balls and rings [m], or width of lines [px].
-    opacity: float = 1.0
-    light: tuple[float, float] | None = None  # Shares of ambient and scene light; None draws the plain colour.
-    shift: float = 0.0  # Towards the viewer [m].
-    plane: FloatArray | None = None  # (2, 3) normal and point of a plane; of a surface, the part behind it is drawn.
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A view of layers, by parallel projection."""
-
-    layers: Sequence[Layer]  # In the order in which they are drawn.
-    axes: FloatArray  # (3, 3) rows: to the right, up, towards the viewer.
-    focus: FloatArray  # (3,) or (F, 3) [m] point in the middle.
-    half_height: float  # Of the view [m].
-    legend: Sequence[tuple[str, str]] = ()  # Texts and colours, at the top.
-
-
-@dataclass(frozen=True, eq=False)
-class RenderScene:
-    """Views side by side, and their drawing options."""
-
-    views: Sequence[View]
-    size: Sequence[int]  # (2,) width and height of each view [px]; even for a film.
-    background: str | None = None  # A colour; None for a transparent one.
-    sorts: bool = False  # Whether translucent surfaces are sorted by depth, which excludes smooth edges.
-    texts: Sequence[str] = ()  # One for each frame, in the first view, before its legend.
-    fps: float = LARGEST_RATE  # Of a film.
-
-
-def view_axes(towards_viewer: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> FloatArray:
-    """Return orthonormal rows (3, 3): to the right, up, towards the viewer."""
-    towards = np.array(towards_viewer, dtype=np.float64)
-    right = np.cross(np.array(up, dtype=np.float64), towards)
-    rows = np.stack([right, np.cross(towards, right), towards])
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-
-
-def upwards(gravity: FloatArray) -> FloatArray:
-    """Return the direction (3,) against gravity; z where there is no gravity."""
-    length = float(np.linalg.norm(gravity))
-    return -gravity / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-
-
-def hangs(mesh: Mesh, fixed: IntArray, gravity: FloatArray) -> tuple[bool, FloatArray]:
-    """Return whether a body hangs from its clamp, and the distances (N,) of its vertices from the clamp [m]."""
-    start = mesh.vertices[fixed].mean(axis=0) if len(fixed) else mesh.vertices[0]
-    away = mesh.vertices - start
-    axis = away.mean(axis=0)
-    size = float(np.linalg.norm(axis) * np.linalg.norm(gravity))
-    return bool(size > 0.0 and axis @ gravity > _HANGING * size), np.linalg.norm(away, axis=1)
-
-
-def motion_axes(gravity: FloatArray, positions: FloatArray) -> FloatArray:
-    """Return axes (3, 3) as `view_axes`, whose right is the direction of largest extent or motion across gravity.
-
-    Args:
-        gravity: (3,) direction of gravity; -z is taken for zero.
-        positions: (T, N, 3) [m], the first frame at rest; NaN is left out.
-    """
-    up = upwards(gravity)
-    points = positions[np.isfinite(positions).all(axis=2)]
-    flat = points - np.outer(points @ up, up)
-    _, _, directions = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-    right = directions[0] - (directions[0] @ up) * up
-    right /= np.linalg.norm(right)
-    moved = np.nanmax(np.linalg.norm(positions - positions[0], axis=2), axis=0)  # (N,)
-    towards_end = moved @ (positions[0] - positions[0].mean(axis=0))
-    right = -right if towards_end @ right < 0.0 else right
-    return view_axes(np.cross(right, up) + _TILT[0] * right + _TILT[1] * up, up)
-
-
-def axes_from_below(axes: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Return axes (3, 3) of a view from below with the same right as the given axes.
-
-    Args:
-        axes: (3, 3) of a view in which gravity points down or away.
-        gravity: (3,) direction of gravity; -z is taken for zero.
-    """
-    towards = -upwards(gravity)
-    return np.stack([axes[0], np.cross(towards, axes[0]), towards])
-
-
-def path_axes(plane: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Return axes (3, 3) as `view_axes`, in which letters in a plane are readable.
-
-    Args:
-        plane: (2, 3) directions to the right and upwards in the plane.
-        gravity: (3,) direction of gravity.
-    """
-    up, normal = upwards(gravity), np.cross(*plane)
-    normal /= np.linalg.norm(normal)
-    level = float(normal @ up)
-    near = plane[1] / np.linalg.norm(plane[1])
-    return view_axes(normal - _LEVEL * level * near + _UPRIGHT * (1.0 - level**2) * up, up)
-
-
-def frame_of(points: FloatArray, axes: FloatArray, margin: float = _FRAME) -> tuple[FloatArray, FloatArray]:
-    """Return the middle (3,) of points (P, 3), and half the width and height (2,) of a view that contains them [m].
-
-    Args:
-        points: [m]; those that are not finite are left out.
-        axes: (3, 3) of the view.
-        margin: On each side, over the longer side of the points.
-    """
-    turned = points[np.isfinite(points).all(axis=1)] @ axes.T
-    low, high = turned.min(axis=0), turned.max(axis=0)
-    extent = (high - low)[:2] + 2.0 * margin * (high - low)[:2].max()
-    return 0.5 * (low + high) @ axes, 0.5 * extent
-
-
-def picture_size(half: FloatArray, longer_side: float) -> list[int]:
-    """Return width and height [px] of a picture of a view, from half its width and height (2,) [m]."""
-    return [int(side) for side in np.ceil(longer_side * half / half.max())]
-
-
-def height_of(half: FloatArray, size: tuple[int, int]) -> float:
-    """Return half the height of a view of a size [px] that contains half a width and height (2,)."""
-    return float(max(half[1], half[0] * size[1] / size[0]))
-
-
-def chain(count: int) -> IntArray:
-    """Return lines (count - 1, 2) from points to the next ones."""
-    return np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
 
 
 class Renderer:
@@ -200,7 +61,7 @@ class Renderer:
         self.close()
 
     def close(self) -> None:
-        """End the process, as does garbage collection of the renderer; a further scene starts another."""
+        """Ends the process, as does garbage collection of the renderer; a further scene starts another."""
         if self._end is not None:
             self._end()
             self._end = None
@@ -218,7 +79,7 @@ class Renderer:
         self._end = weakref.finalize(self, _end, self._process, self._messages)
 
     def frames(self, scene: RenderScene) -> Iterator[Pixels]:
-        """Yield frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
+        """Yields frames (H, V * W, 3 | 4): red, green, blue and, without a background, opacity, from 0 to 255.
 
         All of them are to be taken before those of another scene.
 
@@ -245,7 +106,7 @@ class Renderer:
             timer.cancel()
 
     def _reason(self, *, late: bool) -> str:
-        """Why the process has ended."""
+        """Returns why the process has ended."""
         code = self._process.wait()
         self._messages.seek(0)
         said = self._messages.read().decode(errors="replace").strip()
@@ -266,26 +127,23 @@ def _end(process: subprocess.Popen[bytes], messages: IO[bytes]) -> None:
 
 
 def draw(scene: RenderScene, renderer: Renderer | None = None) -> Pixels:
-    """Return the frames (F, H, V * W, 3 | 4) of a scene, as from `Renderer.frames`.
+    """Returns the frames (F, H, V * W, 3 | 4) of a scene, as from `Renderer.frames`, whose errors it raises.
 
     Args:
         scene: What is drawn.
         renderer: Process that draws further scenes later, in place of a new one that ends with this scene.
-
-    Raises:
-        DrawingError: There is no pyvista, or no OpenGL driver that works off screen.
     """
     with Renderer() if renderer is None else nullcontext(renderer) as used:
         return np.stack(list(used.frames(scene)))
 
 
 def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None) -> None:
-    """Write a film (MP4, H.264) of a scene with a background and a text for every frame; shows its progress.
+    """Writes a film (MP4, H.264) of a scene with a background and a text for every frame; shows its progress.
 
     Args:
         path: Of the file.
         scene: With a background and a text for every frame.
-        renderer: Process that draws it, in place of a new one; it ends with the film.
+        renderer: Process that draws it, in place of a new one.
 
     Raises:
         DrawingError: There is no pyvista, no OpenGL driver that works off screen, or no encoder.
@@ -294,7 +152,7 @@ def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None)
     size = (scene.size[0] * len(scene.views), scene.size[1])
     options: dict[str, Any] = {"codec": "libx264", "quality": None, "ffmpeg_log_level": "error"}
     progress = Progress("video", len(scene.texts), "frames")
-    with atomic_path(path) as target, progress, renderer or Renderer() as used:
+    with atomic_path(path) as target, progress, Renderer() if renderer is None else nullcontext(renderer) as used:
         frames = used.frames(scene)
         first = next(frames)
         target.touch()  # Raises an error where the folder cannot be written.
@@ -303,9 +161,7 @@ def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None)
 
             encoder = imageio_ffmpeg.write_frames(str(target), size, fps=scene.fps, output_params=_CODEC, **options)
             encoder.send(None)
-            encoder.send(np.ascontiguousarray(first))
-            progress.advance()
-            for frame in frames:
+            for frame in chain([first], frames):
                 encoder.send(np.ascontiguousarray(frame))
                 progress.advance()
             encoder.close()
@@ -317,15 +173,171 @@ def write_film(path: Path, scene: RenderScene, renderer: Renderer | None = None)
             ) from error
 
 
-def pace(times: FloatArray, slower: float) -> tuple[IntArray, float]:
-    """Return the frames of a film of a motion at times (T,) [s], and its frame rate [Hz]."""
-    step = float(np.median(np.diff(times)))
-    every = max(1, round(1.0 / (slower * step * LARGEST_RATE)))
-    return np.arange(0, len(times), every), 1.0 / (slower * step * every)
-
-
 def _failure(reason: str) -> DrawingError:
     return DrawingError(
         f"pyvista cannot draw the deformed body on this machine ({reason}): install the Python package pyvista and "
         "an OpenGL driver that works without a display, such as libegl1 and libgl1-mesa-dri on Debian and Ubuntu"
     )
+
+
+def main() -> None:
+    """Draws scenes until there are no more."""
+    target = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # Keeps messages of VTK out of the frames.
+    source: Any = sys.stdin.buffer
+    drawer = _Drawer()
+    while source.peek(1):
+        for frame in drawer.frames(pickle.load(source)):
+            pickle.dump(np.ascontiguousarray(frame), target)
+        pickle.dump(None, target)
+        target.flush()
+
+
+class _Drawer:
+    """Draws scenes into a window, which is reused for scenes of the same layout."""
+
+    def __init__(self) -> None:
+        self._layout: tuple[Any, ...] = ()
+        self._plotter: Any = None
+
+    def _window(self, scene: RenderScene) -> Any:
+        """An empty window with a light."""
+        import pyvista
+
+        (width, height), count = scene.size, len(scene.views)
+        if self._layout != (layout := (width, height, count, scene.sorts)):
+            size = [count * width, height]
+            self._plotter = pyvista.Plotter(
+                shape=(1, count), off_screen=True, border=False, lighting="none", window_size=size
+            )
+            self._layout = layout
+            if scene.sorts:
+                self._plotter.render_window.SetMultiSamples(0)  # Depth peeling needs whole pixels.
+            else:
+                self._plotter.enable_anti_aliasing("msaa", multi_samples=_SAMPLES, all_renderers=True)
+        self._plotter.clear()
+        # Smooth edges of transparent pictures have a share of the background's colour.
+        self._plotter.set_background(scene.background or OUTLINE, all_renderers=True)
+        light = {"light_type": "scene light", "position": TOWARDS_LIGHT, "focal_point": (0.0, 0.0, 0.0)}
+        self._plotter.add_light(pyvista.Light(**light))
+        return self._plotter
+
+    def frames(self, scene: RenderScene) -> Iterator[Pixels]:
+        """Yields the pixels (H, V * W, 3 | 4) of each frame."""
+        plotter, layers = self._window(scene), []
+        plotter.suppress_rendering = True  # A reused window would render after each added object.
+        for column, view in enumerate(scene.views):
+            plotter.subplot(0, column)
+            layers += [_DrawnLayer(plotter, layer, view.axes) for layer in view.layers]
+            if scene.sorts:
+                plotter.enable_depth_peeling(_PEELS)
+        time = _add_texts(plotter, scene) if scene.texts else None
+        plotter.suppress_rendering = False
+        for frame in range(max(len(scene.texts), *(len(layer.points) for layer in layers))):
+            for layer in layers:
+                layer.move(frame)
+            if time is not None:
+                time.input = scene.texts[frame]
+            for column, view in enumerate(scene.views):
+                plotter.subplot(0, column)
+                focus, distance = _at(np.atleast_2d(view.focus), frame), _FAR * view.half_height
+                plotter.camera.position = focus + distance * view.axes[2]
+                plotter.camera.focal_point, plotter.camera.up = focus, view.axes[1]
+                plotter.enable_parallel_projection()
+                plotter.camera.parallel_scale = view.half_height
+                plotter.camera.clipping_range = (0.05 * distance, 2.0 * distance)
+            plotter.render()
+            picture = plotter.screenshot(None, transparent_background=not scene.background, return_img=True)
+            if not scene.background and not picture[..., 3].any():
+                raise RuntimeError("the picture is empty")
+            yield picture
+
+
+def _at(values: FloatArray, frame: int) -> Any:
+    """The value of a frame, of constant (1, ...) or moving (F, ...) values."""
+    return values[min(frame, len(values) - 1)]
+
+
+class _DrawnLayer:
+    """A layer in the current view, with corners or centres at its points (1 | F, P, 3)."""
+
+    def __init__(self, plotter: Any, layer: Layer, axes: FloatArray) -> None:
+        points = layer.points if layer.points.ndim == 3 else layer.points[None]
+        self.points = points + layer.shift * axes[2]
+        self.around: FloatArray | None = None  # (Q, 3) of a ball or ring around its centre.
+        cells = layer.cells
+        if layer.kind in ("balls", "rings"):
+            self.around, corners = _ball(layer.size) if layer.kind == "balls" else _ring(layer.size, axes)
+            cells = np.concatenate([corners + len(self.around) * place for place in range(points.shape[1])])
+        self.mesh = _mesh(layer, self._places(0), cells)
+        style = {"color": layer.colour, "opacity": layer.opacity, "smooth_shading": layer.kind == "balls"}
+        style["lighting"] = layer.light is not None
+        if layer.light is not None:
+            style |= {"ambient": layer.light[0], "diffuse": layer.light[1]}
+        if layer.kind in ("lines", "rings", "slice_edges"):
+            style["line_width"] = _RING_WIDTH if layer.kind == "rings" else layer.size
+        if layer.kind == "slice_edges":
+            style["style"] = "wireframe"
+        if self.mesh.n_cells:
+            plotter.add_mesh(self.mesh, **style)
+
+    def _places(self, frame: int) -> FloatArray:
+        """Positions (P Q, 3) of its points in a frame; points that are not finite are shrunk to zero size."""
+        points = _at(self.points, frame)
+        whole = np.isfinite(points).all(axis=1, keepdims=True)
+        if self.around is None:
+            return points if whole.all() else np.zeros_like(points)
+        centres = np.where(whole, points, 0.0)[:, None]
+        return (centres + np.where(whole[:, None], self.around, 0.0)).reshape(-1, 3)
+
+    def move(self, frame: int) -> None:
+        """Moves the layer to its positions in a frame."""
+        if len(self.points) > 1:
+            self.mesh.points = self._places(frame)
+
+
+def _mesh(layer: Layer, points: FloatArray, cells: Any) -> Any:
+    """The pyvista object of a layer."""
+    import pyvista
+
+    if layer.kind.startswith("slice"):
+        assert layer.plane is not None
+        solid = pyvista.CellType.HEXAHEDRON if cells.shape[1] == 8 else pyvista.CellType.TETRA
+        return pyvista.UnstructuredGrid({solid: cells}, points).slice(normal=layer.plane[0], origin=layer.plane[1])
+    if cells.shape[1] == 2:  # VTK expects the number of points before each line.
+        return pyvista.PolyData(points, lines=np.insert(cells, 0, 2, axis=1).ravel())
+    surface = pyvista.PolyData.from_regular_faces(points, cells)
+    return surface if layer.plane is None else surface.clip(normal=layer.plane[0], origin=layer.plane[1])
+
+
+def _ball(radius: float) -> tuple[FloatArray, Any]:
+    """Corners (Q, 3) and triangles (S, 3) of a ball."""
+    import pyvista
+
+    ball = pyvista.Sphere(radius=radius, theta_resolution=20, phi_resolution=20)
+    return np.asarray(ball.points), ball.regular_faces
+
+
+def _ring(radius: float, axes: FloatArray) -> tuple[FloatArray, Any]:
+    """Corners (Q, 3) and lines (Q, 2) of a ring that faces the viewer."""
+    angle = 2.0 * np.pi * np.arange(_CORNERS)[:, None] / _CORNERS
+    count = np.arange(_CORNERS)
+    return radius * (np.cos(angle) * axes[0] + np.sin(angle) * axes[1]), np.stack([count, np.roll(count, -1)], axis=1)
+
+
+def _add_texts(plotter: Any, scene: RenderScene) -> Any:
+    """Adds time and legends at the top, where controls of players do not hide them, and returns the time."""
+    top = scene.size[1] - 36
+    for column, view in enumerate(scene.views):
+        plotter.subplot(0, column)
+        left = 14 if column else 100
+        for name, colour in view.legend:
+            text = plotter.add_text(name, position=(left, top), font_size=12, color=colour)
+            text.prop.background_color, text.prop.background_opacity = "white", 0.75
+            left += 24 + 12 * len(name)
+    plotter.subplot(0, 0)
+    return plotter.add_text(scene.texts[0], position=(14, top), font_size=12, color=INK)
+
+
+if __name__ == "__main__":
+    main()

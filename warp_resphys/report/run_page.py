@@ -1,7 +1,6 @@
 """The page of a run, of a fold or over the folds: the errors, then sections on its other results."""
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,12 +9,12 @@ from markupsafe import Markup
 from ..io.errors import number_of
 from .body_section import body_section, paths_section
 from .control_section import control_section
-from .data import MODELS, RunReport, folds_in, trial_errors
-from .error_section import error_section
+from .data import RunReport, folds_in, trial_errors
+from .error_section import error_section, training_section
 from .identification_section import identification_section
 from .law_section import law_section
-from .motion_section import motion_section, start_drawing
-from .page import Canvas, Items, Part, Text, canvas_beside, mm_text, unbroken, write_page
+from .motion_section import motion_section
+from .page import Canvas, Items, Part, Text, write_page
 from .sections import (
     details_table,
     horizons_section,
@@ -24,8 +23,8 @@ from .sections import (
     shapes_section,
     trials_section,
 )
-from .training_section import training_section
 from .verdict import LEAST_TRIALS, results_table, verdict
+from .wording import MODELS, mm_text, unbroken
 
 _WITHOUT_RECORDINGS: Final = Markup(
     "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with noise on the "
@@ -42,34 +41,23 @@ _MOST_LABELS: Final = 6  # Markers that are named one by one.
 
 
 def write_report(path: Path, data: RunReport) -> None:
-    """Write the page, with its figures and the video in `figures/` beside it.
-
-    The page is written to a temporary file first, so that it is never incomplete. Pictures that cannot be drawn on this
-    machine are replaced by a sentence with the reason.
+    """Writes the page, see `write_page`.
 
     Args:
-        path: The page's file, such as `report.html`; missing folders are made.
+        path: The page's file, such as `report.html`.
         data: Data of the page.
-
-    Raises:
-        DataFileError: A file could not be written.
     """
-    with canvas_beside(path) as canvas, ThreadPoolExecutor(1) as pool:
-        # In another process, while this one draws figures.
-        canvas.started.update(start_drawing(data, canvas.folder, pool))
-        ready = sorted(SECTIONS, key=lambda section: section is motion_section)  # It waits for the other process.
-        made = {section: section(data, canvas) for section in ready}
-    parts = [part for section in SECTIONS if (part := made[section]) is not None]
-    write_page(path, parts, data.settings, verdict(data.metrics, data.settings), data.metrics)
+    said = verdict(data.metrics, data.settings)
+    write_page(path, lambda canvas: (s(data, canvas) for s in SECTIONS), data.settings, said, data.metrics)
 
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:
-    """Return the mean errors of the models."""
+    """Returns the mean errors of the models."""
     return Part("", [results_table(data.metrics, data.settings)])
 
 
 def details_section(data: RunReport, canvas: Canvas) -> Part:
-    """Return the errors of all models beside the published ones, their definition, and the trials beyond training."""
+    """Returns the errors of all models beside the published ones, their definition, and the trials beyond training."""
     synthetic = "laboratory" in data.settings.targets
     blocks: list[Any] = [Text(_WITHOUT_RECORDINGS, "synthetic")] if synthetic else []
     blocks += [details_table(data.metrics, data.settings), Text(_what_is_measured(data), "what", note=True)]
@@ -106,7 +94,7 @@ def _what_is_measured(data: RunReport) -> str:
         )
     reconstructed = data.metrics.get("reconstruction", {})
     learned = [
-        f"The reconstruction for {MODELS[model][0]} leaves the {of} of the training trials at a mean distance of "
+        f"The reconstruction for {MODELS[model].name} leaves the {of} of the training trials at a mean distance of "
         f"{mm_text(result['mean_mm'])} from the observed ones, {mm_text(result['max_mm'])} at most."
         for model, result in reconstructed.items()
     ]
@@ -132,7 +120,7 @@ def _contributions(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def when_text(first: Mapping[str, float]) -> str:
-    """Return when the first of some trials left the training range, in words; empty without any.
+    """Returns when the first of some trials left the training range, in words; empty without any.
 
     Args:
         first: Times [s] by trial.
@@ -146,7 +134,7 @@ def when_text(first: Mapping[str, float]) -> str:
 
 
 def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
-    """Return a sentence for each model on how many roll-outs left its training range, and when.
+    """Returns a sentence for each model on how many roll-outs left its training range, and when.
 
     Args:
         metrics: With `range`, by model, whose `first_s` has the times [s] at which trials left; and `scales_range`,
@@ -159,7 +147,7 @@ def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
         first = left_by[model]["first_s"]
         count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
         never = " never" * (len(trials) == 1 and not first)
-        text = f"{MODELS[model][0]}: {count}{never} left the training range{when_text(first)}."
+        text = f"{MODELS[model].name}: {count}{never} left the training range{when_text(first)}."
         if model == "resphys" and first and "law" in metrics.get("errors_mm", {}):
             text += " There the learned force fades out, and the law remains."
         scales = [scale for scale in sorted(beyond, key=float) if float(scale) != 1.0]

@@ -1,7 +1,6 @@
 """Sections of the page of a run: errors by trial, horizon and input, and its recordings."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
 
@@ -11,35 +10,21 @@ from ..data.recordings.marker_quality import QUALITY_COLUMNS, quality_table
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
 from ..settings.run import RunSettings
-from .data import (
+from .body_picture import registration_picture
+from .data import Driven, Errors, RunReport, folds_in, grouped_errors, missing_baselines, untrained
+from .page import Canvas, Cell, Drawn, Items, PageTable, Part, Row, Text
+from .verdict import error_cell, interval_text
+from .wording import (
     MODELS,
-    Driven,
-    Errors,
-    RunReport,
-    folds_in,
-    grouped_errors,
-    missing_baselines,
-    models_in_figures,
-    untrained,
-)
-from .page import (
     NONE,
-    Canvas,
-    Cell,
-    Drawn,
-    Items,
-    PageTable,
-    Part,
-    Row,
-    Text,
     error_parts,
     in_a_row,
+    models_in_figures,
     number_text,
     published_parts,
     share_text,
     unbroken,
 )
-from .verdict import error_cell, interval_text
 
 BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
@@ -51,7 +36,7 @@ _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places
 
 
 def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
-    """Return the errors of all models with their deviations and intervals, beside those that were published.
+    """Returns the errors of all models with their deviations and intervals, beside those that were published.
 
     With two groups of test trials, each has a column; published errors are of trials as in training.
 
@@ -78,7 +63,7 @@ def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
         }
     columns = {title: cells for title, cells in columns.items() if cells}
     rows, missing = [], missing_baselines(metrics)
-    for model, (name, meaning) in MODELS.items():
+    for model, (name, meaning, _) in MODELS.items():
         if model in errors or model in published or model in missing:
             small = "no force: no epoch of its training was kept" if model in idle else missing.get(model, meaning)
             rows.append(Row(name, [own.get(model, Cell(NONE)) for own in columns.values()], small=small))
@@ -86,7 +71,7 @@ def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
 
 
 def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Return the published errors by our model with which they are compared."""
+    """Returns the published errors by our model with which they are compared."""
     renamed = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
     return {renamed.get(model, model): published_parts(error) for model, error in published.items()}
 
@@ -99,7 +84,7 @@ def model_table(
     pages: Mapping[str, str] | None = None,
     small: Mapping[str, str] | None = None,
 ) -> PageTable:
-    """Return a table of cells by row and model.
+    """Returns a table of cells by row and model.
 
     Args:
         head: Above the first column.
@@ -116,16 +101,16 @@ def model_table(
         Row(n, [r.get(m, Cell(NONE)) for m in models], small=below.get(n, ""), address=addresses.get(n, ""))
         for n, r in rows.items()
     ]
-    return PageTable(head, [MODELS[model][0] for model in models], body, note)
+    return PageTable(head, [MODELS[model].name for model in models], body, note)
 
 
 def numbers(rows: Mapping[str, Mapping[str, float | None]]) -> dict[str, dict[str, Cell]]:
-    """Return the cells of numbers by row and model."""
+    """Returns the cells of numbers by row and model."""
     return {name: {m: Cell(number_text(value)) for m, value in row.items()} for name, row in rows.items()}
 
 
 def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors on each held-out trial, and what could explain the errors that remain."""
+    """Returns the errors on each held-out trial, and what could explain the errors that remain."""
     folds = folds_in(data.metrics)
     trials = {row["name"]: row for fold in folds for row in fold.get("per_trajectory", ())}
     covered = data.metrics.get("intervals", {}).get("models", {})
@@ -149,7 +134,7 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven | None) -> list[PageTable]:
-    """Return a table of what could explain the errors that remain; empty without fits.
+    """Returns a table of what could explain the errors that remain; empty without fits.
 
     Args:
         fits: Of metrics.json, by model; the model with the smallest error is shown.
@@ -173,10 +158,10 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven |
     averages = [fmean(row["left_mm"].get(key, row["as_is_mm"]) for row in fits[model]) for key in shown]
     body.append(Row("Mean", [Cell(number_text(mean)) for mean in (means[model], *averages)]))
     note = (
-        f"Mean error of {MODELS[model][0]} [mm], and what it would be with the inputs or the marker positions refitted "
-        "to the test trials, linearised about the identified simulator; below it, the refitted value. An improvement "
-        "by gain or offset may come from the calibration of the actuator, from physics that the simulator lacks, or "
-        "from the mesh; one by marker positions suggests a placement error."
+        f"Mean error of {MODELS[model].name} [mm], and what it would be with the inputs or the marker positions "
+        "refitted to the test trials, linearised about the identified simulator; below it, the refitted value. An "
+        "improvement by gain or offset may come from the calibration of the actuator, from physics that the simulator "
+        "lacks, or from the mesh; one by marker positions suggests a placement error."
     )
     note += gain_text(fits[model], driven) if driven is not None else ""
     columns = ["As it is", *(_REFITTED[key] for key in shown)]
@@ -184,7 +169,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven |
 
 
 def gain_text(fits: Sequence[Mapping[str, Any]], driven: Driven) -> str:
-    """Return what the refitted gains suggest; empty with fewer than three inputs, or where they remove little error.
+    """Returns what the refitted gains suggest; empty with fewer than three inputs, or where they remove little error.
 
     Args:
         fits: Of a model, by trial.
@@ -211,14 +196,14 @@ def gain_text(fits: Sequence[Mapping[str, Any]], driven: Driven) -> str:
 
 
 def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors by length of the roll-out."""
+    """Returns the errors by length of the roll-out."""
     table = horizon_table(data.metrics, PUBLISHED_WINDOWS_MM.get(data.settings.name, {}))
     title = "Longer than the training" if data.settings.train_fraction < 1.0 else "By length of the roll-out"
     return None if table is None else Part(title, [table])
 
 
 def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
-    """Return the errors over the first seconds of the roll-outs, with published ones below.
+    """Returns the errors over the first seconds of the roll-outs, with published ones below.
 
     Args:
         metrics: With `horizons` (a summary by seconds and model); None is returned without them.
@@ -234,28 +219,25 @@ def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[st
 
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the picture of the registered markers on the body at rest, and the residuals."""
+    """Returns the picture of the registered markers on the body at rest, and the residuals."""
     recordings = data.recordings
     if recordings is None:
         return None
     shown = f"The body at rest with the registered markers of the trial {recordings.worst}"
 
-    def picture(path: Path) -> Drawn:
-        from .body_picture import draw_registration
-
-        draw_registration(path, recordings, data.fixed, canvas.renderer)
-        caption = (
-            f"{shown}, which fits worst. Rings are nominal positions; a line leads to a marker outside of its ring."
-        )
-        return Drawn.of(path, f"{shown}, from two sides.", caption)
-
-    blocks = canvas.attempt("registration.png", picture)
+    caption = f"{shown}, which fits worst. Rings are nominal positions; a line leads to a marker outside of its ring."
+    picture = registration_picture(recordings, data.fixed)
+    drawn = canvas.rendered(
+        "registration.png",
+        picture.draw,
+        lambda path, pixels: Drawn.of(picture.save(path, pixels), f"{shown}, from two sides.", caption),
+    )
     mountings = mounting_table(recordings.registered)
-    return Part("Registration", [*blocks, residual_table(recordings.registered), *([mountings] if mountings else [])])
+    return Part("Registration", [drawn, residual_table(recordings.registered), *([mountings] if mountings else [])])
 
 
 def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
-    """Return how the mountings of rigid bodies differ between the trials that show them at rest; None without any."""
+    """Returns how the mountings of rigid bodies differ between the trials that show them at rest; None without any."""
     mounted = {trial: fit["mounting"] for trial, fit in residuals.items() if "mounting" in fit}
     if not mounted:
         return None
@@ -271,7 +253,7 @@ def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
 
 
 def residual_table(residuals: Mapping[str, Any]) -> PageTable:
-    """Return the residuals of the registration [mm] by trial and marker, of many markers in many trials the largest."""
+    """Returns the residuals of the registration [mm] by trial and marker, or the largest of many markers and trials."""
     labels = list(dict.fromkeys(label for fit in residuals.values() for label in fit["residual_mm"]))
     head, last = "Residual [mm]", "Root mean square"
     note = "Distance of each marker at rest from its nominal position after the rigid motion that fits best."
@@ -294,7 +276,7 @@ def residual_table(residuals: Mapping[str, Any]) -> PageTable:
 
 
 def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return tables of completeness and noise of the recordings."""
+    """Returns tables of completeness and noise of the recordings."""
     if data.recordings is None:
         return None
     quality = data.recordings.quality
@@ -316,7 +298,7 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Return the errors on other bodies, and where the law is outside of the stretches that it was learned at."""
+    """Returns the errors on other bodies, and where the law is outside of the stretches that it was learned at."""
     shapes: Mapping[str, Any] = data.metrics.get("shapes", {})
     if not shapes:
         return None
@@ -332,7 +314,7 @@ def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
-    """Return the errors by body and model, and the shares of the uncorrected simulator's error that are removed."""
+    """Returns the errors by body and model, and the shares of the uncorrected simulator's error that are removed."""
     models, rows = [model for model in MODELS if any(model in r["errors_mm"] for r in shapes.values())], []
     for name, result in shapes.items():
         errors, cells = result["errors_mm"], []
@@ -342,4 +324,4 @@ def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
             below = f"removes {share_text(1.0 - error / base)}" if removed else ""
             cells.append(Cell(number_text(error) if model in errors else NONE, below))
         rows.append(Row(name, cells, small=f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"))
-    return PageTable("Error on other bodies [mm]", [MODELS[model][0] for model in models], rows, note)
+    return PageTable("Error on other bodies [mm]", [MODELS[model].name for model in models], rows, note)

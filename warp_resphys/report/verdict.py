@@ -14,9 +14,10 @@ from ..learning.baselines import BASELINES
 from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
-from .data import MODELS, Errors, folds_in, grouped_errors, missing_baselines, untrained
+from .data import Errors, folds_in, grouped_errors, missing_baselines, untrained
 from .identification_section import in_sentence, with_unit
-from .page import Cell, PageTable, Row, mm_text, number_text, share_text, unbroken
+from .page import Cell, PageTable, Row
+from .wording import mm_text, model_words, number_text, share_text, unbroken
 
 LEAST_TRIALS: Final = 5  # with which an interval over trials is given
 CORRECTED: Final = ("sysid_elastic", "sysid", "law", "resphys_uncorrected", "resphys")
@@ -38,16 +39,6 @@ _ROWS: Final[Mapping[str, str]] = {  # Below that of the best model without phys
     "resphys": "+ learned force (ResPhys)",
     "resphys_uncorrected": "learned force on the uncorrected simulator",
 }
-_NAMES: Final = {
-    "rest": "a body that does not move",
-    "interpolation": "interpolation",
-    "regression": "kernel regression",
-    "linear": "a linear model",
-    "simulation": "the uncorrected simulator",
-    "sysid_elastic": "identification of E and \N{GREEK SMALL LETTER NU}",
-    "law": "the law of the material",
-    "resphys_uncorrected": "the learned force on the uncorrected simulator",
-}
 _NUMBERS: Final = ("no", "one", "two", "three", "four")
 _EQUAL: Final = 0.005  # share of an error below which there is no difference
 _CLOSE: Final = 1e-4  # distance from a bound or the first guess that counts as none, over a parameter's range
@@ -65,11 +56,6 @@ class Doubt(NamedTuple):
 
     fact: str
     remedy: str  # A sentence.
-
-
-def model_name(model: str) -> str:
-    """Returns the name of a model in a sentence."""
-    return _NAMES.get(model, MODELS[model][0])
 
 
 def known_errors(errors: Errors, without: Collection[str] = ()) -> Known:
@@ -109,7 +95,7 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
     last = next(reversed(groups.values()), {})
     best, mark = best_of(known_errors(last, idle), _RANKED), "best beyond the training" if len(groups) > 1 else "best"
     rows = []
-    if named := [model_name(model) for model in dict.fromkeys(plain.values()) if model]:
+    if named := [model_words(model) for model in dict.fromkeys(plain.values()) if model]:
         cells = [columns[title].get(model, Cell("")) for title, model in plain.items()]
         rows.append(Row(f"without physics ({', '.join(named)})", cells, mark * (best in BASELINES)))
     rows += [
@@ -118,7 +104,7 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
         if any(model in own for own in columns.values())
     ]
     of = "vertices" if settings.markers is None else "markers"
-    lacking = [f"{model_name(model)} ({why})" for model, why in missing_baselines(metrics).items()]
+    lacking = [f"{model_words(model)} ({why})" for model, why in missing_baselines(metrics).items()]
     note = f"Missing: {'; '.join(lacking)}." if lacking else ""
     return PageTable(f"{settings.heading}: mean error of the {of} [mm]", list(columns), rows, note)
 
@@ -146,9 +132,9 @@ def less_error(best: str, second: str, share: float) -> str:
         second: best model of the other kind; the kinds are the corrected simulators, and all other models.
         share: of the error of the second one that the best one removes.
     """
-    other = "anything without physics" if second in BASELINES else model_name(second)
+    other = "anything without physics" if second in BASELINES else model_words(second)
     other = "any corrected simulator" if best not in CORRECTED else other
-    name = f"{model_name(best)}, without physics," if best in BASELINES else model_name(best)
+    name = f"{model_words(best)}, without physics," if best in BASELINES else model_words(best)
     return f"{name} has {share_text(share)} less error than {other}"
 
 
@@ -166,7 +152,7 @@ def verdict(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
     beyond = "beyond the training loads, " if len(groups) > 1 else ""
     texts = [f"{beyond}{_best_text(known)}"] if known else ["all models diverged"]
     inside = best_of(known_errors(groups[0], idle), _RANKED) if len(groups) > 1 else ""
-    advice = [f"within them, {model_name(inside)} is {'enough' if inside in BASELINES else 'best'}"] if inside else []
+    advice = [f"within them, {model_words(inside)} is {'enough' if inside in BASELINES else 'best'}"] if inside else []
     if doubts := [*_failed(groups[-1], known, idle), *_doubts(metrics, settings, known, len(groups))]:
         advice += [f"check before use: {'; '.join(doubt.fact for doubt in doubts[:_MOST_DOUBTS])}", doubts[0].remedy]
     elif not inside:
@@ -180,12 +166,14 @@ def _best_text(known: Known) -> str:
     count = len(known[best])
     on = f"on {count} trial{'s' * (count > 1)}"
     if not corrected or not other:
-        return f"{model_name(best)} has the lowest error, {mm_text(fmean(known[best]))} {on}"
+        return f"{model_words(best)} has the lowest error, {mm_text(fmean(known[best]))} {on}"
     second = other if best == corrected else corrected
     gain = compared(known[second], known[best])
     if gain.share < _EQUAL or not is_clear(gain):
         word = "no" if gain.share < _EQUAL else "no significant"
-        return f"{model_name(best)} and {model_name(second)} show {word} difference {on}, {mm_text(fmean(known[best]))}"
+        return (
+            f"{model_words(best)} and {model_words(second)} show {word} difference {on}, {mm_text(fmean(known[best]))}"
+        )
     lower = sum(a < b for a, b in zip(known[best], known[second], strict=True))
     return f"{less_error(best, second, gain.share)} ({counted(lower, count, 'trial')})"
 
@@ -209,11 +197,11 @@ def _use(known: Known) -> Iterator[str]:
     """Yields which model to use: of those that are not clearly worse than the best one, the simplest simulator."""
     best = best_of(known, _RANKED)
     if best in BASELINES:
-        yield f"{model_name(best)} is enough for trials like these; to judge the simulator, test it on others"
+        yield f"{model_words(best)} is enough for trials like these; to judge the simulator, test it on others"
     elif best:
         chosen = next(m for m in _RANKED if m in known and m not in BASELINES and _as_good(known[m], known[best]))
-        simpler = f", which is simpler than {model_name(best)} and not significantly worse"
-        yield f"use {model_name(chosen)}{simpler * (chosen != best)}"
+        simpler = f", which is simpler than {model_words(best)} and not significantly worse"
+        yield f"use {model_words(chosen)}{simpler * (chosen != best)}"
 
 
 def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:
@@ -224,12 +212,12 @@ def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:
 def _failed(errors: Errors, known: Known, idle: Collection[str]) -> Iterator[Doubt]:
     """Yields corrections that diverged, or that no epoch of a training improved."""
     best = best_of(known, ("simulation", *CORRECTED))
-    use = f"use {model_name(best)}" if best else ""
+    use = f"use {model_words(best)}" if best else ""
     for model in (model for model in CORRECTED if model in errors):
         if lost := sum(error is None for error in errors[model]):
-            yield Doubt(f"{model_name(model)} diverged in {lost} of {len(errors[model])} trials", use)
+            yield Doubt(f"{model_words(model)} diverged in {lost} of {len(errors[model])} trials", use)
         elif model in idle:
-            yield Doubt(f"no epoch of the training of {model_name(model)} lowered the validation error", use)
+            yield Doubt(f"no epoch of the training of {model_words(model)} lowered the validation error", use)
 
 
 def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, groups: int) -> Iterator[Doubt]:
@@ -249,7 +237,7 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
         moved, gained = fmean(check["moved_mm"] for check in checks), fmean(known[base]) - error
         if moved > gained:
             text = f"a finer mesh moves the markers by {mm_text(moved)}"
-            yield Doubt(f"{text}, but {model_name(model)} gains {mm_text(gained)}", "refine the mesh first")
+            yield Doubt(f"{text}, but {model_words(model)} gains {mm_text(gained)}", "refine the mesh first")
     if 0 < count < LEAST_TRIALS:
         few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
         yield Doubt(f"{few} too few for an interval", "test on five trials or more")

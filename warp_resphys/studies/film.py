@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 from ..control.stages import driven_settings, replay
+from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
@@ -17,11 +18,11 @@ from ..io.progress import show
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..io.stages import finished_record
 from ..learning.baselines import BASELINES
-from ..report.bodies import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion
-from ..report.control_section import compared_controllers
-from ..report.data import MODELS, at_times, shown_models
-from ..report.obstacles import ObstacleSurface
-from ..report.render import DrawingError, RenderScene, hangs, write_film
+from ..report.data import at_times
+from ..report.layers import RenderScene
+from ..report.motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs
+from ..report.render import DrawingError, write_film
+from ..report.wording import MODELS, compared_controllers, shown_models
 from ..robot.loading import load, recorded_trial
 from ..robot.robot import Robot
 

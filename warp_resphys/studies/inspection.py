@@ -24,7 +24,7 @@ from ..mesh.mesh import Mesh, Place, boundary_triangles, connected_parts, quadra
 from ..mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
 from ..mesh.tetrahedra import SURFACE_SUFFIXES
-from ..report.body_picture import MeshSummary, draw_mesh
+from ..report.body_picture import MeshSummary, mesh_picture
 from ..settings.mesh import FileMesh, GeneratedArm, MeshSettings, PlaceSettings, SurfaceMesh
 from .recording_quality import RecordingInspection, inspect_recording
 
@@ -142,7 +142,8 @@ def inspect_mesh(
             surfaces = name_surfaces(mesh)
         write_mesh(file, mesh, surfaces)
     if picture is not None:
-        draw_mesh(picture, summary)
+        views = mesh_picture(summary)
+        views.save(picture, views.draw())
     return aligned(rows, left=2)
 
 

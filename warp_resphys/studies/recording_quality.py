@@ -32,7 +32,8 @@ from ..io.errors import DataFileError, InputError, listed
 from ..io.files import write_json
 from ..io.progress import aligned
 from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
-from ..report.figures import STYLE, TONES, new_figure, save_png
+from ..report.figures import STYLE, new_figure, save_png
+from ..report.wording import TONES
 from ..settings.trials import BagSettings, TableSettings
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.

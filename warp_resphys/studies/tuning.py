@@ -28,7 +28,8 @@ from ..io.progress import show
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
 from ..io.stages import StageInterrupted, run_stages
 from ..pipeline import acquire, learning_stages, prepare
-from ..report.page import PageTable, number_text
+from ..report.page import PageTable
+from ..report.wording import number_text
 from ..settings.learning import TrainingSettings
 from ..settings.run import RunSettings
 

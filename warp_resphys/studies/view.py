@@ -17,15 +17,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from ..data.camera import upwards
+from ..data.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError
 from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting
 from ..mesh.mesh import boundary_triangles, surface_vertices
-from ..report.bodies import sharp_edges
-from ..report.figures import TONES
-from ..report.obstacles import OBSTACLE, ObstacleSurface
-from ..report.render import MEASURED, upwards
+from ..report.layers import MEASURED, OBSTACLE, sharp_edges
+from ..report.wording import TONES
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
 from .live import LiveRobot, range_of

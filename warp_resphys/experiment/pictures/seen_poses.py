@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from ...data.camera import Lens, PlacedCamera, tag_poses
+from ...data.camera import Lens, PlacedCamera
 from ...data.markers import bind_markers
 from ...fem.body import Body
 from ...io.arrays import FloatArray, IntArray
@@ -36,6 +36,7 @@ from ...pictures.scene_files import (
     read_tracked,
 )
 from ...pictures.seen import Photo, SeenPose
+from ...pictures.tags import tag_poses
 from ...settings.body import MaterialSettings
 from ...settings.pictures import PictureData, PoseSettings
 from ...settings.stages import StageSettings

@@ -7,14 +7,12 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..data.registration import RigidTransform
 from ..energies.contact import GROWTH, MOTION, SHIFT, TURN, Contact
 from ..energies.obstacles import surface_of
 from ..fem.body import Body
 from ..io.arrays import FloatArray, IntArray
+from .registration import RigidTransform
 
-OBSTACLE: Final = "#b9b2a6"  # Colour of obstacles: a warm grey beside the blue of bodies.
-OBSTACLE_LIGHT: Final = (0.62, 0.42)
 _NEAR: Final = 0.2  # Width of the space around a body in which its obstacles are shown, over its size.
 
 

@@ -1,0 +1,213 @@
+"""Names and colours of the models and controllers that are compared, and formats of numbers and lists in sentences."""
+
+import math
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..learning.baselines import BASELINES
+from ..learning.metrics import PublishedError
+from ..settings.control import ControlSettings
+
+NO_BREAK_SPACE: Final = "\u00a0"
+NONE: Final = "\N{EN DASH}"
+MINUS: Final = "\N{MINUS SIGN}"
+_LEAST_DECIMAL: Final = 1e-4  # Smaller numbers are written with a power of ten.
+
+
+class ComparedModel(NamedTuple):
+    """What a model is called."""
+
+    name: str  # In tables and figures.
+    meaning: str  # In small print below it.
+    words: str = ""  # In a sentence; empty for its name.
+
+
+class Tone(NamedTuple):
+    """Colour of a role on a light page and on a dark one."""
+
+    light: str
+    dark: str
+
+
+# In the order of the tables.
+MODELS: Final[Mapping[str, ComparedModel]] = {
+    "rest": ComparedModel("At rest", "without physics: nothing moves", "a body that does not move"),
+    "interpolation": ComparedModel(
+        "Interpolation", "without physics: straight lines between the training trials", "interpolation"
+    ),
+    "regression": ComparedModel(
+        "Kernel regression", "without physics: ridge regression over the training trials", "kernel regression"
+    ),
+    "linear": ComparedModel(
+        "Linear model",
+        "without physics: linear from frame to frame, with powers of the inputs (DMDc)",
+        "a linear model",
+    ),
+    "published": ComparedModel("Published setting", "the simulator as the published code sets it up"),
+    "simulation": ComparedModel(
+        "Uncorrected simulator", "with the values of the data sheet", "the uncorrected simulator"
+    ),
+    "reconstruction": ComparedModel("Reconstruction", "the simulator with forces fitted to the test trial itself"),
+    "sysid_elastic": ComparedModel(
+        "SysID of E and ν",  # noqa: RUF001
+        "the elastic parameters that fit best",
+        "identification of E and \N{GREEK SMALL LETTER NU}",
+    ),
+    "sysid": ComparedModel("SysID", "the simulator with the parameters that fit best"),
+    "law": ComparedModel("Law", "the simulator with the identified law of its material", "the law of the material"),
+    "simfree": ComparedModel("SimFree", "a network in place of the simulator"),
+    "resphys_uncorrected": ComparedModel(
+        "ResPhys, data sheet",
+        "the learned force on the uncorrected simulator",
+        "the learned force on the uncorrected simulator",
+    ),
+    "resphys": ComparedModel("ResPhys", "the simulator with the learned force, which sees only the simulated state"),
+}
+# matplotlib draws the light tones, and `figures.themed_svg` replaces them, so they must differ.
+TONES: Final[Mapping[str, Tone]] = {
+    "ink": Tone("#1c2127", "#e4e7eb"),
+    "muted": Tone("#5c6670", "#9aa4af"),
+    "rule": Tone("#dde1e6", "#343b44"),
+    "target": Tone("#b4bcc6", "#5d6875"),
+    "rest": Tone("#7d6b4f", "#c8b594"),
+    "interpolation": Tone("#7d6b50", "#c8b595"),
+    "regression": Tone("#7d6b51", "#c8b596"),
+    "linear": Tone("#7d6b52", "#c8b597"),
+    "simulation": Tone("#c4481b", "#ff9a6c"),
+    "reconstruction": Tone("#1d7a55", "#62d2a2"),
+    "sysid": Tone("#7a4aa0", "#c9a2ea"),
+    "law": Tone("#0f766e", "#5eead4"),
+    "simfree": Tone("#8f6a00", "#e2bd4f"),
+    "resphys": Tone("#1a5fb4", "#7fb3f5"),
+    "published": Tone("#b0307b", "#f08bc5"),
+    "sysid_elastic": Tone("#a57cc4", "#d9bdf0"),
+    "resphys_uncorrected": Tone("#1f93b0", "#6fd0e8"),
+}
+# By prefix of a controller: name in words, and description.
+_CONTROLLERS: Final[Mapping[str, tuple[str, str]]] = {
+    "open_": ("{}, open loop", "planned once for the whole path, and played"),
+    "receding_linear": ("Linear model, receding horizon", "dynamic mode decomposition of the same recordings"),
+    "receding_": ("{}, receding horizon", "planned anew at each step, from an estimate by the markers"),
+    "feedback_": ("Jacobian feedback, {}/s", "with the measured Jacobian of the point by the inputs"),
+}
+
+
+def model_words(model: str) -> str:
+    """Returns the name of a model in a sentence."""
+    return MODELS[model].words or MODELS[model].name
+
+
+def shown_models(positions: Collection[str]) -> list[str]:
+    """Returns the models that are drawn as bodies: the uncorrected one, then the best available one."""
+    groups = (("simulation", "published"), ("resphys", "resphys_uncorrected", "law", "sysid", "sysid_elastic"))
+    return [model for group in groups for model in [m for m in group if m in positions][:1]]
+
+
+def models_in_figures(errors: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Returns the models that figures show: of those without physics only the one of least mean error."""
+    plain = [model for model in BASELINES if model in errors]
+    best = min(plain, key=lambda model: np.inf if (e := errors[model]["mean"]) is None else e, default="")
+    return [model for model in MODELS if model in errors and (model not in plain or model == best)]
+
+
+def controller_words(controller: str) -> tuple[str, str]:
+    """Returns the name and the description of a controller."""
+    prefix = next(prefix for prefix in _CONTROLLERS if controller.startswith(prefix))
+    name, meaning = _CONTROLLERS[prefix]
+    rest = controller.removeprefix(prefix)
+    return name.format(MODELS[rest].name if rest in MODELS else rest), meaning
+
+
+def controller_name(controller: str) -> str:
+    """Returns the name of a controller in words."""
+    return controller_words(controller)[0]
+
+
+def compared_controllers(control: ControlSettings) -> list[str]:
+    """Returns the names of the controllers that are drawn."""
+    models = [model for model in control.models if model in ("sysid", "law", control.models[-1])]
+    return [*(f"open_{model}" for model in models), *(f"receding_{model}" for model in control.receding[-1:])]
+
+
+def number_text(value: float | None) -> str:
+    """Returns a number with three digits, or two below 0.1, such as "1.07", "0.0038" or "4.3e-07"; None: diverged."""
+    if value is None:
+        return "diverged"
+    return f"{value:.1e}" if 0.0 < abs(value) < _LEAST_DECIMAL else f"{value:,.{_decimals(value)}f}"
+
+
+def _decimals(value: float) -> int:
+    return max(0, (2 if abs(value) >= 0.1 else 1) - math.floor(math.log10(abs(value)))) if value else 0
+
+
+def mm_text(value: float | None) -> str:
+    """Returns a mean error with its unit; None stands for divergence."""
+    return number_text(value) + ("" if value is None else " mm")
+
+
+def largest_text(errors: NDArray[np.float64]) -> str:
+    """Returns the largest of errors [mm] as text; NaN is left out, an infinite error has diverged."""
+    values = errors[~np.isnan(errors)]
+    return mm_text(float(values.max())) if len(values) and np.isfinite(values).all() else "infinity (it diverged)"
+
+
+def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns a mean and its "± deviation", if there is one, with the same decimals."""
+    mean, std = summary["mean"], summary["std"]
+    if mean is None:
+        return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
+    if std is None:
+        return number_text(mean), ""
+    deviation = number_text(std) if mean < _LEAST_DECIMAL else f"{std:,.{_decimals(mean)}f}"
+    return number_text(mean), f"± {deviation}"
+
+
+def duration_text(seconds: float) -> str:
+    """Returns a duration as "0.42 s", "12.3 s" or "3 min 05 s"."""
+    if seconds < 60.0:
+        return f"{seconds:.2f} s" if seconds < 10.0 else f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s"
+
+
+def published_parts(error: PublishedError) -> tuple[str, str]:
+    """Returns mean and deviation as they were published: both with the same decimals."""
+    decimals = max(len(repr(float(part)).partition(".")[2]) for part in error)
+    return f"{error.mean:.{decimals}f}", f"± {error.std:.{decimals}f}"
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yields settings as dotted keys, as on the command line, with their values."""
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            yield from flatten(value, f"{prefix}{key}.")
+        elif isinstance(value, list | tuple):
+            yield f"{prefix}{key}", f"[{', '.join(map(str, value))}]"
+        else:
+            yield f"{prefix}{key}", "null" if value is None else str(value)
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """Returns a number with some significant digits, without an exponent."""
+    return f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0}f}"
+
+
+def share_text(share: float) -> str:
+    """Returns a share as a percentage, such as "63 %" or "99.8 %", with a digit of what is left of it."""
+    left = 100.0 * (1.0 - share)
+    digits = max(0, -math.floor(math.log10(left))) if left > 0.0 else 0
+    return f"{100.0 * share:.{digits}f} %".replace("-", MINUS)
+
+
+def unbroken(text: str) -> str:
+    """Returns a text with no-break spaces between numbers and their units or symbols."""
+    return re.sub(r"(?<=\d) (?=(?:mm|kPa|s)\b|%)|(?<=\b[Eν]) (?=\d)", NO_BREAK_SPACE, text)  # noqa: RUF001
+
+
+def in_a_row(words: Sequence[str]) -> str:
+    """Returns words as a list in a sentence: "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -24,7 +24,7 @@ from support.main_job import IN_RUN, TINY, files, run, without_reports
 from support.scenes import body_scene
 from warp_resphys.io import atomic
 from warp_resphys.io.settings import Settings
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report import figures, render
 
 wp.config.log_level = wp.LOG_WARNING

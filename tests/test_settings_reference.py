@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 from support.configured import settings
 from warp_resphys.data.markers import KINDS
 from warp_resphys.experiment.experiment import MODELS
-from warp_resphys.fem.body import MASS_MODES
-from warp_resphys.fem.elements import VOLUME_INTEGRATIONS
+from warp_resphys.fem.bodies import MASS_MODES
+from warp_resphys.fem.integration_points import VOLUME_INTEGRATIONS
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.networks import ACTIVATIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings

@@ -20,9 +20,10 @@ from warp_resphys.energies.surfaces import SurfaceContact
 from warp_resphys.energies.tendons import Tendons
 from warp_resphys.environments.making import ball_mesh
 from warp_resphys.experiment.build import choose_device
-from warp_resphys.fem.body import Body
+from warp_resphys.fem.bodies import Body
 from warp_resphys.fem.scene import Scene
-from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 
 from .measuring import free_unknowns, now, solves, take_turns

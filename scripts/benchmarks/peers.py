@@ -30,10 +30,11 @@ from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.materials import StableNeoHookean
 from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.experiment.build import choose_device
-from warp_resphys.fem.body import Body
+from warp_resphys.fem.bodies import Body
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import Mesh, box_tetrahedra
+from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.mesh.quality import cell_volumes
+from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.stepping.state import State
 
 from .measuring import now, take_turns

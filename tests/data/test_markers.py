@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from warp_resphys.data.markers import KINDS, bind_markers
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.rotations import closest_rotation, twisted
 
 MESHES = {

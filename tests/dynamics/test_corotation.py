@@ -22,7 +22,8 @@ from warp_resphys.dynamics import equilibrium, hessian
 from warp_resphys.dynamics.corotation import Corotation
 from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.linalg.pardiso import has_pardiso
-from warp_resphys.mesh.mesh import Mesh, box_tetrahedra
+from warp_resphys.mesh.boxes import box_tetrahedra
+from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.stepping.inputs import Inputs
 
 pytestmark = pytest.mark.skipif(not has_pardiso(), reason="needs the package mkl, which x86 processors alone have")

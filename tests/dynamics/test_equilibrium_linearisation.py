@@ -9,7 +9,7 @@ from support.chambered import chambered
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, Tendons, select_vertices
 from warp_resphys.energies.materials import Gent
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))

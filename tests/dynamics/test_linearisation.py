@@ -12,7 +12,8 @@ from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.energies.placement import place_energies
 from warp_resphys.fem.coordinates import DeviceCoordinates
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import Mesh, box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.stepping.integrators import INTEGRATORS
 
 BOX = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))

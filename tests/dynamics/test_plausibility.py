@@ -12,9 +12,10 @@ from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.materials import ConvexMaterial, Corotated, StableNeoHookean
 from warp_resphys.energies.obstacles import HalfSpace
-from warp_resphys.fem.body import Body, Rigid
+from warp_resphys.fem.bodies import Body, Rigid
 from warp_resphys.io.errors import ResphysWarning
-from warp_resphys.mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.volume_mesh import Mesh, quadratic
 from warp_resphys.stepping.inputs import Inputs
 
 

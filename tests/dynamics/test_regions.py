@@ -20,7 +20,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.fem.body import Glue, Rigid
+from warp_resphys.fem.bodies import Glue, Rigid
 from warp_resphys.io.errors import InputError
 
 TIGHT = SolverSettings(relative_tolerance=1e-11)

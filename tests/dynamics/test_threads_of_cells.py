@@ -6,8 +6,9 @@ import torch
 from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.launcher import Launcher
-from warp_resphys.fem.body import Body
-from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.fem.bodies import Body
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
 

@@ -26,7 +26,7 @@ from warp_resphys import (
 from warp_resphys.energies.contact import Contact, vertex_areas, vertex_factors
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import select_cells
+from warp_resphys.mesh.selection import select_cells
 
 CPU = torch.device("cpu")
 TIGHT = SolverSettings("newton", relative_tolerance=1e-13)

@@ -21,7 +21,7 @@ from warp_resphys import (
 )
 from warp_resphys.energies.medium import Medium
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import boundary_faces
+from warp_resphys.mesh.volume_mesh import boundary_faces
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 

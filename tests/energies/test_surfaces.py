@@ -32,7 +32,8 @@ from warp_resphys.environments.making import ball_mesh
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels.contact import nearest_points
 from warp_resphys.kernels.contact import surface_pairs as kernels
-from warp_resphys.mesh.mesh import join, select_cells
+from warp_resphys.mesh.selection import select_cells
+from warp_resphys.mesh.volume_mesh import join
 
 CPU = torch.device("cpu")
 SOFT = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45)

@@ -27,7 +27,7 @@ from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings

@@ -7,7 +7,7 @@ from support.configured import check, composed, settings
 from warp_resphys.experiment.actuators import build_muscles, build_tendons
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.settings import parse
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.settings.body import MuscleSettings, TendonSettings
 
 HALVES = [

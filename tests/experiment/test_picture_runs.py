@@ -27,7 +27,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.io.files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import run_stages
-from warp_resphys.mesh.mesh import boundary_triangles
+from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
 from warp_resphys.pictures.scene_files import read_tracked
 from warp_resphys.report.pictures_page import PictureResult, picture_verdict

@@ -17,7 +17,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, StageInterrupted, run_stages
 from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
-from warp_resphys.mesh.mesh import box_tetrahedra
+from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
 from warp_resphys.report.error_section import mesh_text
 from warp_resphys.report.wording import NO_BREAK_SPACE

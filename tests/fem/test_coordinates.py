@@ -6,7 +6,7 @@ import torch
 
 from support.regions import beam, two_boxes
 from warp_resphys import Body, Mesh, box_tetrahedra, select_vertices
-from warp_resphys.fem.body import Glue, Rigid
+from warp_resphys.fem.bodies import Glue, Rigid
 from warp_resphys.fem.coordinates import Coordinates, DeviceCoordinates, barycentric, control_vertices
 from warp_resphys.io.errors import InputError
 

@@ -19,7 +19,7 @@ from warp_resphys import (
 )
 from warp_resphys.fem.scene import Scene
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.mesh.mesh import join
+from warp_resphys.mesh.volume_mesh import join
 
 SOFT = Corotated(2e5, 0.45)
 

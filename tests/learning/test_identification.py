@@ -15,7 +15,7 @@ from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.mesh.mesh import select_vertices
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 
 TRUTH = {"youngs_modulus": 215e3, "stiffness_damping": 0.002}

@@ -14,7 +14,8 @@ from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra(divisions=(4, 1, 1))

@@ -20,7 +20,8 @@ from warp_resphys.learning.nuisance import NuisanceFit
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.mesh.mesh import box_hexahedra, select_vertices
+from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.rotations import twisted
 

@@ -14,9 +14,9 @@ from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
 from warp_resphys.mesh.arm_section import SOLID, section_grids, section_quadrilaterals
 from warp_resphys.mesh.chambers import check_chambers, find_chambers
-from warp_resphys.mesh.mesh import boundary_faces, check_mesh, face_triangles
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces
+from warp_resphys.mesh.volume_mesh import boundary_faces, check_mesh, face_triangles
 
 SHIPPED = resources.files("warp_resphys") / "meshes"
 SHAPES = [

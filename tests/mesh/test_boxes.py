@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.mesh import boundary_triangles, check_mesh
+from warp_resphys.mesh.boxes import boxes_hexahedra
 from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.rod import boxes_hexahedra
+from warp_resphys.mesh.volume_mesh import boundary_triangles, check_mesh
 
 PLATE, SIDES, FIN = (
     ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06)),

@@ -8,9 +8,9 @@ import pyvista
 from warp_resphys import ResphysWarning, box_hexahedra, box_tetrahedra, read_mesh, read_surfaces
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.elements import ELEMENTS
-from warp_resphys.mesh.mesh import quadratic
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.mesh.readers import read_vertices
+from warp_resphys.mesh.volume_mesh import quadratic
 
 BAR = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))  # 12 vertices, two cells of 1000 mm^3 along x
 LEFT = [101, 102, 104, 103]  # numbers of the nodes of its face at x = 0

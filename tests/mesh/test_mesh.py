@@ -14,20 +14,19 @@ from hypothesis import strategies as st
 from warp_resphys.io import decoding
 from warp_resphys.io.arrays import IntArray
 from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.elements import ELEMENTS
-from warp_resphys.mesh.mesh import (
+from warp_resphys.mesh.quality import cell_volumes
+from warp_resphys.mesh.readers import read_mesh
+from warp_resphys.mesh.selection import select_vertices
+from warp_resphys.mesh.volume_mesh import (
     Mesh,
     boundary_faces,
     boundary_triangles,
-    box_hexahedra,
-    box_tetrahedra,
     check_mesh,
     quadratic,
-    select_vertices,
     surface_vertices,
 )
-from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.readers import read_mesh
 
 MESHIO_NAMES = {name: element.file_type for name, element in ELEMENTS.items()}
 BOXES = {

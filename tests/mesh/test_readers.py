@@ -5,7 +5,7 @@ import pytest
 
 from warp_resphys import Mesh, box_hexahedra, box_tetrahedra, read_mesh, read_surfaces, write_mesh
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.mesh import boundary_faces
+from warp_resphys.mesh.volume_mesh import boundary_faces
 
 
 def in_two(mesh):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.mesh import box_hexahedra, box_tetrahedra, check_mesh
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.mesh.rod import rod
 from warp_resphys.mesh.surface import locate
+from warp_resphys.mesh.volume_mesh import check_mesh
 
 AXIS = [[0.0, 0.0, 0.0], [0.0, 0.0, -0.3]]
 TAPER = [[0.0, 0.02], [0.3, 0.01]]

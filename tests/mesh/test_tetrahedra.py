@@ -6,9 +6,9 @@ import trimesh
 
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.chambers import find_chambers
-from warp_resphys.mesh.mesh import check_mesh
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.tetrahedra import fill_surface
+from warp_resphys.mesh.volume_mesh import check_mesh
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from warp_resphys import Body
 from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report.layers import obstacle_layers
 from warp_resphys.stepping.rotations import rotations
 

@@ -30,8 +30,9 @@ from warp_resphys.experiment.report import make_folds_report, read_driven, read_
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json, write_json
 from warp_resphys.io.stages import StageContext
-from warp_resphys.mesh.mesh import Mesh, box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
+from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.report import run_page
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst

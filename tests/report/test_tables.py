@@ -21,7 +21,7 @@ from warp_resphys.learning.metrics import (
     median_filter,
     published_errors,
 )
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, along_body, at_times, drawn_markers
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text

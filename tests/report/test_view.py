@@ -13,7 +13,8 @@ from support.made_up_run import arm_settings, vertex_settings, write_arm_run, wr
 from support.report_page import FAILING, Page, report
 from warp_resphys import Body, Capsule, Contact, Sphere
 from warp_resphys.data.obstacle_surface import ObstacleSurface
-from warp_resphys.mesh.mesh import boundary_triangles, box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.report import render
 from warp_resphys.report.layers import OBSTACLE
 from warp_resphys.report.motion_section import reduced, view_in_space

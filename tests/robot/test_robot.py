@@ -218,7 +218,7 @@ class TestFiles:
             assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(motion.times[-1])
             body = UsdGeom.Mesh(stage.GetPrimAtPath("/robot/body"))
             at = np.array(body.GetPointsAttr().Get(3.0))
-            kept = np.unique(warp_resphys.mesh.mesh.boundary_triangles(robot.simulator.body.mesh))
+            kept = np.unique(warp_resphys.mesh.volume_mesh.boundary_triangles(robot.simulator.body.mesh))
             np.testing.assert_allclose(at, motion.q[3, 0].numpy()[kept], atol=1e-6)
             faces = np.array(body.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
             corners = at[faces]

@@ -12,7 +12,7 @@ from warp_resphys.data.dataset import Dataset
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 
 GRAVITY = np.array([0.0, 0.02, -9.8])
 

@@ -6,7 +6,7 @@ import torch
 
 from support.configured import settings
 from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.mesh import box_hexahedra
+from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings

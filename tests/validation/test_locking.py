@@ -12,7 +12,7 @@ import torch
 
 from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, find_chambers
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
-from warp_resphys.mesh.mesh import quadratic
+from warp_resphys.mesh.volume_mesh import quadratic
 
 RUBBER = Corotated(264e3, 0.499, density=1070.0)
 CONVERGED = 31.63  # mm, under gravity

@@ -20,7 +20,7 @@ from ..io.errors import InputError
 from ..io.files import read_json
 from ..io.settings import parse
 from ..io.stages import finished_record
-from ..mesh.mesh import boundary_triangles
+from ..mesh.volume_mesh import boundary_triangles
 from ..robot.description import Description
 from ..robot.robot import Robot
 from ..robot.state import RobotState

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..energies.contact import MOTION, Contact
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.text import read_rows

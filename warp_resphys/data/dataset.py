@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from ..energies.strings import PAYLOAD, Strings
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5
-from ..mesh.mesh import select_vertices
+from ..mesh.selection import select_vertices
 from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations

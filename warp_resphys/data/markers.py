@@ -29,8 +29,8 @@ from typing_extensions import override
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_points
+from ..mesh.volume_mesh import Mesh
 from ..stepping.rotations import closest_rotation
 
 _LEAST_PATCH = 4  # number of vertices that determine the rotation of a patch

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..energies.contact import GROWTH, MOTION, SHIFT, TURN, Contact
 from ..energies.obstacles import surface_of
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.arrays import FloatArray, IntArray
 from .registration import RigidTransform
 

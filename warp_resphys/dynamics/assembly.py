@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
-from ..fem.elements import Points
+from ..fem.integration_points import Points
 from ..kernels import hessian_blocks as kernels
 from ..linalg.linear_solver import LinearSolver
 

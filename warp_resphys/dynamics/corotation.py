@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
-from ..fem.elements import SolidPoints
+from ..fem.integration_points import SolidPoints
 from ..kernels import vertex_rotations as kernels
 
 

@@ -18,7 +18,7 @@ from ..energies.obstacles import ObstacleMotion
 from ..energies.placement import DEPENDENT, PlacedEnergy, SimulatorStep
 from ..energies.potential import StepTerms
 from ..energies.surfaces import BoundSurfaceContact
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs

@@ -7,8 +7,8 @@ a slender body, as they buckle a column. Forces that rotate with the body do not
 import numpy as np
 import torch
 
-from ..fem.body import Body
-from ..fem.elements import mean_gradients
+from ..fem.bodies import Body
+from ..fem.integration_points import mean_gradients
 from ..stepping.rotations import rotations
 
 _ITERATIONS = 8  # of the polar decomposition; enough for stretches from 0.1 to 10

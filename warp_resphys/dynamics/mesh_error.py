@@ -20,7 +20,7 @@ import torch
 
 from ..energies.placement import PlacedEnergy
 from ..energies.solid import Solid
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import warn
 from ..mesh.elements import BY_NODES

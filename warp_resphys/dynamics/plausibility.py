@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from ..energies.contact import Contact
 from ..energies.materials import Material
 from ..energies.obstacles import HalfSpace
-from ..fem.body import Body
-from ..fem.elements import volume_points
+from ..fem.bodies import Body
+from ..fem.integration_points import volume_points
 from ..io.errors import warn
-from ..mesh.mesh import Mesh
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import LONGEST_DIAGONAL, SHORTEST_DIAGONAL
+from ..mesh.volume_mesh import Mesh
 
 SOFTEST: Final = 1e3  # Pa, of gels
 UNLIKELY: Final = (1e8, 1e9)  # Pa, stiffer than rubbers and softer than the plastics that hard parts are made of

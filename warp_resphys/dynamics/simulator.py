@@ -14,7 +14,7 @@ from ..energies.launcher import lasting
 from ..energies.materials import Corotated, Material
 from ..energies.obstacles import ObstacleMotion
 from ..energies.placement import Materials, SimulatorStep, joined_names, place_energies
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
 from ..io.machine import find_device

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..energies.obstacles import ObstacleMotion
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.errors import InputError
 from ..io.files import atomic_hdf5, create
 from ..mesh.motion_files import write_vtk

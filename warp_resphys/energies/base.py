@@ -23,11 +23,11 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from ..fem.body import Body
-from ..fem.elements import Points
+from ..fem.bodies import Body
+from ..fem.integration_points import Points
 from ..io.errors import InputError
 from ..kernels.points import MatrixPoints, VectorPoints
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Parameter, Quantity

@@ -7,11 +7,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fem.elements import principal_stretches, share_outside
+from ..fem.integration_points import principal_stretches, share_outside
 from ..io.classes import imported
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_json
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from .materials import MASS_DAMPING, ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 
 MATERIALS: Final[dict[str, type[Material]]] = {

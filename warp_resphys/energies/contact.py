@@ -36,11 +36,11 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points
+from ..fem.integration_points import Points
 from ..io.errors import InputError, listed, naming
 from ..kernels.contact import barriers as kernels
 from ..mesh.elements import FACES
-from ..mesh.mesh import Mesh, boundary_faces, face_triangles
+from ..mesh.volume_mesh import Mesh, boundary_faces, face_triangles
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations

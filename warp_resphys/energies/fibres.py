@@ -17,7 +17,7 @@ from typing_extensions import override
 from ..io.errors import InputError, MeshError
 from ..kernels.axial import axial_kernels
 from ..mesh.chambers import Chamber, face_rule
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher

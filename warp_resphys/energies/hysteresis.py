@@ -36,9 +36,9 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from ..fem.elements import Points
+from ..fem.integration_points import Points
 from ..kernels import plastic_sliders as kernels
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
 from .launcher import Launcher, warp_view
 from .solid import PointModuli, Solid

@@ -20,11 +20,11 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points
+from ..fem.integration_points import Points
 from ..io.errors import InputError
 from ..kernels import fluid_drag as kernels
 from ..mesh.elements import FACES
-from ..mesh.mesh import Mesh, boundary_faces
+from ..mesh.volume_mesh import Mesh, boundary_faces
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Constants

@@ -20,10 +20,10 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..fem.elements import physical_gradients
+from ..fem.integration_points import physical_gradients
 from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy, PointSet, Values, value_of
 from .launcher import Launcher

@@ -7,8 +7,8 @@ from typing import Any, TypeVar, cast
 
 import torch
 
-from ..fem.body import Body
-from ..fem.elements import Points
+from ..fem.bodies import Body
+from ..fem.integration_points import Points
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
 from ..stepping.state import Constants, ImplicitStage, State

@@ -25,11 +25,11 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points, physical_gradients
+from ..fem.integration_points import Points, physical_gradients
 from ..io.errors import InputError
 from ..kernels.energy_functions import pointwise_kernels
 from ..kernels.points import PartValues
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter
 from .base import Adjoint, Energy, PointSet, Term, Values, value_of
 from .launcher import Launcher, struct_of, warp_view

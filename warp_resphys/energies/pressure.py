@@ -18,7 +18,7 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels import follower_pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers, face_rule
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import Adjoint, Energy, PointSet, Values
 from .launcher import Launcher, warp_view

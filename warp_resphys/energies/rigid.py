@@ -21,11 +21,11 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.body import Body, Rigid
+from ..fem.bodies import Body, Rigid
 from ..fem.coordinates import barycentric, weighted_sum
-from ..fem.elements import Points, SolidPoints, volume_points
+from ..fem.integration_points import Points, SolidPoints, volume_points
 from ..kernels import vertex_rotations as kernels
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Mass
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of

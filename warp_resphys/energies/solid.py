@@ -12,12 +12,12 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.body import Body
-from ..fem.elements import Discretisation, Points, SolidPoints
+from ..fem.bodies import Body
+from ..fem.integration_points import Discretisation, Points, SolidPoints
 from ..io.errors import InputError
 from ..kernels import elasticity as kernels
 from ..kernels import lanes
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Constants, Mass
 from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, WholeCells, value_of

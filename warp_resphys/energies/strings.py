@@ -27,7 +27,7 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Constants, ImplicitStage, State

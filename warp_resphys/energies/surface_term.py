@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.elements import Points
+from ..fem.integration_points import Points
 from ..io.errors import InputError
 from ..kernels.contact import nearest_points
 from ..kernels.contact import surface_pairs as kernels

@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..fem.elements import Points
+from ..fem.integration_points import Points
 from ..fem.scene import Scene
 from ..io.errors import InputError, naming
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, value_of
 from .contact import ContactForces

@@ -29,8 +29,8 @@ from typing_extensions import override
 
 from ..io.errors import InputError
 from ..kernels import tendon_segments as kernels
-from ..mesh.mesh import Mesh
 from ..mesh.surface import locate
+from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import BoundEnergy, Energy, EnergySite, PointSet
 from .launcher import Launcher

@@ -19,10 +19,11 @@ from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact import Contact
 from ..energies.obstacles import HalfSpace
 from ..energies.surfaces import SurfaceContact
-from ..fem.body import Body, Rigid
+from ..fem.bodies import Body, Rigid
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh, boundary_triangles, box_hexahedra
+from ..mesh.boxes import box_hexahedra
+from ..mesh.volume_mesh import Mesh, boundary_triangles
 from ..robot.inputs import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot

@@ -19,10 +19,11 @@ from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
 from ..energies.surfaces import FrictionPair, SurfaceContact
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
-from ..mesh.mesh import Mesh, select_cells, select_vertices
+from ..mesh.selection import select_cells, select_vertices
+from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
 from ..settings.mesh import PlaceSettings
 from ..stepping.quantity import Quantity

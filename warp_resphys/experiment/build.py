@@ -22,17 +22,19 @@ from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import make_material
 from ..energies.materials import Material
-from ..fem.body import Body, Glue, Rigid
+from ..fem.bodies import Body, Glue, Rigid
 from ..fem.coordinates import SymmetryPlane
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError, naming
 from ..io.machine import find_device
 from ..mesh.arm import ArmGeometry, mesh_arm
-from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, check_mesh, join, quadratic, select_cells, select_vertices
+from ..mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
 from ..mesh.readers import read_mesh
-from ..mesh.rod import boxes_hexahedra, rod
+from ..mesh.rod import rod
+from ..mesh.selection import select_cells, select_vertices
 from ..mesh.tetrahedra import fill_surface
+from ..mesh.volume_mesh import Mesh, check_mesh, join, quadratic
 from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
 from ..settings.mesh import (
     BoxesMesh,

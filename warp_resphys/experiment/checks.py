@@ -20,13 +20,14 @@ from ..energies.base import Energy
 from ..energies.catalogue import read_law
 from ..energies.materials import ConvexMaterial, Material
 from ..energies.tendons import OFFSETS, Tendons
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.errors import InputError, naming
 from ..io.machine import available_memory_gib
 from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
-from ..mesh.mesh import select_vertices, surface_vertices
+from ..mesh.selection import select_vertices
+from ..mesh.volume_mesh import surface_vertices
 from ..settings.body import BodySettings, MaterialSettings
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox

@@ -12,7 +12,7 @@ from ..data.dataset import Dataset, read_dataset
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import WHOLE_STATE, Observation
 from ..dynamics.simulator import Simulator
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.files import read_json
 from ..learning.observed_motions import Identified, ObservedMotions
 from ..learning.parameters import split_name

@@ -25,7 +25,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.stages import StageContext
 from ..learning.replay import sample
-from ..mesh.mesh import select_vertices
+from ..mesh.selection import select_vertices
 from ..settings.stages import StageSettings
 from ..settings.trials import PlaySettings, Trial
 from ..stepping.inputs import Inputs

@@ -13,7 +13,7 @@ from ..data.markers import WHOLE_STATE
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import unit_of
 from ..energies.materials import MASS_DAMPING
-from ..fem.elements import principal_stretches
+from ..fem.integration_points import principal_stretches
 from ..io.arrays import FloatArray
 from ..learning.law import VISCOSITIES
 from ..learning.parameters import Bounds, Prior

@@ -21,7 +21,7 @@ from ..io.progress import show
 from ..io.stages import Stage, StageContext, package_versions, resources_used
 from ..learning.metrics import mean_distance
 from ..learning.reconstruction import follow, make_reconstructor, without_ringing
-from ..mesh.mesh import surface_vertices
+from ..mesh.volume_mesh import surface_vertices
 from ..settings.run import RunSettings
 from ..settings.stages import SIMULATOR, StageSettings
 from ..stepping.inputs import Inputs

@@ -16,15 +16,16 @@ from ..data.obstacle_surface import ObstacleSurface
 from ..data.rigid_bodies import as_markers, owners
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
-from ..fem.body import Body
-from ..fem.elements import principal_stretches, share_outside
+from ..fem.bodies import Body
+from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.files import read_array, read_hdf5, read_json
 from ..io.stages import StageContext, package_versions, resources_used
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
-from ..mesh.mesh import Mesh, select_vertices
+from ..mesh.selection import select_vertices
+from ..mesh.volume_mesh import Mesh
 from ..report.data import Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
 from ..report.wording import MODELS, models_in_figures
 from ..settings.run import RunSettings

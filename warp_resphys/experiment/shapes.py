@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..fem.elements import principal_stretches, share_outside
+from ..fem.integration_points import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
 from ..io.files import read_json, write_json
 from ..io.progress import Progress
 from ..io.stages import StageContext
 from ..learning.metrics import marker_errors, summarise
-from ..mesh.mesh import select_vertices
+from ..mesh.selection import select_vertices
 from ..settings.body import BodySettings, SimulatorSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.shapes import ShapeSettings

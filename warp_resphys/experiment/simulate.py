@@ -27,8 +27,9 @@ from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.fan_out import ALONE
 from ..io.stages import StageContext
-from ..mesh.mesh import Mesh, select_vertices
+from ..mesh.selection import select_vertices
 from ..mesh.surface import locate
+from ..mesh.volume_mesh import Mesh
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.stages import StageSettings

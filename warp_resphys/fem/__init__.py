@@ -1,4 +1,4 @@
 """Finite elements as integration points, and the bodies made of them.
 
-Public: `body.Body` and `body.PointMass`; `elements.discretise` and `elements.Points` for new energies.
+Public: `bodies.Body` and `bodies.PointMass`; `integration_points.discretise` and `Points` for new energies.
 """

@@ -19,7 +19,7 @@ import torch
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from .elements import Points
+from .integration_points import Points
 
 P = TypeVar("P", bound=Points)
 _ROUNDING = 1e-9  # weights up to this size are zero but for rounding

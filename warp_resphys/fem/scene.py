@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh, join
+from ..mesh.volume_mesh import Mesh, join
 from ..stepping.inputs import Inputs
-from .body import Body, BodyEnergy
+from .bodies import Body, BodyEnergy
 from .coordinates import Coordinates
 
 _FIELDS = ("external_force", "fixed_positions", "attached_mass")  # inputs with one value per vertex

@@ -1,4 +1,4 @@
 """Rest shapes: meshes, readers, mesh quality, surfaces, chambers, and parametric pneumatic arms.
 
-Public: `mesh.Mesh` and its boxes, `readers.read_mesh`, `chambers.find_chambers`, `arm.mesh_arm`.
+Public: `volume_mesh.Mesh`, `boxes`, `readers.read_mesh`, `chambers.find_chambers`, `arm.mesh_arm`.
 """

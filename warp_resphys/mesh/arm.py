@@ -17,8 +17,8 @@ from ..io.arrays import IntArray
 from ..io.errors import MeshError
 from .arm_section import SOLID, ComplexArray, Section, section_grids, section_quadrilaterals
 from .chambers import find_chambers
-from .mesh import Mesh, boundary_faces, check_mesh
 from .tetrahedra import tetrahedra_by_gmsh
+from .volume_mesh import Mesh, boundary_faces, check_mesh
 
 _PROFILES = ("half_disc", "disc", "sector")
 _OUTLINES = ("lobed", "round")
@@ -132,7 +132,7 @@ def mesh_arm(
         geometry: the arm.
         size: element size [m]; for hexahedra, the average edge length in the section, for walls, flat sides and arcs
             separately.
-        cells: "hexahedra" or "tetrahedra" (4-node; `mesh.quadratic` adds the midpoints).
+        cells: "hexahedra" or "tetrahedra" (4-node; `volume_mesh.quadratic` adds the midpoints).
         layers: height of the layers of hexahedra [m]; None: 2.5 times the size.
 
     Returns:
@@ -160,7 +160,7 @@ def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
     """Returns the surfaces of an arm that hangs along -z, by name.
 
     Returns:
-        (F, 3 | 4 | 6) faces as from `mesh.boundary_faces`: ``base`` and ``tip`` in the planes of the highest and lowest
+        (F, 3 | 4 | 6) faces as from `boundary_faces`: ``base`` and ``tip`` in the planes of the highest and lowest
         vertices, ``chamber_1`` and so on as from `chambers.find_chambers`, and ``outside``, the rest.
     """
     faces = boundary_faces(mesh)

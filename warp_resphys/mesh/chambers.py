@@ -14,7 +14,7 @@ from ..io.kernel_cache import ensure_kernel_cache, start_quietly
 from ..kernels.contact.signed_distances import blocked
 from ..kernels.modules import shareable
 from .elements import FACES, Rule, Shape
-from .mesh import Mesh, boundary_faces, boundary_triangles, connected_parts, face_triangles
+from .volume_mesh import Mesh, boundary_faces, boundary_triangles, connected_parts, face_triangles
 
 _SAME_HEIGHT = 0.05  # chambers with centres closer than this along the axis, over the body's length, are side by side
 _DIRECTIONS = 24  # rays per triangle, over the hemisphere of its normal
@@ -30,7 +30,7 @@ class Chamber:
     """A closed surface inside a body."""
 
     name: str  # name in results and messages
-    # (F, 3 | 4 | 6) vertices of the faces as from `mesh.boundary_faces`, counter-clockwise seen from outside the solid,
+    # (F, 3 | 4 | 6) vertices of the faces as from `boundary_faces`, counter-clockwise seen from outside the solid,
     # that is, from inside the chamber
     faces: NDArray[np.int64]
 

@@ -14,7 +14,7 @@ from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
 from ..io.files import write_text
-from .mesh import Mesh, boundary_triangles, surface_vertices
+from .volume_mesh import Mesh, boundary_triangles, surface_vertices
 
 _USD = (".usd", ".usda", ".usdc")
 _MARKER_SHARE = 0.02  # diameter of a marker, over the body's size

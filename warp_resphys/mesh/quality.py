@@ -4,7 +4,7 @@ import numpy as np
 
 from ..io.arrays import FloatArray, IntArray
 from .elements import ELEMENTS
-from .mesh import Mesh, boundary_faces
+from .volume_mesh import Mesh, boundary_faces
 
 
 def scaled_jacobian(mesh: Mesh) -> FloatArray:

@@ -15,7 +15,7 @@ from ..io.atomic import atomic_path
 from ..io.decoding import MESH_READERS, Arrays, decode, mesh_arrays
 from ..io.errors import DecodingError, MeshError, warn
 from .elements import ELEMENTS
-from .mesh import Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
+from .volume_mesh import Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}  # [m] length of one unit
 SHORTEST_DIAGONAL, LONGEST_DIAGONAL = 1e-3, 10.0  # plausible diagonals of a body [m]
@@ -65,7 +65,7 @@ def read_surfaces(
     """Reads the named surfaces of a mesh file: gmsh's physical groups, or the cell sets of other formats.
 
     Returns:
-        (F, 3 | 4 | 6) faces by name, as from `mesh.boundary_faces` of the mesh that `read_mesh` returns for the same
+        (F, 3 | 4 | 6) faces by name, as from `boundary_faces` of the mesh that `read_mesh` returns for the same
         arguments; empty without named surfaces. Those between two parts of the body are left out, with a warning.
 
     Raises:

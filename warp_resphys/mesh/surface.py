@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from .elements import Array, Element
-from .mesh import Mesh, boundary_triangles
+from .volume_mesh import Mesh, boundary_triangles
 
 _TIE = 1e-9  # difference up to which triangles are equally close, over the diagonal of the mesh
 _CANDIDATES = 16  # triangles that are tried first for a point
@@ -31,7 +31,7 @@ class ClosestPoints:
 def closest_points(mesh: Mesh, points: FloatArray) -> ClosestPoints:
     """Finds the closest points on the boundary of the rest shape.
 
-    Faces are split into triangles (`mesh.face_triangles`). Of triangles that share the closest edge, the one whose
+    Faces are split into triangles (`face_triangles`). Of triangles that share the closest edge, the one whose
     plane is farthest from the point is used.
 
     Raises:

@@ -15,9 +15,9 @@ import scipy.sparse
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import MeshError, naming
 from ..io.progress import QUIET_SECONDS, Progress
-from .mesh import Mesh, quadratic
 from .quality import cell_volumes
 from .readers import METRES, check_size
+from .volume_mesh import Mesh, quadratic
 
 _TETRAHEDRON, _TRIANGLE = 4, 2  # gmsh's numbers of linear cells
 _ANGLES = (40.0, 30.0, 20.0)  # angles between triangles above which their edge is preserved, tried in turn [deg]

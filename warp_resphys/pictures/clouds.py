@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 from ..data.camera import PlacedCamera
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh
 from ..mesh.surface import closest_of, closest_points
+from ..mesh.volume_mesh import Mesh
 from .outlines import Mask
 
 _STRAY: Final = 1.0  # % of the points that may lie far away in a direction, when their extent is measured

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh, boundary_triangles
+from ..mesh.volume_mesh import Mesh, boundary_triangles
 
 Mask = BoolArray
 

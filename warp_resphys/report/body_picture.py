@@ -18,9 +18,9 @@ from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..mesh.chambers import Chamber
 from ..mesh.elements import ELEMENTS
-from ..mesh.mesh import Mesh, boundary_triangles, face_triangles
 from ..mesh.plotting import BODY, FIXED
 from ..mesh.surface import closest_points
+from ..mesh.volume_mesh import Mesh, boundary_triangles, face_triangles
 from .data import Recordings
 from .figures import CHAMBER_COLOURS, WIDE, in_style
 from .layers import INK, MEASURED, Layer, RenderScene, View, chain, face_edges, obstacle_layers, sharp_edges, stems

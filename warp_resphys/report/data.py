@@ -13,7 +13,7 @@ from ..io.arrays import FloatArray, IntArray
 from ..learning.baselines import BASELINES
 from ..learning.metrics import PublishedError, mean_distance, published_errors
 from ..mesh.chambers import Chamber
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..settings.run import RunSettings
 from ..settings.trials import ReleaseFromLoad
 from ..stepping.quantity import Quantity

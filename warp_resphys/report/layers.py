@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from ..io.arrays import FloatArray, IntArray
-from ..mesh.mesh import Mesh, boundary_faces
+from ..mesh.volume_mesh import Mesh, boundary_faces
 
 INK: Final = "#1c2127"
 OUTLINE: Final = "#808891"  # Of the undeformed body: a grey that is visible on light and dark pages.

@@ -22,7 +22,7 @@ from ..data.camera import frame_of, motion_axes, upwards
 from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
 from ..learning.metrics import mean_distance
-from ..mesh.mesh import boundary_triangles, surface_vertices
+from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from . import figures
 from .data import Film, RunReport, TrialResults, at_times, shown_markers
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges

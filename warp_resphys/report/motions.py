@@ -10,8 +10,8 @@ from ..data.camera import axes_from_below, frame_of, height_of, motion_axes, pat
 from ..data.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..learning.metrics import mean_distance
-from ..mesh.mesh import Mesh, boundary_triangles
 from ..mesh.surface import closest_points
+from ..mesh.volume_mesh import Mesh, boundary_triangles
 from .layers import (
     BEHIND,
     MEASURED,

@@ -25,7 +25,7 @@ from ..learning.correction import Range
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings
 from ..settings.mesh import PlaceSettings

@@ -26,7 +26,7 @@ from ..learning.correction import (
 from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
-from ..mesh.mesh import Mesh
+from ..mesh.volume_mesh import Mesh
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
 from ..stepping.state import State

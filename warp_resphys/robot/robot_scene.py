@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Material
 from ..energies.surfaces import SurfaceContact
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..fem.scene import Scene
 from ..io.arrays import FloatArray
 from ..io.errors import InputError

@@ -106,7 +106,7 @@ class MaterialSettings(_Constants):
 
 
 class RigidSettings(Settings):
-    """A rigid region, such as an end cap or an insert, by `fem.body.Rigid`."""
+    """A rigid region, such as an end cap or an insert, by `fem.bodies.Rigid`."""
 
     density: Positive = setting(1200.0, unit="kg/m^3")
     stiffness: Positive = setting(1.0e9, "stiffness of the energy that penalises deformation", "Pa")
@@ -120,7 +120,7 @@ class PartSettings(Settings):
 
 
 class GlueSettings(Settings):
-    """Glue between regions whose cells do not match: vertices that follow another region, by `fem.body.Glue`."""
+    """Glue between regions whose cells do not match: vertices that follow another region, by `fem.bodies.Glue`."""
 
     region: Word = setting(description="region with the glued vertices")
     at: PlaceSettings = setting(description="where the glued vertices of that region lie")

@@ -26,15 +26,17 @@ from ..energies.pressure import Pressure
 from ..energies.surfaces import SurfaceContact
 from ..energies.tendons import Tendons
 from ..experiment.build import choose_device
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..fem.scene import Scene
 from ..io.errors import ResphysError
 from ..io.progress import Progress, show
 from ..io.settings import Settings, Word, setting
 from ..linalg.choice import LINEAR_SOLVERS
 from ..linalg.pardiso import has_pardiso
+from ..mesh.boxes import box_hexahedra, box_tetrahedra
 from ..mesh.chambers import find_chambers
-from ..mesh.mesh import Mesh, box_hexahedra, box_tetrahedra, select_vertices
+from ..mesh.selection import select_vertices
+from ..mesh.volume_mesh import Mesh
 from ..report.page import PageTable
 from ..stepping.inputs import Inputs
 from ..stepping.state import State

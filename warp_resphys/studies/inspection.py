@@ -13,17 +13,18 @@ from ..dynamics.mesh_error import NOTICED
 from ..dynamics.simulator import Simulator
 from ..energies.materials import Corotated
 from ..experiment.build import build_mesh
-from ..fem.body import Body
+from ..fem.bodies import Body
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.progress import aligned
 from ..io.settings import Many, Positive, Word, setting
 from ..mesh.arm import name_surfaces
 from ..mesh.chambers import find_chambers, open_cavities
-from ..mesh.mesh import Mesh, Place, boundary_triangles, connected_parts, quadratic, select_vertices
 from ..mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
+from ..mesh.selection import Place, select_vertices
 from ..mesh.tetrahedra import SURFACE_SUFFIXES
+from ..mesh.volume_mesh import Mesh, boundary_triangles, connected_parts, quadratic
 from ..report.body_picture import MeshSummary, mesh_picture
 from ..settings.mesh import FileMesh, GeneratedArm, MeshSettings, PlaceSettings, SurfaceMesh
 from .recording_quality import RecordingInspection, inspect_recording

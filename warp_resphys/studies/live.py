@@ -12,7 +12,7 @@ from ..energies.contact import MOTION, Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..mesh.mesh import surface_vertices
+from ..mesh.volume_mesh import surface_vertices
 from ..robot.inputs import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot

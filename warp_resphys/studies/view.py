@@ -23,7 +23,7 @@ from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError
 from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting
-from ..mesh.mesh import boundary_triangles, surface_vertices
+from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from ..report.layers import MEASURED, OBSTACLE, sharp_edges
 from ..report.wording import TONES
 from ..robot.inputs import BASE

@@ -13,14 +13,15 @@ from PIL import Image
 
 from ...data.camera import Lens, PlacedCamera
 from ...data.markers import bind_markers
-from ...fem.body import Body
+from ...fem.bodies import Body
 from ...io.arrays import FloatArray, IntArray
 from ...io.atomic import atomic_path, digest
 from ...io.errors import DataFileError, InputError, listed, naming, number_of
 from ...io.files import atomic_hdf5, create, read_array, read_hdf5
 from ...io.stages import StageContext
-from ...mesh.mesh import Mesh, quadratic, select_vertices
 from ...mesh.readers import METRES, read_mesh
+from ...mesh.selection import select_vertices
+from ...mesh.volume_mesh import Mesh, quadratic
 from ...pictures.clouds import Cloud
 from ...pictures.outlines import ClosedSurface, Outline
 from ...pictures.released_force import ReleasedForce

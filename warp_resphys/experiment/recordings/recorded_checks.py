@@ -9,9 +9,9 @@ from ...data.input_response import draw_inputs
 from ...data.markers import follow_vertices
 from ...data.registration import axes_rotation
 from ...data.rigid_bodies import owners
-from ...fem.body import Body
+from ...fem.bodies import Body
 from ...io.errors import InputError, listed, naming, number_of
-from ...mesh.mesh import select_vertices
+from ...mesh.selection import select_vertices
 from ...settings.run import RunSettings
 from ...settings.trials import MarkerSettings, RecordedData, Trial
 from ..actuators import Drive, drive_of

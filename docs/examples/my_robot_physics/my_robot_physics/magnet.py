@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_resphys.energies.pointwise import PointwiseEnergy, in_cells
 from warp_resphys.io.settings import Positive
-from warp_resphys.mesh.mesh import select_cells
+from warp_resphys.mesh.selection import select_cells
 from warp_resphys.settings.mesh import BoxSettings, Direction
 from warp_resphys.stepping.quantity import Quantity
 

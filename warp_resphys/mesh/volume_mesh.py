@@ -1,9 +1,9 @@
-"""Volume meshes: boxes, quadratic elements, boundaries, selections and mesh checks.
+"""Volume meshes: quadratic elements, boundaries and checks of a mesh.
 
 Nodes are in VTK order. Lengths are in metres; `mesh.readers` converts other units.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import MeshError
 from .elements import BY_NODES, ELEMENTS, FACES, Element
 from .plotting import Picture
-
-Extent = float | Sequence[float]  # a coordinate, or a range of coordinates
 
 LARGEST_COORDINATE = 1e50  # in any unit; products of three coordinates must be finite
 DEGENERATE_VOLUME = 1e-12  # smallest volume of a cell, over the cube of its longest edge
@@ -112,59 +110,6 @@ class Mesh:
         """Sizes and regions."""
         regions = f", regions {', '.join(self.regions)}" if self.regions else ""
         return f"Mesh({len(self.vertices)} vertices, {len(self.cells)} cells: {self.kind}{regions})"
-
-
-# Steps along x, y and z from the lowest corner.
-_BRICK_CORNERS = (ELEMENTS["hexahedron"].shape.nodes.astype(np.int64) + 1) // 2
-# Kuhn's six tetrahedra around the diagonal from corner 0 to corner 6. The diagonals of opposite faces are parallel, so
-# that neighbouring bricks conform.
-_BRICK_TETRAHEDRA = np.array([[0, a, b, 6] for a, b in ((1, 2), (2, 3), (3, 7), (7, 4), (4, 5), (5, 1))])
-
-
-def box_hexahedra(
-    size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3), nodes: int = 8
-) -> Mesh:
-    """Returns a box of equal bricks with one corner at the origin.
-
-    Vertex (i, j, k) has index (i (ny + 1) + j) (nz + 1) + k; cells are numbered the same way.
-
-    Args:
-        size: Lengths along x, y and z [m].
-        divisions: Numbers of bricks (nx, ny, nz) along the axes.
-        nodes: Nodes of a hexahedron: 8, 20 or 27; corners are numbered first.
-
-    Raises:
-        MeshError: A length is not positive and finite, a number is not a positive integer, or the element is unknown.
-    """
-    if nodes not in (8, 20, 27):
-        raise MeshError(f"hexahedra have 8, 20 or 27 nodes, not {nodes}")
-    sides, counts = np.asarray(size), np.asarray(divisions)
-    if sides.shape != (3,) or sides.dtype.kind not in "fiu" or not 0 < sides.min() <= sides.max() < np.inf:
-        raise MeshError(f"the size of a box must be three positive lengths in metres, not {size}")
-    if counts.shape != (3,) or counts.dtype.kind not in "iu" or np.any(counts < 1):
-        raise MeshError(f"the divisions of a box must be three positive integers, not {divisions}")
-    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(sides, counts, strict=True)]
-    vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    index = np.arange(len(vertices)).reshape(counts + 1)
-    mesh = Mesh(vertices, index[:-1, :-1, :-1].reshape(-1, 1) + index[tuple(_BRICK_CORNERS.T)])
-    return mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
-
-
-def box_tetrahedra(
-    size: Sequence[float] = (0.1, 0.03, 0.03), divisions: Sequence[int] = (10, 3, 3), order: int = 1
-) -> Mesh:
-    """Returns a box whose bricks are split into six conforming tetrahedra of equal volume each (Kuhn 1960).
-
-    The first vertices are those of `box_hexahedra` with the same size and divisions; order 2 gives 10-node cells.
-
-    Raises:
-        MeshError: As in `box_hexahedra`, or the order is neither 1 nor 2.
-    """
-    if order not in (1, 2):
-        raise MeshError(f"the order of tetrahedra must be 1 or 2, not {order}")
-    bricks = box_hexahedra(size, divisions)
-    mesh = Mesh(bricks.vertices, bricks.cells[:, _BRICK_TETRAHEDRA].reshape(-1, 4))
-    return quadratic(mesh) if order == 2 else mesh
 
 
 def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
@@ -280,51 +225,6 @@ def surface_vertices(mesh: Mesh) -> IntArray:
     return np.unique(boundary_faces(mesh))
 
 
-@dataclass(frozen=True)
-class Place:
-    """A plane, a slab or a box: each coordinate is free, one value, or a range.
-
-    Raises:
-        MeshError: no coordinate is given, or one is not a finite number or an ascending pair.
-    """
-
-    x: Extent | None = None  # [m]
-    y: Extent | None = None
-    z: Extent | None = None
-    tolerance: float = 1e-9  # [m]
-
-    def __post_init__(self) -> None:
-        """Checks the coordinates."""
-        if not self._given:
-            raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
-        for axis, at in self._given.items():
-            ends = np.atleast_1d(np.asarray(at, dtype=np.float64))
-            if ends.shape not in ((1,), (2,)) or not np.isfinite(ends).all() or ends[-1] < ends[0]:
-                raise MeshError(f"a selection of vertices at {axis} = {at}: give one number, or two that rise, in m")
-
-    @property
-    def _given(self) -> dict[str, Extent]:
-        named = {"x": self.x, "y": self.y, "z": self.z}
-        return {axis: at for axis, at in named.items() if at is not None}
-
-    def _spans(self) -> dict[str, tuple[float, float]]:
-        return {axis: (float(np.min(at)), float(np.max(at))) for axis, at in self._given.items()}
-
-    def holds(self, points: FloatArray) -> BoolArray:
-        """Returns (N,) whether points (N, 3) [m] lie in the place."""
-        inside = np.ones(len(points), dtype=bool)
-        for axis, (first, last) in self._spans().items():
-            along = points[:, "xyz".index(axis)]
-            inside &= (along >= first - self.tolerance) & (along <= last + self.tolerance)
-        return inside
-
-    def __str__(self) -> str:
-        return ", ".join(
-            f"{axis} = {first:g}" + (f" to {last:g}" if last > first else "")
-            for axis, (first, last) in self._spans().items()
-        )
-
-
 def join(meshes: Mapping[str, Mesh]) -> Mesh:
     """Returns a mesh of several meshes, without shared vertices.
 
@@ -349,58 +249,6 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
         regions |= {region: count + cells for region, cells in own.items()}
         first, count = first + len(mesh.vertices), count + len(mesh.cells)
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes.values()]), np.concatenate(cells), regions)
-
-
-def select_vertices(
-    mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
-) -> IntArray:
-    """Returns the vertices (S,) in a plane, a slab or a box, sorted.
-
-    Args:
-        mesh: The mesh.
-        x: A coordinate, or a range of coordinates [m].
-        y: Likewise [m].
-        z: Likewise [m].
-        tolerance: Tolerance of the coordinates [m].
-
-    Raises:
-        MeshError: No coordinate or an invalid one, or no vertex lies there.
-    """
-    place = Place(x, y, z, tolerance)
-    chosen = np.flatnonzero(place.holds(mesh.vertices))
-    if not len(chosen):
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        axes = [axis for axis, at in zip("xyz", (x, y, z), strict=True) if at is not None]
-        there = ", ".join(f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}" for axis in axes)
-        raise MeshError(
-            f"no vertex lies within {tolerance:g} m of {place} m: the mesh reaches {there} m; give a range for a face "
-            f"that is not flat, as in {axes[0]}=[{low['xyz'.index(axes[0])]:.3g}, "
-            f"{low['xyz'.index(axes[0])] + 0.1 * float(np.ptp(mesh.vertices[:, 'xyz'.index(axes[0])])):.3g}], or a "
-            "larger tolerance"
-        )
-    return chosen
-
-
-def select_cells(
-    mesh: Mesh,
-    x: Sequence[float] = (-np.inf, np.inf),
-    y: Sequence[float] = (-np.inf, np.inf),
-    z: Sequence[float] = (-np.inf, np.inf),
-) -> IntArray:
-    """Returns the cells (S,) with centres in a box, given by a range of coordinates along each axis [m].
-
-    Raises:
-        MeshError: no cell lies there.
-    """
-    corners = mesh.cells[:, : ELEMENTS[mesh.element.linear].nodes]
-    centres, box = mesh.vertices[corners].mean(axis=1), np.array([x, y, z], dtype=np.float64)
-    chosen = ((centres >= box[:, 0]) & (centres <= box[:, 1])).all(axis=1)
-    if not chosen.any():
-        asked = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, (low, high) in zip("xyz", box, strict=True))
-        ranges = zip("xyz", centres.min(axis=0), centres.max(axis=0), strict=True)
-        there = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, low, high in ranges)
-        raise MeshError(f"no cell has its centre within {asked} m: those of the mesh reach {there} m")
-    return np.flatnonzero(chosen)
 
 
 def _normalised_volumes(mesh: Mesh) -> tuple[FloatArray, FloatArray, FloatArray]:

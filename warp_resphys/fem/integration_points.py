@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..io.errors import InputError
 from ..mesh.elements import BY_NODES, Array, conical_simplex, gauss_box
-from ..mesh.mesh import Mesh, check_mesh
+from ..mesh.volume_mesh import Mesh, check_mesh
 
 VolumeIntegration = Literal["centre", "full"]
 VOLUME_INTEGRATIONS: tuple[VolumeIntegration, ...] = get_args(VolumeIntegration)
@@ -113,7 +113,7 @@ def discretise(
 
     Raises:
         InputError: an unknown volume integration.
-        MeshError: a mesh that cannot be used (see `mesh.check_mesh`).
+        MeshError: a mesh that cannot be used (see `volume_mesh.check_mesh`).
     """
     if volume_integration not in VOLUME_INTEGRATIONS:
         raise InputError(

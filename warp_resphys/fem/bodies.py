@@ -12,11 +12,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
-from ..mesh.mesh import Mesh
 from ..mesh.plotting import Picture
 from ..mesh.surface import locate
+from ..mesh.volume_mesh import Mesh
 from .coordinates import Coordinates, SymmetryPlane, rigid_weights
-from .elements import Discretisation, Points, discretise
+from .integration_points import Discretisation, Points, discretise
 
 MASS_MODES = ("row_sum", "per_vertex")
 
@@ -114,7 +114,7 @@ class Body:
     # every vertex the density times the mean element volume: wrong by a factor of two on the published beam, and meant
     # only for comparison with the published code
     mass: str = "row_sum"
-    volume_integration: str = "centre"  # ``centre`` or ``full`` (see `elements.discretise`)
+    volume_integration: str = "centre"  # ``centre`` or ``full`` (see `integration_points.discretise`)
     point_masses: Sequence[PointMass] = field(default=())  # attached weights
     energies: Sequence[BodyEnergy] = field(default=())  # energies besides the material: pressure, fibres
     rigid: Mapping[str, Rigid] = field(default_factory=dict)  # rigid parts, by region of the mesh

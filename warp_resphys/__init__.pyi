@@ -9,7 +9,7 @@ from .data.recordings.recording_files import read_recording as read_recording
 from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator
 from .dynamics.tape import record_rollout as record_rollout
-from .dynamics.trajectory import Trajectory as Trajectory
+from .dynamics.trajectory import Motion as Motion
 from .energies.base import Energy as Energy
 from .energies.catalogue import make_material as make_material
 from .energies.catalogue import read_material as read_material
@@ -84,11 +84,8 @@ from .pictures.seen import SeenPose as SeenPose
 from .robot.loading import load as load
 from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names
-from .robot.motion import Motion as Motion
 from .robot.robot import Robot as Robot
 from .robot.robot_scene import RobotScene as RobotScene
-from .robot.robot_scene import SceneState as SceneState
-from .robot.state import RobotState as RobotState
 from .stepping.inputs import Inputs as Inputs
 from .stepping.quantity import Quantity as Quantity
 from .stepping.state import State as State

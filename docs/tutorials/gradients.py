@@ -148,8 +148,8 @@ at_rest = wp.zeros_like(start, requires_grad=True)
 result = wp.zeros(1, dtype=wp.float64, requires_grad=True)
 chosen = wp.array(tip, dtype=wp.int32, device="cpu")
 with wp.Tape() as tape:
-    rollout = record_rollout(tape, simulator, start, at_rest, steps=10)
-    wp.launch(mean_height, dim=len(tip), inputs=[rollout.q, chosen, 10], outputs=[result])
+    path, _ = record_rollout(tape, simulator, start, at_rest, steps=10)
+    wp.launch(mean_height, dim=len(tip), inputs=[path, chosen, 10], outputs=[result])
 tape.backward(result)
 by_warp = wp.to_torch(start.grad)
 

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from warp_resphys.commands import CONFIG_PACKAGE
 from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.dynamics.trajectory import Trajectory
+from warp_resphys.dynamics.trajectory import Motion
 from warp_resphys.io.progress import Progress
 from warp_resphys.overrides import readable
 
@@ -68,7 +68,7 @@ def take_turns(
     return [{name: median(row[name] for row in own) for name in own[0]} for own in figures], median(yardsticks)
 
 
-def solves(path: Trajectory) -> dict[str, float]:
+def solves(path: Motion) -> dict[str, float]:
     """Returns the mean numbers of iterations and factorisations in a step of a roll-out."""
     counts = ("iterations", "factorisations")
     return {name: float(np.mean([getattr(r, name).double().mean().item() for r in path.reports])) for name in counts}

@@ -82,6 +82,6 @@ def test_simulations_are_printed_in_a_line():
     body = "Body(Mesh(20 vertices, 4 cells: hexahedron), 4 fixed vertices, Tendons)"
     assert repr(simulator) == f"Simulator({body}, Corotated, 10 ms, implicit_euler, torch.float64, cpu)"
     assert repr(path.final).startswith("State(q (1, 20, 3), v (1, 20, 3)")
-    assert repr(path) == "Trajectory(2 steps of 10 ms, q (3, 1, 20, 3), v (3, 1, 20, 3))"
+    assert repr(path) == "Motion: 2 steps of 10 ms, 1 environment, q (3, 1, 20, 3)"
     assert repr(inputs) == "Inputs(tendon_tension (1, 2))"
     assert repr(scene).startswith(f"Scene(a: {body}, b: Body(Mesh(20 vertices, 4 cells: hexahedron, regions body)")

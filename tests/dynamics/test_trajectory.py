@@ -20,7 +20,6 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.data.obstacle_surface import ObstacleSurface
-from warp_resphys.dynamics.trajectory import Trajectory
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)
@@ -31,8 +30,7 @@ SIMULATOR = Simulator(
 
 @pytest.fixture(scope="module")
 def trajectory():
-    moved = SIMULATOR.rollout(SIMULATOR.rest_state(), 3)
-    return Trajectory(moved.q, moved.v, moved.reports, moved.final, SIMULATOR.body, 0.01)
+    return SIMULATOR.rollout(SIMULATOR.rest_state(), 3)
 
 
 def test_a_file_has_times_and_units(trajectory, tmp_path):

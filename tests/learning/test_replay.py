@@ -13,9 +13,10 @@ from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, begin_inputs, estimate_release, hold, sideways_shapes
-from warp_resphys.learning.replay import Replay, Start, sample
+from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
+from warp_resphys.stepping.rollout import sample
 from warp_resphys.stepping.state import State
 
 

@@ -115,7 +115,7 @@ class TestRollouts:
 
     def test_its_markers_are_plotted(self, robot):
         motion = played(robot, 3)
-        axes = motion.plot("x")
+        axes = motion.plot(axis="x")
         assert [text.get_text() for text in axes.get_legend().get_texts()] == list(robot.labels)
         moved = 1e3 * (motion.markers[:, 0, :, 0] - motion.markers[0, 0, :, 0]).numpy()
         np.testing.assert_allclose(np.stack([line.get_ydata() for line in axes.lines], 1), moved)

@@ -48,7 +48,7 @@ def test_robots_without_contact_move_as_alone(finished):
         state = scene.step(state, inputs)
         alone = {name: robot.step(own, **inputs[name]) for name, own in alone.items()}
     for name, own in alone.items():
-        at = state.robots[name]
+        at = scene.state_of(state, name)
         assert float((own.q - robot.begin().q).abs().max()) > 1e-4
         torch.testing.assert_close(at.q, own.q, rtol=0.0, atol=1e-8)
         torch.testing.assert_close(at.v, own.v, rtol=0.0, atol=1e-5)
@@ -72,13 +72,13 @@ def test_robots_in_contact_push_one_another():
     for _ in range(12):
         state = scene.step(state, {"first": {"external_force": force}})
     acting = scene.scene.inputs({"first": Inputs(external_force=force[None])})
-    way = (state.body.q - start.body.q)[0]
+    way = (state.q - start.q)[0]
     assert float(way[scene.scene.vertex_slice("second"), 1].max()) > 1e-3  # by the first one
     assert float(way[scene.scene.vertex_slice("block"), 1].abs().max()) < 1e-3
-    assert float(state.robots["second"].q[0, :, 1].min()) < -1e-3  # in its own frame, which is turned
+    assert float(scene.state_of(state, "second").q[0, :, 1].min()) < -1e-3  # in its own frame, which is turned
     fall = way[scene.scene.vertex_slice("stone")] / (0.5 * np.linalg.norm(robot.simulator.gravity))
     assert float(fall.norm(dim=-1).std()) < 1e-9 < float(fall.norm(dim=-1).mean())
-    forces = scene.simulator.contacts(state.body, scene.step(state).body, acting, scene.constants)["surfaces"]
+    forces = scene.simulator.contacts(state, scene.step(state), acting, scene.constants)["surfaces"]
     assert 0.0 < float(forces.gap.min()) < CONTACT.distance
 
 
@@ -93,7 +93,7 @@ def test_gradient_of_a_push_through_contact():
         state, force = scene.begin(), {"first": {"external_force": size * tip_force(robot, 0.0, 0.5, 0.02)}}
         for _ in range(8):
             state = scene.step(state, force)
-        return state.robots["second"].q[0, :, 1].sum()
+        return scene.state_of(state, "second").q[0, :, 1].sum()
 
     size = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(deflection(size), size)

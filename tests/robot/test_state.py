@@ -7,36 +7,31 @@ import pytest
 import torch
 
 from warp_resphys import Body, Simulator, box_hexahedra
+from warp_resphys.dynamics.trajectory import Motion
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.motion_files import input_columns, write_csv
-from warp_resphys.robot.inputs import InputReader, RobotInput
-from warp_resphys.robot.motion import Motion
-from warp_resphys.robot.state import RobotState
+from warp_resphys.robot.commands import InputReader, RobotInput
 from warp_resphys.stepping.quantity import Quantity
 from warp_resphys.stepping.state import State
 
 
 def moved(batch, **more):
     q = torch.arange(6.0 * batch, dtype=torch.float64).reshape(batch, 2, 3)
-    memory = {"pressure.queue": 2.0 + torch.arange(4.0 * batch).reshape(2, batch, 2)}
-    return RobotState(State(q, -q), memory, **more)
+    queue = 2.0 + torch.arange(4.0 * batch).reshape(batch, 2, 2)
+    return State(q, -q, memory={"strain": 1.0 + q}).with_memory({"pressure.queue": queue, **more})
 
 
 def test_environments_are_chosen_from_two_states():
-    flags = torch.tensor([True, True])
-    first = moved(2, hidden=torch.ones(2, 4), base=torch.ones(2, 2, 6), left=flags)
-    second = RobotState(
-        State(torch.zeros(2, 2, 3).double(), torch.zeros(2, 2, 3).double()), {"pressure.queue": torch.zeros(2, 2, 2)}
-    )
+    """What a state lacks is zero there, and its past is its present."""
+    more = {"hidden": torch.ones(2, 4), "base": torch.ones(2, 2, 6), "left": torch.tensor([True, True])}
+    first, still = moved(2, **more), torch.zeros(2, 2, 3).double()
+    second = State(still + 5.0, still, (still + 3.0, still)).with_memory({"pressure.queue": torch.zeros(2, 2, 2)})
     mixed = first.where(torch.tensor([True, False]), second)
-    for name in ("q", "v", "hidden", "left"):
-        joined, wanted = getattr(mixed, name), getattr(first, name)
-        assert torch.equal(joined[0], wanted[0])
-        assert not joined[1].any()
-    assert torch.equal(mixed.base[:, 0], first.base[:, 0])
-    assert not mixed.base[:, 1].any()
-    assert torch.equal(mixed.memory["pressure.queue"][:, 0], first.memory["pressure.queue"][:, 0])
-    assert not mixed.memory["pressure.queue"][:, 1].any()
+    for name, joined in mixed.tensors().items():
+        assert torch.equal(joined[0], {**first.tensors(), "previous_q": first.q, "previous_v": first.v}[name][0])
+        assert torch.equal(joined[1], second.tensors().get(name, torch.zeros_like(joined))[1])
+    assert mixed.memory_of().keys() == {"pressure.queue", *more}
+    assert mixed.left.tolist() == [True, False]
     assert not mixed.lost.any()
 
 
@@ -45,8 +40,8 @@ def test_environments_are_repeated_and_selected():
     many = state.repeat(3)
     assert (many.batch, len(many.lost)) == (6, 6)
     again = many.select([3, 2])
-    assert torch.equal(again.q, state.q.flip(0))
-    assert torch.equal(again.memory["pressure.queue"], state.memory["pressure.queue"].flip(1))
+    for name, values in again.tensors().items():
+        assert torch.equal(values, state.tensors()[name].flip(0))
 
 
 def test_a_table_has_an_empty_cell_where_nothing_was_seen(tmp_path):
@@ -70,7 +65,8 @@ def test_markers_are_interpolated_between_steps():
         return 1.0 + rows * t + 3.0 * t**2
 
     q = at(times)
-    motion = Motion(None, times, q, q, q, None, q, q, {}, {}, None)
+    body = Body(box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1)))
+    motion = Motion(q, q, State(q[-1], q[-1]), body, 0.1)
     torch.testing.assert_close(motion.at(wanted), at(wanted))
     with pytest.raises(InputError, match="environment is 1"):
         motion.write_csv("a.csv", 1)

@@ -19,7 +19,6 @@ from ..io.files import to_plain
 from ..io.progress import Progress
 from ..learning.coders import Coder
 from ..robot.robot import Robot
-from ..robot.state import RobotState
 from ..settings.control import ReductionSettings
 from ..stepping.state import State
 from .files import read_reduced, reduced_file, write_reduced
@@ -180,7 +179,7 @@ def _equilibria(source: Source, asked: int, seed: int, on_progress: OnProgress) 
             batches.append(source.equilibria(some))
             on_progress(len(some))
         q, commands = torch.cat([batch[0] for batch in batches]), np.concatenate([batch[1] for batch in batches])
-        y = source.robot.observe(RobotState(State(q, torch.zeros_like(q)))).flatten(1).double().cpu().numpy()
+        y = source.robot.observe(State(q, torch.zeros_like(q))).flatten(1).double().cpu().numpy()
     if len(commands) < _LEAST_SETTLED * asked:
         raise ConvergenceError(
             f"the robot has an equilibrium under {len(commands)} of {asked} inputs in its range: its learned force is "

@@ -15,9 +15,8 @@ from ..energies.viscosity import relaxation
 from ..experiment.models import Learned
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from ..robot.inputs import RobotInput
+from ..robot.commands import RobotInput
 from ..robot.robot import Robot
-from ..robot.state import RobotState
 from ..settings.control import ReductionSettings
 from ..settings.trials import SequenceSettings
 from ..stepping.state import State
@@ -260,7 +259,7 @@ class Source:
             (self.response.from_rest(commands)[0] / self.scale)[..., self.moving],
         )
 
-    def _outputs(self, state: RobotState, given: dict[str, torch.Tensor]) -> FloatArray:
+    def _outputs(self, state: State, given: dict[str, torch.Tensor]) -> FloatArray:
         """Outputs (B, c) of the network in a step from a state."""
         assert self.learned is not None
         network, conditions = self.learned.network, self.robot.conditions(state, **given)
@@ -321,7 +320,7 @@ class Source:
         columns, zero = shapes.mT.reshape(-1, *q.shape[1:]).to(q), q.new_zeros(modes)
 
         def seen(by: torch.Tensor) -> torch.Tensor:
-            return robot.observe(RobotState(State(q + _moved(by, columns), still))).flatten()
+            return robot.observe(State(q + _moved(by, columns), still)).flatten()
 
         shown = torch.func.jacfwd(seen)(zero).double().cpu().numpy()
         if outputs is None:

@@ -23,9 +23,9 @@ from ..io.stages import finished_record
 from ..mesh.volume_mesh import boundary_triangles
 from ..robot.description import Description
 from ..robot.robot import Robot
-from ..robot.state import RobotState
 from ..settings.stages import StageSettings
 from ..settings.trials import MarkerSettings
+from ..stepping.state import State
 from .reduced import ReducedModel
 
 _FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
@@ -142,7 +142,7 @@ class RobotWorld(World):
         self.robot = self._nominal.with_parameters(**{name: tensor(values) for name, values in parameters.items()})
         self._rest = self._begun()
 
-    def _begun(self) -> RobotState:
+    def _begun(self) -> State:
         with torch.no_grad():
             return self.robot.begin(self.count)
 

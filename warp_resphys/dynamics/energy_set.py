@@ -214,6 +214,8 @@ class EnergySet:
     def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:
         """Raises InputError for an unknown memory variable, a wrong shape or dtype, or values that are not finite."""
         for name, values in memory.items():
+            if "." in name:  # of a robot
+                continue
             if name not in self.memory:
                 names = ", ".join(self.memory) or "nothing"
                 raise InputError(

@@ -33,7 +33,7 @@ from .mesh_error import CHECKED, warn_of_cells
 from .nonlinear_solver import SolverSettings, check_converged
 from .plausibility import warn_of_implausible
 from .statics import MOST_ITERATIONS, find_equilibrium, progress_of, settle
-from .trajectory import Trajectory
+from .trajectory import Motion
 
 GRAVITY = (0.0, 0.0, -9.80709)
 _NO_INPUTS = Inputs()
@@ -523,7 +523,7 @@ class Simulator:
 
     def rollout(
         self, state: State, steps: int, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
-    ) -> Trajectory:
+    ) -> Motion:
         """Simulates several time steps.
 
         For the gradient, states and terms of each step are kept, but no factors: the adjoint of a step recomputes its
@@ -562,10 +562,7 @@ class Simulator:
 
         states = rollout(step, state, inputs.by_step(steps), lambda reached: reached)
         check()
-        q, v = (torch.stack([getattr(reached, name) for reached in states]) for name in ("q", "v"))
-        obstacles = self.obstacle_motions(states, constants)
-        reports = [after.report for after in states[1:] if after.report is not None]
-        return Trajectory(q, v, reports, states[-1], self.body, self.time_step, obstacles)
+        return Motion.of(states, self.body, self.time_step, obstacles=self.obstacle_motions(states, constants))
 
     def _checked(
         self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None

@@ -4,8 +4,8 @@ A recorded roll-out can be combined with other kernels on a tape; ``tape.backwar
 
     with wp.Tape() as tape:
         wp.launch(forces, dim=..., inputs=[parameters], outputs=[forces])
-        rollout = record_rollout(tape, simulator, q, v, steps=60, inputs={"external_force": forces})
-        wp.launch(loss, dim=..., inputs=[rollout.q], outputs=[value])
+        path, speeds = record_rollout(tape, simulator, q, v, steps=60, inputs={"external_force": forces})
+        wp.launch(loss, dim=..., inputs=[path], outputs=[value])
     tape.backward(value)
 
 Nothing is copied: torch uses the memory of the input arrays, and the result arrays use torch's memory. As with torch, a
@@ -14,7 +14,6 @@ step keeps only its states and terms for the adjoint.
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import cast
 
 import torch
@@ -22,21 +21,12 @@ import warp as wp
 
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
-from ..stepping.state import SolveReport, State
+from ..stepping.state import State
 from .simulator import Simulator
 
 _VECTOR_INPUTS = ("external_force", "fixed_positions")
 _SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
 _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
-
-
-@dataclass(frozen=True)
-class RecordedRollout:
-    """Result of a recorded roll-out."""
-
-    q: wp.array  # (T + 1, B, N) vec3 positions, including the start [m]
-    v: wp.array  # (T + 1, B, N) vec3 velocities [m/s]
-    reports: list[SolveReport]  # T solver reports
 
 
 def record_rollout(
@@ -49,7 +39,7 @@ def record_rollout(
     previous: tuple[wp.array, wp.array] | None = None,
     inputs: Mapping[str, wp.array] | None = None,
     parameters: Mapping[str, wp.array] | None = None,
-) -> RecordedRollout:
+) -> tuple[wp.array, wp.array]:
     """Simulates several time steps and records their adjoint on a tape.
 
     Gradients are added to the ``grad`` of every input array that requires gradients. As for Warp's kernels, the arrays
@@ -68,6 +58,9 @@ def record_rollout(
             axis T.
         parameters: parameters by name, with shapes as in `Simulator.prepare`.
 
+    Returns:
+        Positions [m] and velocities [m/s] as (T + 1, B, N) vec3, including the start.
+
     Raises:
         InputError: an unknown parameter, a wrong dtype, device or shape, or values that are not finite.
         ConvergenceError: as in `Simulator.step`.
@@ -83,12 +76,12 @@ def record_rollout(
     }
     values = {name: leaves.scalars(name, array) for name, array in (parameters or {}).items()}
     with leaves.stream(), torch.enable_grad():
-        trajectory = simulator.rollout(state, steps, Inputs(**fields), values)
-    results = [trajectory.q, trajectory.v]
+        motion = simulator.rollout(state, steps, Inputs(**fields), values)
+    results = [motion.q, motion.v]
     arrays = [leaves.result(tensor) for tensor in results]
     if leaves.pairs:
         tape.record_func(leaves.backward(results, arrays), [array for array, _ in leaves.pairs] + arrays)
-    return RecordedRollout(arrays[0], arrays[1], trajectory.reports)
+    return arrays[0], arrays[1]
 
 
 class _Leaves:

@@ -1,49 +1,105 @@
-"""Result of a roll-out, with its files and plots."""
+"""Motions: results of roll-outs of bodies and robots, with their files and plots."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..energies.obstacles import ObstacleMotion
 from ..fem.bodies import Body
-from ..io.errors import InputError
+from ..io.arrays import FloatArray
+from ..io.errors import InputError, number_of
 from ..io.files import atomic_hdf5, create
-from ..mesh.motion_files import write_vtk
+from ..mesh.motion_files import input_columns, write_csv, write_usd, write_vtk
 from ..stepping.inputs import shapes
+from ..stepping.rollout import sample
 from ..stepping.state import SolveReport, State
 
 
-@dataclass(frozen=True)
-class Trajectory:
-    """Result of a roll-out."""
+@dataclass(frozen=True, repr=False)
+class Motion:
+    """T steps of B environments, differentiable.
 
-    q: torch.Tensor  # (T + 1, B, N, 3) positions, including the start [m]
-    v: torch.Tensor  # (T + 1, B, N, 3) velocities [m/s]
-    reports: list[SolveReport]  # T solver reports
-    final: State  # last state, from which another roll-out can continue
+    Attributes:
+        q: (T + 1, B, N, 3) positions of the vertices, including the start [m].
+        v: (T + 1, B, N, 3) velocities [m/s].
+        final: last state, from which another roll-out can continue.
+        body: the body.
+        time_step: h [s].
+        reports: T solver reports.
+        obstacles: motions of the obstacles that the body touches.
+        name: name of a robot and its model.
+        markers: (T + 1, B, M, 3) as `Robot.observe` returns them [m]; without a robot, the vertices.
+        labels: names of the markers of a robot; empty where these are the vertices.
+        half_widths: (T + 1, B, M) half-widths of the prediction intervals of the markers' coordinates [m]; None without
+            intervals.
+        left: (T + 1, B) bool, whether the learned force has been evaluated outside its training range.
+        lost: (T + 1, B) bool, whether the simulation has diverged.
+        inputs: (T, B, C) commands of a robot, by name.
+        units: unit and names of the C parts of the commands that drive actuators, by name.
+    """
+
+    q: torch.Tensor
+    v: torch.Tensor
+    final: State
     body: Body
-    time_step: float  # [s]
+    time_step: float
+    reports: Sequence[SolveReport] = ()
     obstacles: tuple[ObstacleMotion, ...] = ()
+    name: str = ""
+    markers: torch.Tensor = field(default=None)  # type: ignore[assignment]
+    labels: tuple[str, ...] = ()
+    half_widths: FloatArray | None = None
+    left: torch.Tensor | None = None
+    lost: torch.Tensor | None = None
+    inputs: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    units: Mapping[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Observes the vertices where there are no markers."""
+        if self.markers is None:
+            object.__setattr__(self, "markers", self.q)
+
+    @classmethod
+    def of(cls, states: Sequence[State], body: Body, time_step: float, **more: Any) -> "Motion":
+        """Returns the motion of a body in T + 1 states of a roll-out; ``more`` are other attributes."""
+        q, v = (torch.stack([getattr(state, name) for state in states]) for name in ("q", "v"))
+        reports = [state.report for state in states[1:] if state.report is not None]
+        return cls(q, v, states[-1], body, time_step, reports, **more)
 
     def __repr__(self) -> str:
-        """Number and length of the steps, and shapes of the tensors."""
-        given = ", ".join(shapes({"q": self.q, "v": self.v}))
-        return f"Trajectory({len(self.reports)} steps of {1e3 * self.time_step:g} ms, {given})"
+        """Number and length of the steps, environments, and how many left the training range or diverged."""
+        steps, batch = len(self.q) - 1, self.q.shape[1]
+        text = f"Motion{f' of {self.name}' if self.name else ''}: {number_of(steps, 'step')} of "
+        text += f"{1e3 * self.time_step:g} ms, {number_of(batch, 'environment')}, {shapes({'q': self.q})[0]}"
+        left, lost = (None if flags is None else flags.cpu().numpy() for flags in (self.left, self.lost))
+        if left is not None and left.any():
+            first = self.times[left.any(axis=1).argmax()]
+            text += f"; {left.any(axis=0).sum()} left the training range, the first at {first:.3g} s"
+        return text + (f"; {lost[-1].sum()} diverged" if lost is not None and lost.any() else "")
 
     @property
-    def times(self) -> NDArray[np.float64]:
+    def times(self) -> FloatArray:
         """(T + 1,) times, from zero [s]."""
         return self.time_step * np.arange(len(self.q), dtype=np.float64)
+
+    def at(self, times: FloatArray | torch.Tensor) -> torch.Tensor:
+        """Interpolates the markers at other times (F,) [s]; returns (F, B, M, 3), by cubic interpolation [m]."""
+        wanted = torch.as_tensor(times).to(self.markers)
+        if len(self.q) == 1:
+            return self.markers.expand(len(wanted), -1, -1, -1)
+        batch = self.q.shape[1]
+        return sample(self.markers.transpose(0, 1), wanted.expand(batch, -1), self.time_step).transpose(0, 1)
 
     def save(self, path: str | Path) -> Path:
         """Writes times, positions and velocities to an HDF5 file.
 
         Its datasets are ``times`` (T + 1,), ``q`` and ``v`` (T + 1, B, N, 3) and ``rest`` (N, 3), each with an
-        attribute ``units``.
+        attribute ``units``; ``markers`` (T + 1, B, M, 3) if there are any.
 
         Args:
             path: path of the file; missing folders are created.
@@ -51,22 +107,25 @@ class Trajectory:
         Raises:
             DataFileError: the file cannot be written.
         """
-        with atomic_hdf5(path, "trajectory") as file:
+        with atomic_hdf5(path, "trajectory", {"labels": list(self.labels)} if self.labels else None) as file:
             create(file, "times", self.times, "s")
             create(file, "q", _array(self.q), "m")
             create(file, "v", _array(self.v), "m/s")
             create(file, "rest", self.body.vertices, "m")
+            if self.labels:
+                create(file, "markers", _array(self.markers), "m")
         return Path(path)
 
     def plot(
         self, vertices: ArrayLike | None = None, axis: str | None = None, environment: int = 0, ax: Any = None
     ) -> Any:
-        """Plots the mean displacement of some vertices from their rest positions over time.
+        """Plots displacements over time.
 
         Args:
-            vertices: vertex numbers, for example from `select_vertices`, or a single number; by default the vertex that
-                moves furthest.
-            axis: ``x``, ``y`` or ``z``; by default the one along which they move furthest.
+            vertices: vertex numbers, for example from `select_vertices`, or a single number: their mean displacement
+                from rest; by default the displacements of the markers since the start, or, without markers, that of the
+                vertex that moves furthest from rest.
+            axis: ``x``, ``y`` or ``z``; by default the one with the largest displacement.
             environment: index of the environment.
             ax: matplotlib axes; a new figure if omitted.
 
@@ -76,20 +135,56 @@ class Trajectory:
         Raises:
             InputError: an unknown axis, vertex or environment.
         """
-        self._check(environment)
-        moved, count = _array(self.q[:, environment]) - self.body.vertices, self.body.n_vertices
-        if vertices is None:
-            vertices = furthest_moved(moved)
-        chosen = np.atleast_1d(np.asarray(vertices, dtype=np.int64))
-        if not len(chosen) or chosen.min() < 0 or chosen.max() >= count:
-            raise InputError(f"the vertices to plot must be one or more of 0 to {count - 1}.")
-        return plot_displacements(self.times, moved[:, chosen].mean(1, keepdims=True), axis, ax)
+        import matplotlib.pyplot as plt
+
+        q, labels = self._of(self.q, environment) - self.body.vertices, self.labels if vertices is None else ()
+        if labels:
+            markers = self._of(self.markers, environment)
+            moved = markers - markers[0]
+        else:
+            furthest = np.linalg.norm(q, axis=2).max(axis=0).argmax()
+            chosen = np.atleast_1d(np.asarray(furthest if vertices is None else vertices, dtype=np.int64))
+            if not len(chosen) or chosen.min() < 0 or chosen.max() >= q.shape[1]:
+                raise InputError(f"the vertices to plot must be one or more of 0 to {q.shape[1] - 1}.")
+            moved = q[:, chosen].mean(1, keepdims=True)
+        axis = "xyz"[int(np.nanmax(np.abs(moved), axis=(0, 1)).argmax())] if axis is None else axis
+        if axis not in ("x", "y", "z"):
+            raise InputError(f"axis is {axis!r}: choose x, y or z.")
+        ax = plt.subplots(layout="constrained")[1] if ax is None else ax
+        lines = ax.plot(self.times, 1e3 * moved[..., "xyz".index(axis)])
+        ax.set(xlabel="time [s]", ylabel=f"displacement along {axis} [mm]")
+        if labels:
+            ax.legend(lines, labels)
+        return ax
+
+    def write_csv(self, path: str | Path, environment: int = 0, half_widths: bool = False) -> Path:
+        """Writes a table of times, markers, and the commands of the step that led there, in SI units.
+
+        Its headers have names and units. `read_recording` reads tables without half-widths.
+
+        Args:
+            path: path of the file.
+            environment: index of the environment.
+            half_widths: whether columns with the half-widths of the markers' prediction intervals are added.
+
+        Raises:
+            InputError: an unknown environment.
+            DataFileError: the file cannot be written.
+        """
+        markers, columns = self._of(self.markers, environment), dict[str, FloatArray]()
+        if half_widths and self.half_widths is not None:
+            widths = zip(self.labels, self.half_widths[:, environment].T, strict=True)
+            columns |= {f"{label} half-width [m]": width for label, width in widths}
+        for name, (unit, parts) in self.units.items():
+            if name in self.inputs:
+                columns |= input_columns(name, parts, unit, self._of(self.inputs[name], environment))
+        return write_csv(Path(path), self.times, self.labels, markers, columns)
 
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
-        The vertices have ``displacement`` and ``velocity``. Obstacles are in ``NAME_obstacles.pvd``, a half-space as a
-        plate.
+        The vertices have ``displacement`` and ``velocity``. Markers are in ``NAME_markers.pvd``, and obstacles in
+        ``NAME_obstacles.pvd``, a half-space as a plate.
 
         Args:
             path: path of the ``.pvd`` file.
@@ -97,45 +192,38 @@ class Trajectory:
 
         Raises:
             InputError: an unknown environment or another extension.
+            DataFileError: the files cannot be written.
+        """
+        q, v, markers = (self._of(values, environment) for values in (self.q, self.v, self._labelled))
+        obstacles = [motion.surface(environment) for motion in self.obstacles]
+        return write_vtk(Path(path), self.body.mesh, self.times, q, v, markers, obstacles)
+
+    def write_usd(self, path: str | Path, environment: int = 0) -> Path:
+        """Writes the moving surfaces of the body and its obstacles, and its markers, to a USD file (extra ``usd``).
+
+        Args:
+            path: path of the ``.usd``, ``.usda`` or ``.usdc`` file.
+            environment: index of the environment.
+
+        Raises:
+            InputError: an unknown environment, another extension, or the extra is missing.
             DataFileError: the file cannot be written.
         """
-        self._check(environment)
-        q, v = (_array(values[:, environment]) for values in (self.q, self.v))
+        q, markers = (self._of(values, environment) for values in (self.q, self._labelled))
         obstacles = [motion.surface(environment) for motion in self.obstacles]
-        return write_vtk(Path(path), self.body.mesh, self.times, q, v, q[:, :0], obstacles)
+        return write_usd(Path(path), self.body.mesh, self.times, q, markers, obstacles)
 
-    def _check(self, environment: int) -> None:
+    @property
+    def _labelled(self) -> torch.Tensor:
+        """Markers (T + 1, B, M, 3); M = 0 if these are the vertices."""
+        return self.markers if self.labels else self.markers[:, :, :0]
+
+    def _of(self, series: torch.Tensor, environment: int) -> FloatArray:
+        """Values (T, ...) of an environment, from those of all (T, B, ...)."""
         if not 0 <= environment < self.q.shape[1]:
             raise InputError(f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0.")
+        return _array(series[:, environment])
 
 
-def furthest_moved(moved: NDArray[np.float64]) -> int:
-    """Returns the number of the vertex that moves furthest, from displacements (T, N, 3) [m]."""
-    return int(np.linalg.norm(moved, axis=2).max(axis=0).argmax())
-
-
-def plot_displacements(times: NDArray[np.float64], moved: NDArray[np.float64], axis: str | None, ax: Any) -> Any:
-    """Plots displacements (T, n, 3) [m] over times (T,) [s], and returns the axes.
-
-    Args:
-        times: times.
-        moved: displacements.
-        axis: ``x``, ``y`` or ``z``; None: the one with the largest displacement.
-        ax: matplotlib axes; None: a new figure.
-
-    Raises:
-        InputError: an unknown axis.
-    """
-    import matplotlib.pyplot as plt
-
-    axis = "xyz"[int(np.nanmax(np.abs(moved), axis=(0, 1)).argmax())] if axis is None else axis
-    if axis not in ("x", "y", "z"):
-        raise InputError(f"axis is {axis!r}: choose x, y or z.")
-    ax = plt.subplots(layout="constrained")[1] if ax is None else ax
-    ax.plot(times, 1e3 * moved[..., "xyz".index(axis)])
-    ax.set(xlabel="time [s]", ylabel=f"displacement along {axis} [mm]")
-    return ax
-
-
-def _array(values: torch.Tensor) -> NDArray[np.float64]:
+def _array(values: torch.Tensor) -> FloatArray:
     return np.asarray(values.detach().cpu().numpy(), dtype=np.float64)

@@ -24,7 +24,7 @@ from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.boxes import box_hexahedra
 from ..mesh.volume_mesh import Mesh, boundary_triangles
-from ..robot.inputs import BASE
+from ..robot.commands import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
@@ -96,7 +96,7 @@ class GraspWorld(World):
     @override
     def begin(self, chosen: BoolArray) -> None:
         self._height = np.where(chosen, 0.0, self._height)
-        self._state = self._rest.where(torch.as_tensor(chosen, device=self._rest.body.q.device), self._state)
+        self._state = self._rest.where(torch.as_tensor(chosen, device=self._rest.q.device), self._state)
 
     @override
     @torch.no_grad()
@@ -113,12 +113,12 @@ class GraspWorld(World):
     @override
     def markers(self) -> FloatArray:
         fingers = torch.cat(list(self._scene.observe(self._state).values()), 1)
-        ball = self._state.body.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
+        ball = self._state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
         return np.asarray(torch.cat([fingers, ball], 1).double().cpu().numpy())
 
     @override
     def bodies(self) -> tuple[IntArray, FloatArray]:
-        return boundary_triangles(self._scene.scene.mesh), self._state.body.q.double().cpu().numpy()
+        return boundary_triangles(self._scene.scene.mesh), self._state.q.double().cpu().numpy()
 
     @override
     def obstacles(self) -> ObstacleSurface:

@@ -24,11 +24,11 @@ from ..io.arrays import FloatArray
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
 from ..io.stages import StageContext
-from ..learning.replay import sample
 from ..mesh.selection import select_vertices
 from ..settings.stages import StageSettings
 from ..settings.trials import PlaySettings, Trial
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import sample
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places

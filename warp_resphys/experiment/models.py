@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -15,7 +15,7 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError
 from ..io.files import read_checkpoint
-from ..learning.correction import CorrectedSimulator, LearnedPredictor, Range, force_frames, is_lost
+from ..learning.correction import CorrectedSimulator, LearnedPredictor, Range, force_frames
 from ..learning.metrics import marker_errors, summarise
 from ..learning.networks import NextState, ResidualForce, StateMap, restore
 from ..learning.replay import Start
@@ -151,13 +151,13 @@ class ModelRollout:
             if not self.replay.is_static:
                 raise
             state = self._simulator.rest_state(len(self.replay.trials.names))
-            state = replace(state, lost=~is_lost(state))
+            state = state.with_memory({"lost": ~state.lost})
         step = CorrectedSimulator(self._simulator, predictor, self._inputs, self._constants).step
         yield from states(step, state, range(self.steps))
 
     def points(self, state: State) -> torch.Tensor:
         """(R, M, 3) observed points of a state [m]; NaN where the roll-out has diverged."""
-        return torch.where(is_lost(state)[:, None, None], torch.nan, self.replay.observe(state.q))
+        return torch.where(state.lost[:, None, None], torch.nan, self.replay.observe(state.q))
 
     def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
         """(R, T, M, 3) observed points at the frames of the trials [m], from those of all steps (R, M, 3)."""
@@ -173,7 +173,7 @@ class ModelRollout:
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
             for state in islice(self.roll(self.predictor(learned)), steps + 1):
-                if series and bool(is_lost(state).all()):
+                if series and bool(state.lost.all()):
                     series = []
                     break
                 series.append(self.points(state))

@@ -13,7 +13,7 @@ from ..io.arrays import BoolArray, FloatArray
 from ..learning.baselines import BASELINES, REST, PlainTrials, at_rest, predictions
 from ..learning.observed_motions import at_steps
 from ..learning.release import least_delays
-from ..learning.replay import sample
+from ..stepping.rollout import sample
 from .experiment import Experiment
 from .files import driving
 

@@ -4,7 +4,7 @@ Trained models are predictors of a roll-out, with a guard against states outside
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import torch
@@ -61,11 +61,11 @@ class CorrectedSimulator:
 
     def step(self, state: State, number: int) -> State:
         """Returns the state after the step of a number; differentiable."""
-        lost = is_lost(state)
+        lost = state.lost
         new, failed = self._advance(state, number, lost)
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
         lost = lost | failed | ~(distance < DIVERGENCE_DISTANCE * self._length)
-        return replace(self._reset(new, lost) if bool(lost.any()) else new, lost=lost)
+        return (self._reset(new, lost) if bool(lost.any()) else new).with_memory({"lost": lost})
 
     def _advance(self, state: State, number: int, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """Returns the next state, and which environments (B,) failed."""
@@ -96,14 +96,9 @@ class CorrectedSimulator:
         return State.from_tensors({name: masked(name, value) for name, value in state.tensors().items()})
 
 
-def is_lost(state: State) -> torch.Tensor:
-    """Returns which environments have diverged, (B,) bool."""
-    return torch.zeros(state.batch, dtype=torch.bool, device=state.q.device) if state.lost is None else state.lost
-
-
 def known_positions(state: State) -> torch.Tensor:
     """Returns the positions (B, N, 3) of a state, NaN in lost environments [m]."""
-    return torch.where(is_lost(state)[:, None, None], torch.nan, state.q)
+    return torch.where(state.lost[:, None, None], torch.nan, state.q)
 
 
 @dataclass(frozen=True)

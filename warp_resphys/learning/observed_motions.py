@@ -87,7 +87,7 @@ class ObservedMotions:
         Args:
             simulator: of the same time step and body.
             observed: (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point was not seen; by
-                default the positions of all vertices, as in `Trajectory.q`. (T + 1, M, D) is one motion.
+                default the positions of all vertices, as in `Motion.q`. (T + 1, M, D) is one motion.
             start: initial positions and velocities; None: at rest in equilibrium under `resting`.
             inputs: during the motion, with or without a time axis.
             resting: inputs before the motion, where `start` is None.

@@ -20,7 +20,7 @@ from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
-from ..stepping.rollout import rollout, states
+from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .correction import equilibrium_under_feedback
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
@@ -218,7 +218,7 @@ class Replay:
         """Number of steps to the last frame; one more, for the slope there, where frames are between two steps."""
         times = (self.trials.times - start.delay[:, None]).clamp_min(0.0)
         last = float(times.max()) / self.simulator.time_step
-        return round(last) if _on_steps(times, self.simulator.time_step) else max(math.ceil(last - 1e-6) + 1, 2)
+        return round(last) if on_steps(times, self.simulator.time_step) else max(math.ceil(last - 1e-6) + 1, 2)
 
     def __call__(
         self,
@@ -385,37 +385,6 @@ class Replay:
 def _count(parameters: Parameters | None) -> int:
     """Number of sets of parameters."""
     return len(next(iter(parameters.values()))) if parameters else 1
-
-
-def _on_steps(times: torch.Tensor, step: float) -> bool:
-    """Whether all times are whole numbers of steps."""
-    position = times.detach() / step
-    return bool(((position - position.round()).abs() < 1e-6).all())
-
-
-def sample(series: torch.Tensor, times: torch.Tensor, step: float) -> torch.Tensor:
-    """(B, T, ...) values at the given times, by cubic Hermite interpolation with central differences as slopes.
-
-    Args:
-        series: (B, K + 1, ...) values at the times 0, h, ..., K h, with K at least 2 if a time is between them.
-        times: (B, T) [s], from zero; beyond the end the last value stays.
-        step: h [s].
-    """
-    last = series.shape[1] - 1
-    position = (times / step).clamp(0.0, float(last))
-    batch = torch.arange(len(series), device=series.device)[:, None]
-    if not times.requires_grad and _on_steps(times, step):
-        return series[batch, position.round().long()]
-    slopes = torch.gradient(series, dim=1, edge_order=2)[0]
-    index = position.floor().long().clamp(max=last - 1)
-    s = (position - index).reshape(*times.shape, *[1] * (series.ndim - 2))
-    a, b, da, db = series[batch, index], series[batch, index + 1], slopes[batch, index], slopes[batch, index + 1]
-    return (
-        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * a
-        + s * (1.0 - s) ** 2 * da
-        + s**2 * (3.0 - 2.0 * s) * b
-        + s**2 * (s - 1.0) * db
-    )
 
 
 def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:

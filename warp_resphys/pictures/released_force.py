@@ -29,8 +29,9 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import IntArray
 from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
-from ..learning.replay import Replay, Start, sample
+from ..learning.replay import Replay, Start
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import sample
 
 RELEASE_DELAY: Final = "release_delay"  # s
 RELEASE_FORCES: Final = ("release_force_1", "release_force_2", "release_force_3")  # N

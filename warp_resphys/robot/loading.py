@@ -1,7 +1,7 @@
 """Loads a robot from a finished run or a file, and the trials of the run, to replay them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 from ..data.dataset import STATIC
 from ..data.rigid_bodies import as_markers
+from ..dynamics.trajectory import Motion
 from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
 from ..io.errors import DataFileError, InputError, listed
 from ..learning.parameters import own_name
+from ..stepping.state import State
+from .commands import BASE
 from .description import Description, describe, finished_experiment
-from .inputs import BASE
-from .motion import Motion
 from .robot import Robot
-from .state import RobotState
 
 
 def load(path: str | Path, model: str | None = None, device: str = "cpu", on_failure: str = "raise") -> Robot:
@@ -67,7 +67,7 @@ class RecordedTrial:
     """
 
     name: str
-    start: RobotState
+    start: State
     steps: int
     inputs: Mapping[str, Any]
     times: NDArray[np.float64]
@@ -89,7 +89,7 @@ class RecordedTrial:
         Returns:
             (F, K) for K markers and rigid bodies, each of these at its position; NaN where one was not seen.
         """
-        away = as_markers(self.shown(motion) - self.markers, motion.robot.labels)
+        away = as_markers(self.shown(motion) - self.markers, motion.labels)
         return np.asarray(1e3 * np.linalg.norm(away, axis=-1))
 
 
@@ -155,7 +155,7 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]
-                begun = replace(begun, base=poses[:1].repeat(2, 1, 1))
+                begun = begun.with_memory({**begun.memory_of(), BASE: poses[0][:, None].repeat(1, 2, 1)})
     trials = replay.trials
     since = (trials.times - start.delay[:, None]).clamp_min(0.0)[0].cpu().numpy()
     shift = None if start.shift is None else start.shift[0].cpu().numpy()

@@ -12,6 +12,7 @@ from scipy.sparse import csc_array
 
 from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.frames import BaseFrame, VertexFrames
+from ..dynamics.trajectory import Motion
 from ..energies.materials import MASS_DAMPING
 from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError, number_of
@@ -21,7 +22,6 @@ from ..learning.correction import (
     LearnedPredictor,
     equilibrium_under_feedback,
     force_frames,
-    is_lost,
 )
 from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
@@ -29,11 +29,10 @@ from ..learning.parameters import check_names, constants_of, identifiable_parame
 from ..mesh.volume_mesh import Mesh
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import rollout
 from ..stepping.state import State
+from .commands import Acting, Commands, Given, InputReader, inputs_of
 from .description import Description
-from .inputs import Acting, Commands, Given, InputReader, inputs_of
-from .motion import Motion
-from .state import RobotState
 
 SUFFIX: Final = ".safetensors"
 
@@ -183,7 +182,7 @@ class Robot:
 
     # Observation
 
-    def observe(self, state: RobotState) -> torch.Tensor:
+    def observe(self, state: State) -> torch.Tensor:
         """Markers (B, M, 3) in a state, as recordings have them; vertices (B, N, 3) if these are observed [m]."""
         return state.q if self._observe is None else self._observe(state.q)
 
@@ -203,9 +202,7 @@ class Robot:
 
     # Initial states
 
-    def state(
-        self, q: ArrayLike | torch.Tensor, v: ArrayLike | torch.Tensor | None = None, **inputs: Given
-    ) -> RobotState:
+    def state(self, q: ArrayLike | torch.Tensor, v: ArrayLike | torch.Tensor | None = None, **inputs: Given) -> State:
         """Returns a state of given positions, in which constant inputs have acted for a long time.
 
         Args:
@@ -217,7 +214,7 @@ class Robot:
         body = State(at, torch.zeros_like(at) if v is None else self._reader.field(v, "v"))
         return self._commands.begin(body, self._read(inputs, len(at)))
 
-    def begin(self, batch: int = 1, **inputs: Given) -> RobotState:
+    def begin(self, batch: int = 1, **inputs: Given) -> State:
         """Returns the equilibrium of the simulator under its weight and constant inputs, without the learned force.
 
         Trials begin with it. A body that nothing holds (`Simulator.is_held`) keeps its rest shape.
@@ -233,11 +230,12 @@ class Robot:
         given = self._read(inputs, batch)
         state = self._commands.begin(self.simulator.rest_state(batch), given)
         acting = self._commands.act(state, given).inputs
-        if not self.simulator.is_held(state.body, acting, self.constants):
+        if not self.simulator.is_held(state, acting, self.constants):
             return state
-        return replace(state, body=self.simulator.static_equilibrium(acting, self.constants, batch=batch))
+        body = self.simulator.static_equilibrium(acting, self.constants, batch=batch)
+        return body.with_memory(state.memory_of())
 
-    def settle(self, batch: int = 1, **inputs: Given) -> RobotState:
+    def settle(self, batch: int = 1, **inputs: Given) -> State:
         """Returns the equilibrium of the robot under constant inputs, with its learned force.
 
         Args:
@@ -263,9 +261,9 @@ class Robot:
             assert isinstance(predicted, torch.Tensor)
             return predicted
 
-        body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start.body, force)
+        body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start, force)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
-        return replace(start, body=body, memory={**start.memory, **acting.memory}, left=left)
+        return body.with_memory({**start.memory_of(), **acting.memory, "left": left})
 
     def settle_some(self, batch: int = 1, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns positions (B, N, 3) of `settle` [m], and (B,) bool, which environments are in equilibrium.
@@ -284,7 +282,7 @@ class Robot:
 
     # Motion
 
-    def step(self, state: RobotState, **inputs: Given) -> RobotState:
+    def step(self, state: State, **inputs: Given) -> State:
         """Returns the state after one time step; differentiable.
 
         Args:
@@ -298,37 +296,38 @@ class Robot:
             InputError: an unknown input or part, or values of another shape or out of range.
             ConvergenceError: the step failed, and ``on_failure`` is ``raise``.
         """
-        acting = self._commands.act(state, self._read(inputs, state.batch))
-        predictor = None
-        if self._learned is not None:
-            predictor = self._predictor(acting.conditions, acting.base)
-            predictor.hidden = state.hidden
-        corrected = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants)
-        body = corrected.step(replace(state.body, lost=state.lost), 0)
-        now = is_lost(body)
-        if self.simulator.settings.on_failure == "raise" and bool((now & ~state.lost).any()):
+        acting, predictor = self._acting(state, inputs)
+        after = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants).step(state, 0)
+        if self.simulator.settings.on_failure == "raise" and bool((after.lost & ~state.lost).any()):
             raise ConvergenceError(
                 f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths; "
                 "use shorter steps, lower inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
             )
-        return self._after(state, acting, predictor, body, now)
+        return self._remembered(state, acting, predictor, after)
+
+    def _acting(self, state: State, inputs: Mapping[str, Given]) -> tuple[Acting, LearnedPredictor | None]:
+        """Returns what acts in a step under commands, and the predictor of its learned force."""
+        acting = self._commands.act(state, self._read(inputs, state.batch))
+        if self._learned is None:
+            return acting, None
+        predictor = self._predictor(acting.conditions, acting.base)
+        predictor.hidden = state.memory_of().get("hidden")
+        return acting, predictor
 
     @staticmethod
-    def _after(
-        state: RobotState, acting: Acting, predictor: LearnedPredictor | None, body: State, lost: torch.Tensor
-    ) -> RobotState:
+    def _remembered(state: State, acting: Acting, predictor: LearnedPredictor | None, after: State) -> State:
         """Returns the state after a step, from the one before it and the body after it."""
-        left = state.left
+        memory = {**acting.memory, "lost": after.lost, "left": state.left}
         if predictor is not None and predictor.left_at is not None:
-            left = left | (predictor.left_at >= 0)
-        hidden = None if predictor is None else predictor.hidden
-        base = None if acting.base is None else acting.base[1:]
-        return RobotState(body, acting.memory, hidden, base, left, lost)
+            memory["left"] = state.left | (predictor.left_at >= 0)
+        if predictor is not None and predictor.hidden is not None:
+            memory["hidden"] = predictor.hidden
+        return after.with_memory(memory)
 
-    def drive(self, state: RobotState, **inputs: Given) -> tuple[Inputs, Callable[[State], RobotState]]:
-        """Returns a step's inputs with the learned force, and a map from the body's state after it to the robot's.
+    def drive(self, state: State, **inputs: Given) -> tuple[Inputs, Callable[[State], State]]:
+        """Returns a step's inputs with the learned force, and a map from the body after it to the robot's state.
 
         For a simulator of several bodies (`robot_scene.RobotScene`).
 
@@ -339,19 +338,17 @@ class Robot:
         Raises:
             InputError: an invalid input, as for `step`.
         """
-        acting = self._commands.act(state, self._read(inputs, state.batch))
-        own, predictor = acting.inputs, None
-        if self._learned is not None:
-            predictor = self._predictor(acting.conditions, acting.base)
-            predictor.hidden = state.hidden
-            force = predictor(state.body, 0)
+        acting, predictor = self._acting(state, inputs)
+        total = acting.inputs
+        if predictor is not None:
+            force = predictor(state, 0)
             assert isinstance(force, torch.Tensor)
-            own = own.plus(force)
-        return own, lambda body: self._after(state, acting, predictor, body, state.lost)
+            total = total.plus(force)
+        return total, lambda body: self._remembered(state, acting, predictor, body)
 
     def rollout(
         self,
-        state: RobotState,
+        state: State,
         steps: int | None = None,
         on_step: Callable[[int], None] = lambda number: None,
         **inputs: Given,
@@ -374,29 +371,29 @@ class Robot:
         if steps is None and not lengths:
             raise InputError("the number of steps is unknown: give `steps`, or an input with a value for each step.")
         count = max(lengths, default=0) if steps is None else steps
-        states, acting = [state], list[dict[str, torch.Tensor]]()
-        for number in range(count):
-            now = {name: value[min(number, len(value) - 1)] for name, value in series.items()}
-            state = self.step(state, **now)
-            states.append(state)
-            acting.append(now)
+        acting = [{name: value[min(k, len(value) - 1)] for name, value in series.items()} for k in range(count)]
+
+        def step(before: State, number: int) -> State:
+            after = self.step(before, **acting[number])
             on_step(number + 1)
-        markers = torch.stack([self.observe(state) for state in states])
-        times = self.time_step * np.arange(count + 1, dtype=np.float64)
+            return after
+
+        states = rollout(step, state, range(count), lambda reached: reached)
+        markers = torch.stack([self.observe(reached) for reached in states])
         driven = {name: torch.stack([now[name] for now in acting]) for name in series if acting}
-        return Motion(
-            robot=self.description,
-            times=times,
-            q=torch.stack([state.q for state in states]),
-            v=torch.stack([state.v for state in states]),
+        return Motion.of(
+            states,
+            self.simulator.body,
+            self.time_step,
+            obstacles=self.simulator.obstacle_motions(states, self.constants),
+            name=f"{self.description.name}, {self.description.model}",
             markers=markers,
-            half_widths=self.half_widths(markers, _since_change(times, driven, state.batch)),
-            left=torch.stack([state.left for state in states]),
-            lost=torch.stack([state.lost for state in states]),
+            labels=self.labels,
+            half_widths=self.half_widths(markers, _since_change(self.time_step, driven, *markers.shape[:2])),
+            left=torch.stack([reached.left for reached in states]),
+            lost=torch.stack([reached.lost for reached in states]),
             inputs=driven,
-            known_inputs=self.inputs,
-            final=state,
-            obstacles=self.simulator.obstacle_motions([state.body for state in states], self.constants),
+            units={name: (self.inputs[name].unit, self.inputs[name].parts) for name in self.driven},
         )
 
     def integrated_by(self, integrator: str) -> "Robot":
@@ -409,18 +406,18 @@ class Robot:
 
     # Linearisation and the network's inputs in a state
 
-    def conditions(self, state: RobotState, **inputs: Given) -> torch.Tensor | None:
+    def conditions(self, state: State, **inputs: Given) -> torch.Tensor | None:
         """Inputs (B, A) of the network beside the state in a step, as `Description` lists them."""
         return self._commands.act(state, self._read(inputs, state.batch)).conditions
 
-    def linearised(self, state: RobotState, **inputs: Given) -> tuple[csc_array, csc_array, NDArray[np.int64]]:
+    def linearised(self, state: State, **inputs: Given) -> tuple[csc_array, csc_array, NDArray[np.int64]]:
         """Linearises a step of the simulator about a state, without the learned force.
 
         Returns:
             The (3 F, 3 F) Hessian and the inertia in it [N/m], and the numbers of the F free vertices.
         """
         acting = self._commands.act(state, self._read(inputs, state.batch)).inputs
-        linearised = self.simulator.linearise(state.body, acting, self.constants)
+        linearised = self.simulator.linearise(state, acting, self.constants)
         hessian, _ = linearised.matrix(state.q)
         return hessian, linearised.inertia_matrix(state.q), linearised.free.cpu().numpy()
 
@@ -436,10 +433,9 @@ class Robot:
         return LearnedPredictor(learned.network, given, learned.range_, self.frames, frame)
 
 
-def _since_change(times: NDArray[np.float64], driven: Mapping[str, torch.Tensor], batch: int) -> NDArray[np.float64]:
-    """(T + 1, B) time since the last change of commands (T, B, ...) at times (T + 1,) [s]."""
-    frames = np.minimum(np.arange(len(times)), len(times) - 2)
-    acting = [
-        values.detach().cpu().double().numpy()[frames].reshape(len(times), batch, -1) for values in driven.values()
-    ]
-    return time_since_change(np.broadcast_to(times[:, None], (len(times), batch)), acting)
+def _since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> NDArray[np.float64]:
+    """(T + 1, B) time since the last change of commands (T, B, ...) at T + 1 times [s]."""
+    frames = np.minimum(np.arange(times), times - 2)
+    acting = [values.detach().cpu().double().numpy()[frames].reshape(times, batch, -1) for values in driven.values()]
+    at = time_step * np.arange(times, dtype=np.float64)
+    return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

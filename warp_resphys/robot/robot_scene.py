@@ -1,7 +1,7 @@
 """Robots, and things that they touch, in one scene."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,32 +19,11 @@ from ..io.errors import InputError
 from ..learning.parameters import constants_of
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .inputs import Given
+from .commands import Given
 from .robot import Robot
-from .state import RobotState
 
+_OWNER: Final = "robot_{}"  # of memory variables of a robot, by its name
 _SAME_GRAVITY: Final = 1e-3  # [m/s^2]
-
-
-@dataclass(frozen=True)
-class SceneState:
-    """The state of B environments of a `RobotScene`.
-
-    Attributes:
-        body: positions (B, N, 3) [m] and velocities [m/s] of all vertices, and memory of materials and contacts.
-        robots: states of the robots in their own frames, by name, without memory of materials: for `Robot.observe`.
-        lost: (B,) bool, whether a step has failed, where the robots count failures; all bodies stand at rest then.
-    """
-
-    body: State
-    robots: Mapping[str, RobotState]
-    lost: torch.Tensor
-
-    def where(self, chosen: torch.Tensor, other: "SceneState") -> "SceneState":
-        """Joins two states of a scene: this one where chosen (B,) bool, the other one elsewhere."""
-        body = RobotState(self.body).where(chosen, RobotState(other.body)).body
-        robots = {name: own.where(chosen, other.robots[name]) for name, own in self.robots.items()}
-        return SceneState(body, robots, torch.where(chosen, self.lost, other.lost))
 
 
 class RobotScene:
@@ -148,7 +127,7 @@ class RobotScene:
                 "without rotation."
             )
 
-    def begin(self, batch: int = 1, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> SceneState:
+    def begin(self, batch: int = 1, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> State:
         """Returns the state with every robot in its equilibrium on its own, and objects at rest in their places.
 
         Args:
@@ -160,7 +139,7 @@ class RobotScene:
             ConvergenceError: a robot has no equilibrium.
         """
         given = self._checked(inputs)
-        rest, own = self.simulator.rest_state(batch), dict[str, RobotState]()
+        rest, own = self.simulator.rest_state(batch), dict[str, State]()
         parts = []
         for name, _, _ in self.scene.members:
             at = self.scene.vertex_slice(name)
@@ -169,10 +148,9 @@ class RobotScene:
                 parts.append(self._placed(name, own[name].q))
             else:
                 parts.append(rest.q[:, at])
-        body = self.simulator.state(torch.cat(parts, 1))
-        return SceneState(body, own, torch.zeros(batch, dtype=torch.bool, device=body.q.device))
+        return self._with_robots(self.simulator.state(torch.cat(parts, 1)), own)
 
-    def step(self, state: SceneState, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> SceneState:
+    def step(self, state: State, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> State:
         """Returns the state after one time step; differentiable.
 
         Args:
@@ -184,27 +162,32 @@ class RobotScene:
             ConvergenceError: the step failed.
         """
         given, by_body = self._checked(inputs), dict[str, Inputs]()
-        after = dict[str, Callable[[State], RobotState]]()
+        after = dict[str, Callable[[State], State]]()
         for name, robot in self.robots.items():
-            acting, after[name] = robot.drive(state.robots[name], **given.get(name, {}))
+            acting, after[name] = robot.drive(self.state_of(state, name), **given.get(name, {}))
             by_body[name] = self._inputs_in_scene(name, acting)
         if any(own.fixed_positions is not None for own in by_body.values()):
             for name, body, first in self.scene.members:
                 own = by_body.get(name, Inputs())
                 if own.fixed_positions is None and len(body.fixed_vertices):
                     places = self.simulator.rest_positions[first + body.fixed_vertices]
-                    by_body[name] = own.replace(fixed_positions=places.expand(state.body.batch, -1, -1))
-        new = self.simulator.step(state.body, self.scene.inputs(by_body), self.constants)
+                    by_body[name] = own.replace(fixed_positions=places.expand(state.batch, -1, -1))
+        new = self.simulator.step(state, self.scene.inputs(by_body), self.constants)
         lost = state.lost | ~new.converged
         if bool(lost.any()):
-            rest = self.simulator.rest_state(state.body.batch)
-            new = RobotState(rest).where(lost, RobotState(new)).body
-        robots = {name: replace(after[name](self._own(name, new)), lost=lost) for name in self.robots}
-        return SceneState(new, robots, lost)
+            new = self.simulator.rest_state(state.batch).where(lost, new)
+        new = new.with_memory({"lost": lost})
+        return self._with_robots(new, {name: after[name](self._in_frame(name, new)) for name in self.robots})
 
-    def observe(self, state: SceneState) -> dict[str, torch.Tensor]:
+    def state_of(self, state: State, name: str) -> State:
+        """Returns the state of a robot in its frame, without the memory of its materials, as for `Robot.observe`."""
+        return self._in_frame(name, state).with_memory(state.memory_of(_OWNER.format(name)))
+
+    def observe(self, state: State) -> dict[str, torch.Tensor]:
         """Returns markers (B, M, 3) of the robots in the frame of the scene, by name [m]."""
-        return {name: self._placed(name, robot.observe(state.robots[name])) for name, robot in self.robots.items()}
+        return {
+            name: self._placed(name, robot.observe(self.state_of(state, name))) for name, robot in self.robots.items()
+        }
 
     def _checked(self, inputs: Mapping[str, Mapping[str, Given]] | None) -> Mapping[str, Mapping[str, Given]]:
         given = inputs or {}
@@ -218,10 +201,18 @@ class RobotScene:
         rotation, shift = self._frames[name]
         return points @ rotation.mT + shift
 
-    def _own(self, name: str, body: State) -> State:
-        """State of a robot in its own frame."""
+    def _in_frame(self, name: str, body: State) -> State:
+        """Positions and velocities of a robot in its frame."""
         (rotation, shift), at = self._frames[name], self.scene.vertex_slice(name)
         return State((body.q[:, at] - shift) @ rotation, body.v[:, at] @ rotation)
+
+    @staticmethod
+    def _with_robots(state: State, robots: Mapping[str, State]) -> State:
+        """Adds the memory of the robots' actuators and networks to a state."""
+        for name, own in robots.items():
+            state = state.with_memory({**own.memory_of(), "lost": state.lost}, _OWNER.format(name))
+        left = torch.stack([own.left for own in robots.values()]).any(0)
+        return state.with_memory({"lost": state.lost, "left": left})
 
     def _inputs_in_scene(self, name: str, own: Inputs) -> Inputs:
         fields: dict[str, torch.Tensor | None] = {}

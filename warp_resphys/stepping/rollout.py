@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
 from typing import TypeVar
 
+import torch
+
 S = TypeVar("S")  # a state
 I = TypeVar("I")  # noqa: E741  # inputs of a step
 O = TypeVar("O")  # noqa: E741  # what is observed in a state
@@ -38,3 +40,34 @@ def rollout(step: Stepper[S, I], state: S, inputs: Iterable[I], observe: Callabl
         observe: what is kept of a state.
     """
     return [observe(now) for now in states(step, state, inputs)]
+
+
+def on_steps(times: torch.Tensor, step: float) -> bool:
+    """Returns whether all times (...,) are whole numbers of steps [s]."""
+    position = times.detach() / step
+    return bool(((position - position.round()).abs() < 1e-6).all())
+
+
+def sample(series: torch.Tensor, times: torch.Tensor, step: float) -> torch.Tensor:
+    """(B, T, ...) values at the given times, by cubic Hermite interpolation with central differences as slopes.
+
+    Args:
+        series: (B, K + 1, ...) values at the times 0, h, ..., K h, with K at least 2 if a time is between them.
+        times: (B, T) [s], from zero; beyond the end the last value stays.
+        step: h [s].
+    """
+    last = series.shape[1] - 1
+    position = (times / step).clamp(0.0, float(last))
+    batch = torch.arange(len(series), device=series.device)[:, None]
+    if not times.requires_grad and on_steps(times, step):
+        return series[batch, position.round().long()]
+    slopes = torch.gradient(series, dim=1, edge_order=2)[0]
+    index = position.floor().long().clamp(max=last - 1)
+    s = (position - index).reshape(*times.shape, *[1] * (series.ndim - 2))
+    a, b, da, db = series[batch, index], series[batch, index + 1], slopes[batch, index], slopes[batch, index + 1]
+    return (
+        (1.0 + 2.0 * s) * (1.0 - s) ** 2 * a
+        + s * (1.0 - s) ** 2 * da
+        + s**2 * (3.0 - 2.0 * s) * b
+        + s**2 * (s - 1.0) * db
+    )

@@ -2,13 +2,14 @@
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 
 from ..io.errors import InputError
 from .inputs import check_tensor, shapes
 
+ROBOT = "robot"  # owner of the memory variables of a robot and of its roll-out
 _MEMORY = "memory."  # prefix of memory variables among the tensors of a state
 
 
@@ -24,14 +25,14 @@ class SolveReport:
 
 @dataclass(frozen=True)
 class State:
-    """Positions and velocities of a batch, and the memory variables of its energies."""
+    """State of a batch of bodies, robots or scenes: everything on which their next step depends."""
 
     q: torch.Tensor  # (B, N, 3) [m]
     v: torch.Tensor  # (B, N, 3) [m/s]
     previous: tuple[torch.Tensor, torch.Tensor] | None = None  # (q, v) one step earlier, for BDF2
-    # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest
+    # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest. Variables
+    # OWNER.NAME are those of robots (`own`), such as commands on their way; a simulator ignores them
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    lost: torch.Tensor | None = None  # (B,) bool, whether a roll-out that counts failures has diverged
     report: SolveReport | None = field(default=None, compare=False)  # of the step that led here; None for other states
 
     def __repr__(self) -> str:
@@ -60,6 +61,51 @@ class State:
         for unit, (name, values) in zip(itertools.cycle(("m", "m/s")), fields.items(), strict=False):
             check_tensor(name, values, (self.batch, vertices, 3), unit, "vertex", like)
 
+    @property
+    def lost(self) -> torch.Tensor:
+        """(B,) bool, whether the simulation has diverged, where failures are counted; the body stands at rest then."""
+        return self._flag("lost")
+
+    @property
+    def left(self) -> torch.Tensor:
+        """(B,) bool, whether the learned force was ever evaluated outside its training range."""
+        return self._flag("left")
+
+    def _flag(self, name: str) -> torch.Tensor:
+        known = self.memory.get(f"{ROBOT}.{name}")
+        return torch.zeros(self.batch, dtype=torch.bool, device=self.q.device) if known is None else known
+
+    def memory_of(self, owner: str = ROBOT) -> dict[str, torch.Tensor]:
+        """Returns the memory variables of a robot by name."""
+        before = f"{owner}."
+        return {name.removeprefix(before): x for name, x in self.memory.items() if name.startswith(before)}
+
+    def with_memory(self, variables: Mapping[str, torch.Tensor], owner: str = ROBOT) -> "State":
+        """Returns the state with these memory variables of a robot in place of its former ones."""
+        before = f"{owner}."
+        others = {name: x for name, x in self.memory.items() if not name.startswith(before)}
+        return replace(self, memory=others | {f"{before}{name}": x for name, x in variables.items()})
+
+    def select(self, environments: Sequence[int]) -> "State":
+        """Returns the state of some environments, by number."""
+        rows = torch.as_tensor([*environments], device=self.q.device)
+        return self.map(lambda tensor: tensor[rows])
+
+    def repeat(self, times: int) -> "State":
+        """Returns the state with all environments repeated several times."""
+        return self.map(lambda tensor: torch.cat([tensor] * times))
+
+    def where(self, chosen: torch.Tensor, other: "State") -> "State":
+        """Joins two states: this one where chosen (B,) bool, the other one elsewhere."""
+        if bool(chosen.all()):
+            return self
+        mine, theirs = ({"previous_q": state.q, "previous_v": state.v} | state.tensors() for state in (self, other))
+        joined = {}
+        for name, like in (self.tensors() | other.tensors()).items():
+            a, b = (tensors[name] if name in tensors else torch.zeros_like(like) for tensors in (mine, theirs))
+            joined[name] = torch.where(chosen.view(-1, *[1] * (like.ndim - 1)), a, b)
+        return State.from_tensors(joined)
+
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
         """Returns the state with a function applied to every tensor, without report."""
         return State.from_tensors({name: change(tensor) for name, tensor in self.tensors().items()})
@@ -69,11 +115,10 @@ class State:
         return self.map(torch.Tensor.detach)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Returns the tensors by name: ``q``, ``v``, ``previous_q``, ``previous_v``, ``lost``, ``memory.NAME``."""
+        """Returns the tensors by name: ``q``, ``v``, ``previous_q``, ``previous_v``, ``memory.NAME``."""
         tensors = {"q": self.q, "v": self.v}
         if self.previous is not None:
             tensors |= {"previous_q": self.previous[0], "previous_v": self.previous[1]}
-        tensors |= {} if self.lost is None else {"lost": self.lost}
         return tensors | {f"{_MEMORY}{name}": tensor for name, tensor in self.memory.items()}
 
     @classmethod
@@ -81,7 +126,7 @@ class State:
         """Builds the state from its `tensors`; other names are ignored."""
         previous = (tensors["previous_q"], tensors["previous_v"]) if "previous_q" in tensors else None
         memory = {name.removeprefix(_MEMORY): x for name, x in tensors.items() if name.startswith(_MEMORY)}
-        return cls(tensors["q"], tensors["v"], previous, memory, tensors.get("lost"))
+        return cls(tensors["q"], tensors["v"], previous, memory)
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from ..experiment.build import bound_markers, marker_view_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.volume_mesh import surface_vertices
-from ..robot.inputs import BASE
+from ..robot.commands import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot
-from ..robot.state import RobotState
 from ..stepping.quantity import Quantity
+from ..stepping.state import State
 
 MATERIAL: Final = ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping")
 _ROUNDING: Final = 1e-9  # Of times [s].
@@ -62,7 +62,7 @@ class LiveRobot:
         self.held: tuple[FloatArray, FloatArray] | None = None
         self._on_body = _markers_on_body(robot)
         self.moved: dict[str, FloatArray] = {}
-        self.state: RobotState
+        self.state: State
         self.trial: RecordedTrial | None = None
         self.failure = ""
         self.reset()
@@ -245,14 +245,19 @@ class LiveRobot:
                 at = at[min(number, len(at) - 1)] if at.ndim == 3 else at
                 self.inputs[name][:] = at.reshape(-1).double().cpu().numpy()
         acting = {name: values.copy() for name, values in self.inputs.items() if name != BASE}
-        if self.state.base is not None or (BASE in self.inputs and self.inputs[BASE].any()):
+        if self._base is not None or (BASE in self.inputs and self.inputs[BASE].any()):
             acting[BASE] = self.inputs[BASE].copy() if self.trial is not None else self._moved_base()
         return acting
+
+    @property
+    def _base(self) -> torch.Tensor | None:
+        """Displacement (1, 2, 6) of the base before and after the last step [m, rad]; None if it never moved."""
+        return self.state.memory_of().get(BASE)
 
     def _moved_base(self) -> FloatArray:
         """Motion of the base (6,) towards its commanded value, at no more than `_BASE_SPEED`."""
         target = self.inputs[BASE]
-        now = np.zeros(6) if self.state.base is None else self.state.base[-1, 0].double().cpu().numpy()
+        now = np.zeros(6) if self._base is None else self._base[0, -1].double().cpu().numpy()
         far = np.repeat([self.size, 1.0], 3) * _BASE_SPEED * self.robot.time_step
         return np.asarray(now + np.clip(target - now, -far, far))
 

@@ -20,9 +20,9 @@ import numpy as np
 from ..control.controllers import conditioned
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
-from ..robot.inputs import Given
+from ..robot.commands import Given
 from ..robot.robot import Robot
-from ..robot.state import RobotState
+from ..stepping.state import State
 
 _UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump, over the size of the body
 _SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
@@ -198,7 +198,7 @@ class TwinEstimator(ABC, Generic[B]):
         return []
 
     @abstractmethod
-    def robot_state(self, belief: B) -> RobotState:
+    def robot_state(self, belief: B) -> State:
         """Returns the estimated state of the robot, one environment."""
 
     @abstractmethod

@@ -21,9 +21,8 @@ from ..energies.surfaces import SurfaceContact
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError, listed
 from ..learning.parameters import check_names, identifiable_parameters
-from ..robot.inputs import Given
+from ..robot.commands import Given
 from ..robot.robot import Robot
-from ..robot.state import RobotState
 from ..stepping.quantity import Quantity
 from ..stepping.state import State
 from .estimator import Belief, TwinEstimator
@@ -49,7 +48,7 @@ class FullBelief(Belief):
         wait: steps until the next one.
     """
 
-    state: RobotState
+    state: State
     transition: FloatArray
     turn: int = 0
     pause: int = 1
@@ -168,10 +167,10 @@ class FullEstimator(TwinEstimator[FullBelief]):
         return replace(self._propagated(belief, belief.transition), state=state)
 
     @override
-    def robot_state(self, belief: FullBelief) -> RobotState:
+    def robot_state(self, belief: FullBelief) -> State:
         return belief.state.select([0])
 
-    def _renewed(self, belief: FullBelief, after: RobotState) -> FullBelief:
+    def _renewed(self, belief: FullBelief, after: State) -> FullBelief:
         """Renews a column of the transition from a step of which the last two environments began with its changes."""
         column = self.tangent.slopes(after.select([self._count, self._count + 1]), [belief.turn])[:, 0]
         before, transition, r = belief.transition[:, belief.turn], belief.transition.copy(), len(belief.bias)
@@ -187,7 +186,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         q = state.q - ago * state.v
         amount = _SEEN_STEP * self.size / tangent.shapes.norm(dim=2).amax(1)
         both = torch.cat([q, q[:1] + amount[:, None, None] * tangent.shapes])
-        seen = self.robot.observe(RobotState(State(both, torch.zeros_like(both)))).cpu().double().numpy()
+        seen = self.robot.observe(State(both, torch.zeros_like(both))).cpu().double().numpy()
         now, beside, free, moved = seen[0], seen[1 : self._count - 1], seen[self._count - 1], seen[self._count :]
         by_z = np.moveaxis((moved - now) / amount.cpu().double().numpy()[:, None, None], 0, 2)
         by_values = np.moveaxis((beside - now) / self._apart[:, None, None], 0, 2)
@@ -206,7 +205,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         state, tangent = belief.state, self.tangent
         if len(self._prior):
             share = state.q.new_tensor((parameters - belief.parameters) / self._apart)
-            state = state.map(lambda value, axis: _along(value, axis, share))
+            state = state.map(lambda value: _along(value, share))
         own = state.q.new_ones(self._count, 1, 1)
         own[-1] = 0.0
         shapes = (torch.einsum("r,rni->ni", state.q.new_tensor(x), tangent.shapes) for x in (z, w))
@@ -230,7 +229,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
         return np.clip(parameters, low + far, high - far - self._apart)
 
 
-def at_rest(robot: Robot, batch: int, inputs: Mapping[str, Given]) -> RobotState:
+def at_rest(robot: Robot, batch: int, inputs: Mapping[str, Given]) -> State:
     """The equilibrium under constant commands, without the learned force where there is none with it."""
     try:
         return robot.settle(batch, **inputs)
@@ -238,10 +237,9 @@ def at_rest(robot: Robot, batch: int, inputs: Mapping[str, Given]) -> RobotState
         return robot.begin(batch, **inputs)
 
 
-def _along(value: torch.Tensor, axis: int, share: torch.Tensor) -> torch.Tensor:
+def _along(rows: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
     """Moves a tensor of the state along those that run beside, by shares (P,) of the differences; the last stays."""
-    if not value.is_floating_point():
-        return value
-    rows = value.movedim(axis, 0)
-    step = torch.tensordot(share.to(value), rows[1 : 1 + len(share)] - rows[:1], dims=1)
-    return torch.cat([rows[:-1] + step, rows[-1:]]).movedim(0, axis)
+    if not rows.is_floating_point():
+        return rows
+    step = torch.tensordot(share.to(rows), rows[1 : 1 + len(share)] - rows[:1], dims=1)
+    return torch.cat([rows[:-1] + step, rows[-1:]])

@@ -13,9 +13,9 @@ from ..control.reduction import reduced_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.correction import DIVERGENCE_DISTANCE
-from ..robot.inputs import Given, InputReader
+from ..robot.commands import Given, InputReader
 from ..robot.robot import Robot
-from ..robot.state import RobotState
+from ..stepping.state import State
 from .estimator import Belief, TwinEstimator
 
 _SLOWEST = 1.0  # least frequency of a coordinate, for the scale of its errors [rad/s]
@@ -107,14 +107,15 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         return replace(self._propagated(belief, transition), state=end, outside=belief.outside or left)
 
     @override
-    def robot_state(self, belief: ReducedBelief) -> RobotState:
+    def robot_state(self, belief: ReducedBelief) -> State:
         """Returns the estimated state of the robot, in which the material has relaxed."""
         simulator, (rate, *_) = self.robot.simulator, belief.state.v
         moved, faster = self.model.positions(belief.state)[:1], (self.model.basis @ rate).reshape(1, -1, 3)
         state = self.robot.state(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster))
-        known = {f"{self.model.name}.{key}": np.array(value[..., :1, :]) for key, value in belief.state.memory.items()}
-        memory = {**state.memory, **{key: simulator.tensor(value) for key, value in known.items()}}
-        return replace(state, memory=memory, left=torch.full_like(state.left, belief.outside))
+        memory = {**state.memory_of(), "left": torch.full_like(state.left, belief.outside)}
+        for key, value in belief.state.memory.items():
+            memory[f"{self.model.name}.{key}"] = simulator.tensor(np.moveaxis(value[..., :1, :], -2, 0).copy())
+        return state.with_memory(memory)
 
     @override
     def _seen(self, belief: ReducedBelief, ago: float) -> tuple[FloatArray, FloatArray, FloatArray]:

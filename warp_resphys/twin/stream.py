@@ -18,7 +18,7 @@ from ..data.rigid_bodies import as_markers, with_corners
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError, listed
 from ..robot.robot import Robot
-from ..robot.state import RobotState
+from ..stepping.state import State
 
 _LARGEST: Final = 65_535  # bytes of a packet
 _FIELDS: Final = ("time", "markers", "inputs", "plan")
@@ -259,7 +259,7 @@ class Forecast:
     times: FloatArray
     markers: FloatArray
     deviations: FloatArray
-    state: RobotState
+    state: State
 
 
 @dataclass(frozen=True)

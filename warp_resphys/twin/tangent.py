@@ -16,9 +16,8 @@ import torch
 
 from ..energies.materials import VISCOUS
 from ..io.arrays import FloatArray, IntArray
-from ..robot.inputs import FORCE, Given, InputReader
+from ..robot.commands import FORCE, Given, InputReader
 from ..robot.robot import Robot
-from ..robot.state import RobotState
 from ..stepping.integrators import make_integrator
 from ..stepping.state import State
 
@@ -53,7 +52,7 @@ class StepTangent:
     free: torch.Tensor
 
     @classmethod
-    def of(cls, robot: Robot, state: RobotState, inputs: Mapping[str, Given], modes: int) -> "StepTangent":
+    def of(cls, robot: Robot, state: State, inputs: Mapping[str, Given], modes: int) -> "StepTangent":
         """Linearises a step from a state of rest, with one environment.
 
         Args:
@@ -102,7 +101,7 @@ class StepTangent:
         moved, faster, pulled = torch.cat([fields, -fields], dim=1)
         return moved, faster, pulled
 
-    def slopes(self, after: RobotState, columns: Sequence[int]) -> FloatArray:
+    def slopes(self, after: State, columns: Sequence[int]) -> FloatArray:
         """Returns C columns (2 r, C) of a transition, from 2 C environments after `changes` and a step."""
         count, environments = len(columns), range(len(after.q))
         below, above = after.select(environments[count:]), after.select(environments[:count])
@@ -118,9 +117,7 @@ def pulled_by(robot: Robot, inputs: Mapping[str, Given], forces: torch.Tensor) -
     return {**inputs, FORCE: forces}
 
 
-def shifted(
-    robot: Robot, state: RobotState, moved: torch.Tensor, faster: torch.Tensor, at_once: bool = True
-) -> RobotState:
+def shifted(robot: Robot, state: State, moved: torch.Tensor, faster: torch.Tensor, at_once: bool = True) -> State:
     """Returns a state with other positions and velocities, and a past that fits them; obstacles push the body out.
 
     Args:
@@ -131,25 +128,25 @@ def shifted(
         at_once: whether the body has only just been moved, so that its material has not relaxed there; else as if it
             had always been there.
     """
-    body, memory = state.body, dict(state.body.memory)
-    q, v = robot.simulator.outside(body.q + moved, body, robot.constants), body.v + faster
-    moved = q - body.q
-    if at_once and memory:
-        after, before = (robot.simulator.remember(body, x, robot.constants).memory for x in (q, body.q))
-        memory = {name: value + (after[name] - before[name]) for name, value in memory.items()}
+    memory = dict(state.memory)
+    q, v = robot.simulator.outside(state.q + moved, state, robot.constants), state.v + faster
+    moved = q - state.q
+    if at_once and any("." not in name for name in memory):
+        after, before = (robot.simulator.remember(state, x, robot.constants).memory for x in (q, state.q))
+        memory |= {name: memory[name] + (value - before[name]) for name, value in after.items() if name in memory}
     previous = None
-    if body.previous is not None:
-        previous = body.previous[0] + moved - robot.time_step * faster, body.previous[1] + faster
-    return replace(state, body=State(q, v, previous, memory))
+    if state.previous is not None:
+        previous = state.previous[0] + moved - robot.time_step * faster, state.previous[1] + faster
+    return State(q, v, previous, memory)
 
 
 def _vibrations(
-    robot: Robot, state: RobotState, inputs: Mapping[str, Given], modes: int
+    robot: Robot, state: State, inputs: Mapping[str, Given], modes: int
 ) -> tuple[FloatArray, FloatArray, scipy.sparse.csc_array, IntArray]:
     """Eigenvalues (r,) [1/s^2], vectors (3 F, r), mass (3 F, 3 F) of the slowest vibrations; free vertices."""
-    still = replace(state, body=State(state.q, torch.zeros_like(state.v), memory=state.body.memory))
+    still = State(state.q, torch.zeros_like(state.v), memory=state.memory)
     hessian, mass, free = robot.linearised(still, **inputs)
-    step = make_integrator(robot.simulator.integrator).stage(still.body, robot.time_step).step
+    step = make_integrator(robot.simulator.integrator).stage(still, robot.time_step).step
     stiffness, mass = (hessian - mass).tocsc(), scipy.sparse.csc_array(step**2 * mass)
     unknowns = mass.shape[0]
     count = min(modes + 6, unknowns - 2)

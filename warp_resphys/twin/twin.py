@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..robot.inputs import Given, InputReader
+from ..robot.commands import Given, InputReader
 from ..robot.robot import Robot
-from ..robot.state import RobotState
+from ..stepping.state import State
 from .estimator import Belief, Correction, TwinEstimator
 from .full import FullEstimator
 from .reduced import ReducedEstimator
@@ -44,7 +44,7 @@ class Estimate:
     """
 
     time: float
-    state: RobotState
+    state: State
     markers: FloatArray
     deviations: FloatArray
     parameters: Mapping[str, tuple[float, float]]

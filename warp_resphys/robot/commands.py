@@ -23,9 +23,8 @@ from ..learning.parameters import MASS_FACTOR
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.rotations import rotations
-from ..stepping.state import State
+from ..stepping.state import ROBOT, State
 from .description import Description
-from .state import RobotState
 
 BASE: Final = "base"
 FORCE: Final = "external_force"
@@ -160,7 +159,8 @@ class Acting:
     Attributes:
         inputs: of the simulator.
         conditions: (B, A) inputs of the network beside the state; None if it has none.
-        memory: `RobotState.memory` after the step.
+        memory: memory variables of the robot's actuators and base after the step (`State.memory_of`), such as
+            ``pressure.queue`` (B, K, C), see `InputResponse`, and ``base`` (B, 2, 6) [m, rad].
         base: (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved.
     """
 
@@ -194,43 +194,44 @@ class Commands:
         responses = {name: response_of(simulator.inputs[name], parameters) for name in taken}
         self._responses = {name: InputResponse(h, **own, filters=filters) for name, own in responses.items()}
 
-    def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> RobotState:
+    def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> State:
         """Returns the state after constant inputs (B, C), zero if omitted, have acted for a long time."""
-        memory: dict[str, torch.Tensor] = {}
+        memory = {"lost": body.lost, "left": body.left}
         for name, response in self._responses.items():
             still = response.steady(self._value(name, given, body))
-            memory |= {f"{name}.{key}": values for key, values in still.items()}
-        moved = self._description.told_of_base is not None or BASE in given
-        return RobotState(body, memory, base=torch.stack([self._value(BASE, given, body)] * 2) if moved else None)
+            memory |= {f"{name}.{key}": values.movedim(-2, 0) for key, values in still.items()}
+        if self._description.told_of_base is not None or BASE in given:
+            memory[BASE] = torch.stack([self._value(BASE, given, body)] * 2, 1)
+        return body.with_memory(memory)
 
-    def act(self, state: RobotState, given: Mapping[str, torch.Tensor]) -> Acting:
+    def act(self, state: State, given: Mapping[str, torch.Tensor]) -> Acting:
         """Returns what acts during a step with inputs (B, C) by name; omitted ones are zero, an omitted base stays."""
         description = self._description
         fields: dict[str, torch.Tensor | None] = {FORCE: given.get(FORCE)}
-        conditions, memory = list[torch.Tensor](), dict[str, torch.Tensor]()
+        conditions, memory, before = list[torch.Tensor](), dict[str, torch.Tensor](), state.memory_of()
         payload = given.get(PAYLOAD.name)
         if description.payload_at is not None and description.sees_payload:
-            conditions.append(self._value(PAYLOAD.name, given, state.body))
+            conditions.append(self._value(PAYLOAD.name, given, state))
         for name, response in self._responses.items():
-            own = f"{name}."
-            remembered = {key.removeprefix(own): x for key, x in state.memory.items() if key.startswith(own)}
-            acting, means, later = response(remembered, self._value(name, given, state.body)[None])
+            remembered = {key: x.movedim(0, -2) for key, x in state.memory_of(f"{ROBOT}.{name}").items()}
+            acting, means, later = response(remembered, self._value(name, given, state)[None])
             fields[name] = acting[0]
             conditions += [with_means(acting[0], means[:, 0])] if name in description.seen else []
-            memory |= {f"{own}{key}": values for key, values in later.items()}
+            memory |= {f"{name}.{key}": values.movedim(-2, 0) for key, values in later.items()}
         if payload is not None:
             fields |= self._hung(payload)
-        base = state.base
-        if BASE in given or base is not None:
-            before = given[BASE].new_zeros(2, *given[BASE].shape) if base is None else base
-            base = torch.cat([before, given.get(BASE, before[1])[None]])
+        base = None
+        if BASE in given or BASE in before:
+            moved = before[BASE].unbind(1) if BASE in before else [torch.zeros_like(given[BASE])] * 2
+            base = torch.stack([*moved, given.get(BASE, moved[1])])
+            memory[BASE] = base[1:].movedim(1, 0)
             fields["fixed_positions"] = self._fixed(base[2])
             if BASE in given:
                 self._check_base(base)
             if description.told_of_base is not None:
                 gravity = self._simulator.tensor(self._simulator.gravity)
-                moved = base_movement(base, self._simulator.time_step, gravity)[1]
-                conditions.append(moved[:, torch.tensor(description.told_of_base, device=moved.device)])
+                movement = base_movement(base, self._simulator.time_step, gravity)[1]
+                conditions.append(movement[:, torch.tensor(description.told_of_base, device=movement.device)])
         return Acting(Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base)
 
     def _value(self, name: str, given: Mapping[str, torch.Tensor], body: State) -> torch.Tensor:

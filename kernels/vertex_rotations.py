@@ -105,7 +105,7 @@ def tangent(
 
 
 @wp.kernel
-def slopes(
+def adjoint(
     points: VectorPoints,
     inertia: wp.array2d[wp.float64],
     target: wp.array2d[wp.vec3d],

@@ -9,7 +9,7 @@ import torch
 from warp_resphys import Body, Corotated, Inputs, Rigid, Simulator, Tendons, select_vertices
 from warp_resphys.dynamics.energy_set import EnergySet
 from warp_resphys.dynamics.linearisation import Linearisation
-from warp_resphys.energies.placement import place_energies
+from warp_resphys.energies.body_energies import place_energies
 from warp_resphys.fem.coordinates import DeviceCoordinates
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.boxes import box_hexahedra
@@ -84,7 +84,7 @@ def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     values, mass = energies.prepare({**given, "tip_density": torch.tensor([[500.0], [700.0]]).double()})
     volume = 0.02**3
     np.testing.assert_allclose(mass.inertia.sum(1), [volume * (1000.0 + 2 * density) for density in (500.0, 700.0)])
-    assert "tendon_friction" in values
+    assert "tendon_friction" in values[-1]
     energies.check_memory({"tendon_segment_tension": rest.new_zeros(2, 3)}, 2, rest)
     for wrong in ({"tension": rest.new_zeros(2, 1)}, {"tendon_segment_tension": rest.new_zeros(2, 1)}):
         with pytest.raises(InputError, match=next(iter(wrong))):

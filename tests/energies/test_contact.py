@@ -356,8 +356,8 @@ TWO = {"a": HalfSpace(position=(0.0, 0.0, -0.1)), "b": HalfSpace(position=(0.0, 
 def test_values_by_the_name_of_an_obstacle():
     contact = Contact(TWO, stiffness=2e4, friction={"b": 0.2, "a": 0.1})
     constants = Simulator(Body(BLOCK, energies=[contact])).prepare()
-    assert constants.value("contact_friction").tolist() == [[0.1, 0.2]]
-    assert constants.value("contact_stiffness").unique().tolist() == [2e4]
+    assert constants.values[1]["contact_friction"].tolist() == [[0.1, 0.2]]
+    assert constants.values[1]["contact_stiffness"].unique().tolist() == [2e4]
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ import torch
 
 from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
+from warp_resphys.energies.body_energies import PlacedEnergy
 from warp_resphys.energies.catalogue import MATERIALS as ALL_MATERIALS
 from warp_resphys.energies.materials import ConvexMaterial, DensityMaterial
-from warp_resphys.energies.placement import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
 from warp_resphys.linalg.choice import make_linear_solver
@@ -63,7 +63,7 @@ def unit_potential(
     stiffness = torch.stack([full(modulus, 1) for modulus in moduli], dim=-1)
     values = {"stiffness": stiffness, "viscosity": viscous, "strain_offset": viscous[0, 0] * strain}
     values["dilation_offset"] = viscous[0, 1] * strain.diagonal(dim1=-2, dim2=-1).sum(-1)
-    potential.set_terms(StepTerms(full(0, 4, 3), full(0, 4), full(0, 4, 3), values))
+    potential.set_terms(StepTerms(full(0, 4, 3), full(0, 4), full(0, 4, 3), [values]))
     potential.positions.copy_(torch.as_tensor(UNIT @ gradients.transpose(0, 2, 1), **where))
     return potential
 
@@ -198,7 +198,7 @@ def loaded_potential(mesh):
     strain = 0.01 * noise(b, sum(s.n_points for s in sets), 3, 3)
     main = noise(b, n, 3), 1e4 * (1 + noise(b, n)), noise(b, n, 3)
     values = {"viscosity": noise(b, 2), "strain_offset": strain + strain.mT, "dilation_offset": strain[..., 0, 0]}
-    potential.set_terms(StepTerms(*main, {"stiffness": torch.stack(stiffness, dim=-1), **values}))
+    potential.set_terms(StepTerms(*main, [{"stiffness": torch.stack(stiffness, dim=-1), **values}]))
     potential.positions.copy_(torch.as_tensor(mesh.vertices) + 1e-3 * noise(b, n, 3))
     pattern = BlockPattern(body.mesh.vertices, body.fixed_vertices, sets)
     dofs = (3 * pattern.free[:, None] + np.arange(3)).ravel()

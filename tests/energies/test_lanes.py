@@ -6,8 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import Body, box_hexahedra, box_tetrahedra
+from warp_resphys.energies.body_energies import PlacedEnergy
 from warp_resphys.energies.catalogue import MATERIALS
-from warp_resphys.energies.placement import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid, SolidTerm
 
@@ -40,7 +40,7 @@ def potential_of(mesh, batch, **options):
 
 def whole_cells(p):
     """Whether each set of points is taken cell by cell."""
-    return [p.energies[0].whole_cells(s, p.own_values[0], p._position_view) is not None for s in p.sets]
+    return [p.energies[0].lane_cells(s) is not None for s in p.sets]
 
 
 def evaluated(mesh, viscosity, q, bulk=1.0):
@@ -60,7 +60,7 @@ def evaluated(mesh, viscosity, q, bulk=1.0):
         "dilation_offset": 0.1 * torch.randn(batch, term.n_points, generator=random, dtype=torch.float64),
     }
     n = len(mesh.vertices)
-    p.set_terms(StepTerms(p.zeros(n, 3), p.zeros(n), p.zeros(n, 3), values))
+    p.set_terms(StepTerms(p.zeros(n, 3), p.zeros(n), p.zeros(n, 3), [values]))
     p.positions.copy_(torch.as_tensor(q))
     p.evaluate()
     p.update_tangent(torch.arange(batch) == 1)
@@ -92,7 +92,7 @@ def test_cells_as_a_whole_equal_their_points(mesh, viscosity, monkeypatch):
     growth = np.linalg.det(gradients_of(whole, q)).min((1, 2))
     assert growth[:-1].min() > 0.1
     assert growth[-1] < 0.0
-    monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
+    monkeypatch.setattr(SolidTerm, "lane_cells", lambda *_: None)
     check_equal(whole, evaluated(MESHES[mesh], viscosity, q))
 
 
@@ -113,7 +113,7 @@ def test_a_flat_point_leaves_the_others_of_its_cell_as_they_are(flattest, monkey
     assert max(groups) > 0.5
     q = np.repeat((mesh.vertices + share * way)[None], 2, 0)
     whole = evaluated(mesh, (2.0, 0.5), q)
-    monkeypatch.setattr(SolidTerm, "whole_cells", lambda *_: None)
+    monkeypatch.setattr(SolidTerm, "lane_cells", lambda *_: None)
     check_equal(whole, evaluated(mesh, (2.0, 0.5), q))
 
 

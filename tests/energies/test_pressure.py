@@ -9,8 +9,8 @@ import torch
 from support.chambered import BRICK, KINDS, chambered, hollow_box
 from support.slopes import check_slopes
 from warp_resphys import Body, Corotated, Inputs, Pressure, Simulator, SolverSettings
+from warp_resphys.energies.body_energies import PlacedEnergy
 from warp_resphys.energies.fibres import Fibres
-from warp_resphys.energies.placement import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
@@ -35,7 +35,7 @@ def force_of(s, q, pressure):
     placed = [PlacedEnergy(energy, energy.points(s.body.mesh))]
     potential = IncrementalPotential(placed, s.body.coordinates, none, len(q), q.device)
     zeros = torch.zeros_like(q)
-    potential.set_terms(StepTerms(zeros, zeros[..., 0], zeros, {"pressure": pressure}))
+    potential.set_terms(StepTerms(zeros, zeros[..., 0], zeros, [{"pressure": pressure}]))
     potential.positions.copy_(q)
     potential.evaluate()
     return -potential.residual

@@ -102,7 +102,7 @@ def test_parts_have_their_own_parameters():
         ({"tendon_stiffness": 5.0 * value, "tendon_stiffness_low": value}, [[1.0, 5.0], [2.0, 10.0]]),
     ):
         constants, _, _ = replay.prepare(given)
-        result = constants.values["tendon_stiffness"]  # two trials for each set of parameters
+        result = constants.values[1]["tendon_stiffness"]  # two trials for each set of parameters
         torch.testing.assert_close(result, double(wanted).repeat_interleave(2, 0))
 
 

@@ -6,25 +6,51 @@ Mass damping is linear in the solution, so it is merged with inertia and target.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import torch
 
-from ..energies.base import BoundEnergy, EnergySite, Memory
+from ..energies.base import BoundEnergy, EnergySite, EnergyStep, Memory
+from ..energies.body_energies import PlacedEnergy
 from ..energies.contact import BoundContact, ContactForces
 from ..energies.obstacles import ObstacleMotion
-from ..energies.placement import DEPENDENT, PlacedEnergy, SimulatorStep
 from ..energies.potential import StepTerms
 from ..energies.surfaces import BoundSurfaceContact
+from ..energies.term import Term, Values
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Quantity
-from ..stepping.state import Constants, Mass, State
+from ..stepping.state import Constants, ImplicitStage, Mass, State
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class SimulatorStep:
+    """One time step of a simulator, or a static equilibrium after a state: a step without end (`endless`)."""
+
+    state: State  # state at the start
+    stage: ImplicitStage  # the implicit solve of the step
+    inputs: Inputs
+    constants: Constants
+    terms: Sequence[Term]  # kernels of all energies for the state's batch
+
+    @classmethod
+    def endless(cls, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]) -> "SimulatorStep":
+        """Returns a static equilibrium, in which inertia has no part."""
+        return cls(state, ImplicitStage(math.inf, state.q, state.q, ()), inputs, constants, terms)
+
+
+def _without(prefix: str, values: Mapping[str, T]) -> Mapping[str, T]:
+    """Selects the values whose names in the simulator have a prefix, and removes it."""
+    if not prefix:
+        return values
+    return {name.removeprefix(prefix): x for name, x in values.items() if name.startswith(prefix)}
 
 
 class EnergySet:
@@ -65,70 +91,79 @@ class EnergySet:
         self.parts: dict[str, tuple[str, ...]] = {}
         self.memory: dict[str, Memory] = {}
         for item in placed:
-            energy, points = item.energy, item.all_points or item.points
+            energy, prefix, points = item.energy, item.prefix, item.all_points or item.points
             bound = energy.bind(EnergySite(item.body or body, item.first, points, rest_positions, method, time_step))
             self._bound.append(bound)
             parameters, inputs = (
-                {f"{item.prefix}{q.name}": replace(q, name=f"{item.prefix}{q.name}") for q in quantities}
+                {f"{prefix}{q.name}": replace(q, name=f"{prefix}{q.name}") for q in quantities}
                 for quantities in (energy.parameters, energy.inputs)
             )
             if duplicates := {*parameters, *inputs} & {*self.parameters, *self.inputs}:
                 raise InputError(f"two energies depend on {min(duplicates)}: rename one of their bodies or regions.")
             self.parameters |= parameters
             self.inputs |= inputs
-            self.constants |= item.named(energy.constants)
-            counts = {q.name: energy.count_of(q) for q in (*energy.parameters, *energy.inputs)}
-            self.counts |= item.named(counts)
-            shared = item.named({name: counts[name] != energy.count for name in counts})
-            self.parts |= {name: energy.names for name in parameters if energy.names and not shared[name]}
-            self.memory |= item.named({m.name: replace(m, name=f"{item.prefix}{m.name}") for m in bound.memory})
-        pairs = list(enumerate(self._pairs))
+            self.constants |= {f"{prefix}{name}": value for name, value in energy.constants.items()}
+            for q in (*energy.parameters, *energy.inputs):
+                self.counts[f"{prefix}{q.name}"] = energy.count_of(q)
+                if q in energy.parameters and energy.names and energy.count_of(q) == energy.count:
+                    self.parts[f"{prefix}{q.name}"] = energy.names
+            self.memory |= {f"{prefix}{m.name}": replace(m, name=f"{prefix}{m.name}") for m in bound.memory}
         self._loading, self._stepping, self._posing = (
-            [(i, pair) for i, pair in pairs if getattr(type(pair[1]), name) is not getattr(BoundEnergy, name)]
+            [k for k, bound in enumerate(self._bound) if getattr(type(bound), name) is not getattr(BoundEnergy, name)]
             for name in ("load", "begin_step", "at_pose")
         )
-        self._remembering = [(i, pair) for i, pair in pairs if pair[1].memory]
-        self._rate_independent = [(i, pair) for i, pair in pairs if pair[1].rate_independent]
+        self._remembering = [k for k, bound in enumerate(self._bound) if bound.memory]
+        self._rate_independent = [k for k, bound in enumerate(self._bound) if bound.rate_independent]
 
-    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor | None], Mass]:
-        """Returns the values that follow from the parameters, by name, and the mass of the body."""
-        values: dict[str, torch.Tensor | None] = {}
-        masses: list[Mass] = []
-        for placed, bound in self._pairs:
-            own = placed.own(parameters)
-            values |= placed.named(bound.prepare(own))
-            if (mass := bound.mass(own)) is not None:
-                masses.append(mass)
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[list[Values], Mass]:
+        """Returns the values of every energy that follow from the parameters, by name, and the mass of the body."""
+        given = [_without(item.prefix, parameters) for item in self.placed]
+        values: list[Values] = [bound.prepare(own) for bound, own in zip(self._bound, given, strict=True)]
+        masses = [mass for bound, own in zip(self._bound, given, strict=True) if (mass := bound.mass(own)) is not None]
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
-    @property
-    def _pairs(self) -> Iterable[tuple[PlacedEnergy, BoundEnergy]]:
-        return zip(self.placed, self._bound, strict=True)
+    def _values(self, step: SimulatorStep, share: float = 1.0) -> list[dict[str, torch.Tensor | None]]:
+        """Returns the values of every energy that follow from parameters and inputs; missing inputs are zero.
 
-    def _values(self, constants: Constants, inputs: Inputs, batch: int) -> dict[str, torch.Tensor | None]:
-        """Returns the values that follow from parameters and inputs, by name; missing inputs are zero."""
-        values = dict(constants.values)
-        for name in self.inputs:
-            value = inputs.actuation.get(name)
-            values[name] = constants.gravity.new_zeros(batch, self.counts[name]) if value is None else value
+        Args:
+            step: the step.
+            share: factor of the inputs.
+        """
+        values, given, batch = [dict(own) for own in step.constants.values], step.inputs.actuation, step.state.batch
+        for own, item in zip(values, self.placed, strict=True):
+            for quantity in item.energy.inputs:
+                name = f"{item.prefix}{quantity.name}"
+                zero = step.constants.gravity.new_zeros
+                if name in given:
+                    own[quantity.name] = given[name] if share == 1.0 else share * given[name]
+                else:
+                    own[quantity.name] = zero(batch, self.counts[name])
         return values
+
+    def _step(self, step: SimulatorStep, k: int) -> EnergyStep:
+        """Returns a step as energy k sees it."""
+        prefix, state, constants = self.placed[k].prefix, step.state, step.constants
+        if prefix and state.memory:
+            state = replace(state, memory=_without(prefix, state.memory))
+        fixed = None if prefix else step.inputs.fixed_positions
+        inputs = _without(prefix, step.inputs.actuation)
+        return EnergyStep(state, step.stage, inputs, fixed, constants.values[k], constants.gravity, step.terms[k])
 
     def step_terms(self, step: SimulatorStep) -> StepTerms:
         """Returns the terms of a step, differentiable."""
         batch, h, constants, stage = step.state.batch, step.stage.step, step.constants, step.stage
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
-        mass, force = constants.mass, self._loads(step, False)
+        mass, force = constants.mass, self._loads(step)
         if step.inputs.attached_mass is not None:
             mass = mass + step.inputs.attached_mass
-        values = self._values(constants, step.inputs, batch)
-        for i, (placed, bound) in self._stepping:
-            values |= placed.named(bound.begin_step(placed.step(step, i)))
+        values = self._values(step)
+        for k in self._stepping:
+            values[k] |= self._bound[k].begin_step(self._step(step, k))
         target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
         inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
-        if self._coordinates.depends:
+        if self._coordinates.depends:  # their inertia is the last energy (`body_energies.place_energies`)
             dependent = self._coordinates.dependent
-            values[f"{DEPENDENT}inertia"] = inertia[:, dependent]
-            values[f"{DEPENDENT}target"] = target[:, dependent]
+            values[-1] |= {"inertia": inertia[:, dependent], "target": target[:, dependent]}
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
 
     def rest_terms(self, step: SimulatorStep, share: float, near: torch.Tensor | None = None) -> StepTerms:
@@ -141,21 +176,16 @@ class EnergySet:
             near: (B, N, 3) positions of forces that depend on the pose; without, these are left out [m].
         """
         state, batch = step.state, step.state.batch
-        values = self._values(step.constants, step.inputs, batch)
-        for name in self.inputs:
-            value = values[name]
-            values[name] = None if value is None else share * value
-        values |= {k: v for placed, bound in self._pairs for k, v in placed.named(bound.at_rest(batch)).items()}
-        for i, (placed, bound) in self._rate_independent:
-            values |= placed.named(bound.begin_step(placed.step(step, i)))
+        values = self._values(step, share)
+        for k, bound in enumerate(self._bound):
+            values[k] |= bound.begin_step(self._step(step, k)) if bound.rate_independent else bound.at_rest(batch)
         if near is not None:
-            for _, (placed, bound) in self._posing:
-                own = {name: value for name, value in placed.own(values).items() if value is not None}
-                values |= placed.named(bound.at_pose(near, own))
-        force = self._coordinates.reduce(self._loads(step, True).expand(batch, -1, -1))
+            for k in self._posing:
+                values[k] |= self._bound[k].at_pose(near, values[k])
+        force = self._coordinates.reduce(self._loads(step).expand(batch, -1, -1))
         return StepTerms(state.q, state.q.new_zeros(state.q.shape[:2]), share * force, values)
 
-    def _loads(self, step: SimulatorStep, static: bool) -> torch.Tensor:
+    def _loads(self, step: SimulatorStep) -> torch.Tensor:
         """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""
         constants, inputs, mass = step.constants, step.inputs, step.constants.load_mass
         if inputs.attached_mass is not None:
@@ -163,11 +193,8 @@ class EnergySet:
         force = mass[..., None] * constants.gravity[:, None]
         if inputs.external_force is not None:
             force = force + inputs.external_force
-        for _, (placed, bound) in self._loading:
-            own = placed.own_inputs(inputs), placed.own_constants(constants)
-            if (load := bound.load(*own, step.state.batch, static)) is not None:
-                force = force + load
-        return force
+        loads = (self._bound[k].load(self._step(step, k)) for k in self._loading)
+        return sum((load for load in loads if load is not None), start=force)
 
     @property
     def follow_pose(self) -> bool:
@@ -179,36 +206,36 @@ class EnergySet:
 
         After a static equilibrium these are the ones of energies without rate.
         """
-        remembering = self._remembering if math.isfinite(step.stage.step) else self._rate_independent
         memory: dict[str, torch.Tensor] = {}
-        for i, (placed, bound) in remembering:
-            memory |= placed.named(bound.end_step(placed.step(step, i), x, q))
+        for k in self._remembering if math.isfinite(step.stage.step) else self._rate_independent:
+            end = self._bound[k].end_step(self._step(step, k), x, q)
+            memory |= {f"{self.placed[k].prefix}{name}": value for name, value in end.items()}
         return memory
 
     def contacts(self, step: SimulatorStep, x: torch.Tensor) -> dict[str, ContactForces]:
         """Returns the contact of a step with solution x (B, N, 3) by name (`Simulator.contacts`)."""
         out: dict[str, ContactForces] = {}
-        for i, (placed, bound) in enumerate(self._pairs):
+        for k, bound in enumerate(self._bound):
             if isinstance(bound, BoundContact | BoundSurfaceContact):
                 others = "obstacles" if isinstance(bound, BoundContact) else "surfaces"
-                out[f"{placed.prefix}{others}"] = bound.forces(placed.step(step, i), x)
+                out[f"{self.placed[k].prefix}{others}"] = bound.forces(self._step(step, k), x)
         return out
 
     def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
         """Returns the motions of all obstacles in successive states, with the prefixes of their energies."""
         motions: list[ObstacleMotion] = []
-        for placed, bound in self._pairs:
+        for item, bound, values in zip(self.placed, self._bound, constants.values, strict=True):
             if isinstance(bound, BoundContact):
-                seen = [replace(state, memory=placed.own(state.memory)) for state in states]
-                own = bound.motions(seen, placed.own_constants(constants))
-                motions += [replace(motion, name=f"{placed.prefix}{motion.name}") for motion in own]
+                memories = [_without(item.prefix, state.memory) for state in states]
+                seen = bound.motions(memories, values, states[0].batch)
+                motions += [replace(motion, name=f"{item.prefix}{motion.name}") for motion in seen]
         return tuple(motions)
 
     def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
         """Returns positions (B, N, 3) [m] out of obstacles, see `Simulator.outside`."""
-        for placed, bound in self._pairs:
+        for bound, values in zip(self._bound, constants.values, strict=True):
             if isinstance(bound, BoundContact):
-                q = bound.outside(q, state, placed.own_constants(constants))
+                q = bound.outside(q, state, values)
         return q
 
     def check_memory(self, memory: Mapping[str, torch.Tensor], batch: int, like: torch.Tensor) -> None:

@@ -10,8 +10,8 @@ import warp as wp
 from torch.autograd import forward_ad
 from typing_extensions import override
 
+from ..energies.body_energies import PlacedEnergy
 from ..energies.launcher import BLOCK, lasting
-from ..energies.placement import PlacedEnergy
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..energies.solid import Solid
 from ..fem.coordinates import Coordinates
@@ -31,6 +31,7 @@ from .nonlinear_solver import NonlinearSolver, SolverSettings
 
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
+Names = tuple[tuple[int, str], ...]  # number of an energy, and name of a value of its term
 
 _REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
 _LEAST_WAY, _MOST_PARTS = 1e-2, 32  # of the way of fixed vertices that bodies bar: a part of it, and their number
@@ -153,8 +154,8 @@ def equilibrium(
     Returns:
         The last iterate, and the solver's report, which says whether it converged (`check_converged`).
     """
-    solve = _Solve(workspace, purpose, settings, follows, tuple(workspace.potential.terms.values))
-    values = (terms.values[name] for name in solve.names)
+    solve = _Solve(workspace, purpose, settings, follows, workspace.potential.value_names)
+    values = (terms.values[energy][name] for energy, name in solve.names)
     tensors = (start, fixed_positions, terms.target, terms.inertia, terms.force, *values)
     needs_grad = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors[1:])
     # Forward-mode differentiation also calls the function, which raises an error for it.
@@ -173,7 +174,7 @@ class _Solve:
     purpose: str
     settings: SolverSettings
     follows: torch.Tensor | None
-    names: tuple[str, ...]  # of the values
+    names: Names  # of the values
     report: SolveReport | None = None
 
     def __call__(self, inputs: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, SolveReport]:
@@ -263,16 +264,19 @@ def _join_gradients(value: torch.Tensor | None, slopes: tuple[torch.Tensor | Non
     return torch.stack(parts).sum(0) if value is not None and len(value) == 1 else torch.cat(parts)
 
 
-def _terms(names: tuple[str, ...], tensors: Sequence[Any]) -> StepTerms:
+def _terms(names: Names, tensors: Sequence[Any]) -> StepTerms:
     target, inertia, force, *values = tensors
-    return StepTerms(target, inertia, force, dict(zip(names, values, strict=True)))
+    by_energy = [dict[str, torch.Tensor | None]() for _ in range(1 + max((energy for energy, _ in names), default=-1))]
+    for (energy, name), value in zip(names, values, strict=True):
+        by_energy[energy][name] = value
+    return StepTerms(target, inertia, force, by_energy)
 
 
 def _solve(
     workspace: Workspace,
     solver: NonlinearSolver,
     follows: torch.Tensor | None,
-    names: tuple[str, ...],
+    names: Names,
     start: Any,
     fixed_positions: Any,
     *terms: Any,
@@ -302,7 +306,7 @@ def _solve(
 def _adjoint(
     workspace: Workspace,
     hessians: Sequence[ExactHessian],
-    names: tuple[str, ...],
+    names: Names,
     needed: Sequence[bool],
     gradient: Any,
     x: Any,
@@ -316,10 +320,10 @@ def _adjoint(
     gradient = gradient.double()
     z, product = _adjoint_solution(potential, hessians, gradient)
     fixed, target, inertia, force, *values = needed
-    slopes = potential.value_adjoint(z) if any(values) else {}
+    slopes = potential.value_adjoint(z) if any(values) else None
     by_values: list[torch.Tensor | None] = []
-    for name, is_needed in zip(names, values, strict=True):
-        value, slope = terms.values[name], slopes.get(name)
+    for (energy, name), is_needed in zip(names, values, strict=True):
+        value, slope = terms.values[energy][name], slopes[energy].get(name) if slopes else None
         if value is None or slope is None or not is_needed:
             by_values.append(None)
         else:

@@ -9,9 +9,9 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..energies.base import PairTangents
 from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
+from ..energies.term import PairTangents
 from ..io.errors import InputError
 from ..kernels.hessian_blocks import sum_blocks
 from ..linalg.conjugate_gradients import conjugate_gradients
@@ -339,9 +339,8 @@ class ProjectiveHessian(HessianApproximation):
 
     def _terms(self) -> tuple[torch.Tensor, ...]:
         p = self._potential
-        pairs = zip(p.energies, p.own_values, strict=True)
-        curvatures = ((term.curvature(values), term.sets) for term, values in pairs)
-        return p.terms.inertia, *(values[:, s.own] for values, sets in curvatures for s in sets)
+        curvatures = ((term.curvature(), term.sets) for term in p.energies)
+        return p.terms.inertia, *(values[:, s.in_energy] for values, sets in curvatures for s in sets)
 
     @override
     def ready(self) -> bool:

@@ -151,7 +151,10 @@ class Linearisation:
         whole, diagonal = self.matrix(x)
         if not len(self._coordinates.dependent):
             return scipy.sparse.csc_array(scipy.sparse.diags_array(diagonal))
-        still = {n: v * 0.0 if v is not None and n.endswith("inertia") else v for n, v in self._terms.values.items()}
+        still = [
+            {name: v * 0.0 if v is not None and name == "inertia" else v for name, v in values.items()}
+            for values in self._terms.values
+        ]
         self._potential.set_terms(replace(self._terms, inertia=0.0 * self._terms.inertia, values=still))
         elastic, _ = self.matrix(x)
         self._potential.set_terms(self._terms)

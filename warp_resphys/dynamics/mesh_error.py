@@ -11,15 +11,15 @@ The first estimate is low where it is large. Both are verified against quadratic
 ``tests/dynamics/test_mesh_error.py``.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 import scipy.sparse
-import torch
 
-from ..energies.placement import PlacedEnergy
+from ..energies.body_energies import PlacedEnergy
 from ..energies.solid import Solid
+from ..energies.term import Values
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import warn
@@ -33,28 +33,28 @@ _LEAST: Final = 1e-7  # strain, below which rounding dominates
 _INCOMPRESSIBLE: Final = 0.5  # Poisson's ratio of materials without this constant
 
 
-def warn_of_cells(
-    body: Body, placed: Iterable[PlacedEnergy], q: FloatArray, values: Mapping[str, torch.Tensor | None]
-) -> bool:
+def warn_of_cells(body: Body, placed: Sequence[PlacedEnergy], q: FloatArray, values: Sequence[Values]) -> bool:
     """Issues a `ResphysWarning` for each body whose deflection other cells would change by more than 7 %.
 
     Args:
         body: a body, or a `fem.scene.Scene`.
         placed: energies of its simulator.
         q: (N, 3) positions of an equilibrium [m].
-        values: of the energies' terms by name.
+        values: values of every energy by name (`stepping.state.Constants`).
 
     Returns:
         Whether there is such a body.
     """
     warned = False
-    solids = [(item, item.energy) for item in placed if isinstance(item.energy, Solid)]
+    solids = [
+        (item, item.energy, own) for item, own in zip(placed, values, strict=True) if isinstance(item.energy, Solid)
+    ]
     for name, own, first in body.members:
         if own.mesh.element.parents:
             continue
         at, regions = q[first : first + own.n_vertices], dict[str, FloatArray]()
-        for item, solid in solids:
-            stiffness = values[f"{item.prefix}stiffness"]
+        for item, solid, known in solids:
+            stiffness = known["stiffness"]
             if item.first == first and item.body is own and stiffness is not None:
                 region = item.prefix.removeprefix(f"{name}_" if name else "").removesuffix("_")
                 regions[region] = _energies(solid, at, stiffness[0].detach().double().cpu().numpy())

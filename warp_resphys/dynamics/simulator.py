@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..energies.body_energies import Materials, joined_names, place_energies
 from ..energies.contact import ContactForces
 from ..energies.launcher import lasting
 from ..energies.materials import Corotated, Material
 from ..energies.obstacles import ObstacleMotion
-from ..energies.placement import Materials, SimulatorStep, joined_names, place_energies
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import ConvergenceError, InputError
@@ -26,7 +26,7 @@ from ..stepping.quantity import Quantity
 from ..stepping.rollout import rollout
 from ..stepping.state import Constants, SolveReport, State
 from .assembly import BlockPattern
-from .energy_set import EnergySet
+from .energy_set import EnergySet, SimulatorStep
 from .equilibrium import Workspace, equilibrium
 from .linearisation import Linearisation
 from .mesh_error import CHECKED, warn_of_cells

@@ -41,14 +41,14 @@ from ..io.errors import InputError, listed, naming
 from ..kernels.contact import barriers as kernels
 from ..mesh.elements import FACES
 from ..mesh.volume_mesh import Mesh, boundary_faces, face_triangles
-from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.rotations import rotations
-from ..stepping.state import Constants, State
+from ..stepping.state import State
 from .barrier import barrier_pressure, friction_over_slide
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Term, Values, value_of
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher, struct_of, warp_view
 from .obstacles import DistanceGrid, Obstacle, ObstacleMotion, ObstacleSet, Pose
+from .term import Adjoint, PointSet, Term, Values, value_of
 
 log = logging.getLogger(__name__)
 
@@ -298,20 +298,27 @@ class BoundContact(BoundEnergy):
                 )
         return {**values, "contact_place": pose.place, "contact_turn": pose.turn}
 
-    def _pose(self, inputs: Inputs, constants: Constants, batch: int) -> Pose:
-        """Returns the poses (B, O, ...) at the end of a step."""
-        names = (*POSE, GROWTH.name)
+    def _pose(self, values: Values, inputs: Mapping[str, torch.Tensor], batch: int) -> Pose:
+        """Returns the poses (B, O, ...) at the end of a step with the values of `prepare` and inputs by name."""
         if self._contact.moves:
-            moved = self.pose({q.name: constants.value(q.name) for q in (GROWTH, *SHIFT, *TURN)}, inputs.actuation)
-            values = [moved.place, moved.turn, moved.growth]
+            moved = self.pose({q.name: value_of(values, q.name) for q in (GROWTH, *SHIFT, *TURN)}, inputs)
+            parts = [moved.place, moved.turn, moved.growth]
         else:
-            values = [constants.value(name) for name in names]
-        return Pose(*(value.expand(batch, *value.shape[1:]) for value in values))
+            parts = [value_of(values, name) for name in (*POSE, GROWTH.name)]
+        return Pose(*(part.expand(batch, *part.shape[1:]) for part in parts))
 
-    def motions(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
-        """Returns the motions of the obstacles in successive states, at the ends of the steps that lead to them."""
-        still, poses = self._pose(Inputs(), constants, states[0].batch), []
-        for memory in (state.memory for state in states):
+    def motions(
+        self, memories: Sequence[Mapping[str, torch.Tensor]], values: Values, batch: int
+    ) -> tuple[ObstacleMotion, ...]:
+        """Returns the motions of the obstacles.
+
+        Args:
+            memories: the memory in successive states.
+            values: values of `prepare`.
+            batch: number of environments.
+        """
+        still, poses = self._pose(values, {}, batch), []
+        for memory in memories:
             poses.append(Pose(memory.get(POSE[0], still.place), memory.get(POSE[1], still.turn), still.growth))
         return tuple(
             ObstacleMotion(name, obstacle, self.site.body.vertices, tuple(pose.of(k) for pose in poses))
@@ -321,7 +328,7 @@ class BoundContact(BoundEnergy):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         state, stage = step.state, step.stage
-        now = self._pose(step.inputs, step.constants, state.batch)
+        now = self._pose(step.values, step.inputs, state.batch)
         before, earlier = self._remembered(step, now)
         x = state.q[:, self._vertices]
         d, n = self._shapes.distances(x, before)
@@ -340,11 +347,11 @@ class BoundContact(BoundEnergy):
             n = torch.einsum("boij,bokj,bpok->bpoi", now.turn, before.turn, n)
             self._check_motion(step.inputs, before, now)
             here = now.world(inside)
-        if self._contact.moves or step.inputs.fixed_positions is not None:
-            self._check_way(here.detach(), self._ends(x, step.inputs), now, d.detach())
+        if self._contact.moves or step.fixed_positions is not None:
+            self._check_way(here.detach(), self._ends(x, step.fixed_positions), now, d.detach())
         if self._contact.moves:
             start = self._pushed_out(state.q.detach(), now, d.detach())
-        load = self._load(d, step.constants)
+        load = self._load(d, step.values)
         if self._has_factors:
             load = load * self._factor[:, None]
         if self._interpolates:
@@ -360,26 +367,26 @@ class BoundContact(BoundEnergy):
         }
         return values | dict(zip(POSE, (now.place, now.turn), strict=True))
 
-    def _load(self, d: torch.Tensor, constants: Constants) -> torch.Tensor:
+    def _load(self, d: torch.Tensor, values: Values) -> torch.Tensor:
         """Returns the normal forces (B, P, O) at distances [N]."""
         pressure = barrier_pressure(d, self._contact.distance)
-        return constants.value(STIFFNESS.name)[:, None] * self._area[:, None] * pressure
+        return value_of(values, STIFFNESS.name)[:, None] * self._area[:, None] * pressure
 
     def forces(self, step: EnergyStep, x: torch.Tensor) -> ContactForces:
         """Returns the forces at the solution x (B, N, 3) of a step's implicit stage [m]."""
         values = self.begin_step(step)
-        at, pose = x[:, self._vertices], self._pose(step.inputs, step.constants, step.state.batch)
+        at, pose = x[:, self._vertices], self._pose(step.values, step.inputs, step.state.batch)
         d, n = self._shapes.distances(at, pose)
         normal, way = value_of(values, "contact_normal"), at[:, :, None] - value_of(values, "contact_reference")
         u = way - (way * normal).sum(-1, keepdim=True) * normal
         slip = value_of(values, "contact_slip")[..., None]
         y, factor = friction_over_slide(u, slip)
-        most = step.constants.value(FRICTION.name)[:, None] * value_of(values, "contact_load")
+        most = step.value(FRICTION.name)[:, None] * value_of(values, "contact_load")
         return ContactForces(
             self._contact.names,
             self._vertices,
             d,
-            self._load(d, step.constants)[..., None] * n,
+            self._load(d, step.values)[..., None] * n,
             -(most * factor)[..., None] * u,
             y,
             (value_of(values, "contact_load") > 0.0) & (y < slip),
@@ -392,7 +399,7 @@ class BoundContact(BoundEnergy):
         memory = step.state.memory
         given = [memory.get(name) for name in (m.name for m in self.memory)]
         if given[0] is None or given[1] is None:
-            rest = now if math.isfinite(step.stage.step) else self._pose(Inputs(), step.constants, step.state.batch)
+            rest = now if math.isfinite(step.stage.step) else self._pose(step.values, {}, step.state.batch)
             return rest, rest
         before = Pose(given[0], given[1], now.growth)
         return before, before if given[2] is None or given[3] is None else Pose(given[2], given[3], now.growth)
@@ -401,25 +408,25 @@ class BoundContact(BoundEnergy):
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         if not self._contact.moves:
             return {}
-        now = self._pose(step.inputs, step.constants, step.state.batch)
+        now = self._pose(step.values, step.inputs, step.state.batch)
         before, _ = self._remembered(step, now)
         poses = (now.place, now.turn, before.place, before.turn)
         return dict(zip((m.name for m in self.memory), poses, strict=True))
 
-    def _ends(self, x: torch.Tensor, inputs: Inputs) -> torch.Tensor:
+    def _ends(self, x: torch.Tensor, fixed_positions: torch.Tensor | None) -> torch.Tensor:
         """Returns the vertices of the surface (B, P, 3), the fixed ones where they are at the end of a step [m]."""
-        given, x = inputs.fixed_positions, x.detach()
-        if given is None:
+        x = x.detach()
+        if fixed_positions is None:
             return x
         whole = x.new_zeros(len(x), len(self.site.rest_positions), 3).index_copy(1, self._vertices, x)
-        whole[:, self._fixed] = given.detach()
+        whole[:, self._fixed] = fixed_positions.detach()
         return whole[:, self._vertices]
 
-    def _check_motion(self, inputs: Inputs, before: Pose, now: Pose) -> None:
+    def _check_motion(self, inputs: Mapping[str, torch.Tensor], before: Pose, now: Pose) -> None:
         """Raises InputError where an obstacle that does not move has an input, or one turns too far in a step."""
         still = self._moving == 0.0
         for quantity in MOTION:
-            value = inputs.actuation.get(quantity.name)
+            value = inputs.get(quantity.name)
             if value is not None and bool((value[..., still] != 0.0).any()):
                 raise InputError(f"{quantity.name} is not zero for an obstacle without moves=True: set it there.")
         if bool((torch.einsum("boij,boij->bo", before.turn, now.turn) < 1.0).any()):
@@ -487,13 +494,13 @@ class BoundContact(BoundEnergy):
         self._check(q, pose, "after an obstacle has moved")
         return q
 
-    def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
+    def outside(self, q: torch.Tensor, state: State, values: Values) -> torch.Tensor:
         """Returns positions (B, N, 3) [m] out of the obstacles, at least by the gaps of a state, at most by half of D.
 
         Raises:
             InputError: the obstacles leave no place.
         """
-        pose = self._pose(Inputs(), constants, state.batch)
+        pose = self._pose(values, {}, state.batch)
         gaps, _ = self._shapes.distances(state.q[:, self._vertices], pose)
         return self._pushed_out(q, pose, gaps)
 
@@ -539,68 +546,55 @@ class ContactTerm(Term):
     _kernels = kernels
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], contact: Contact) -> None:
-        super().__init__(launcher, sets)
         (s,) = sets
         assert isinstance(s.source, ContactPoints)
-        self._count, self._vertices, self._reach = contact.count, s.n_vertices, contact.distance
+        p, o = s.n_points, contact.count
+        names = (*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name, "contact_slip", *FRICTION_VALUES, "contact_start")
+        shapes = ((o, 3), (o, 3, 3), (o,), (o,), (o,), (1,), (p, o), (p, o, 3), (p, o, 3), (s.n_vertices, 3))
+        super().__init__(launcher, sets, dict(zip(names, shapes, strict=True)))
+        self._count, self._reach = o, contact.distance
         self._shapes = ObstacleSet(tuple(contact.obstacles.values()), contact.distance, launcher.device)
         self._area = torch.as_tensor(s.source.areas, device=launcher.device)
         self._moved = torch.as_tensor(s.source.nodes[:, 0], device=launcher.device)
 
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        p, o = self.n_points, self._count
-        return {
-            **dict(zip((*POSE, GROWTH.name), ((o, 3), (o, 3, 3), (o,)), strict=True)),
-            STIFFNESS.name: (o,),
-            FRICTION.name: (o,),
-            "contact_slip": (1,),
-            **dict(zip(FRICTION_VALUES, ((p, o), (p, o, 3), (p, o, 3)), strict=True)),
-            "contact_start": (self._vertices, 3),
-        }
-
-    def _obstacles(self, values: Values) -> Any:
-        return self._shapes.at(*(value_of(values, name) for name in (*POSE, GROWTH.name)))
+    def _obstacles(self) -> Any:
+        return self._shapes.at(*(self.values[name] for name in (*POSE, GROWTH.name)))
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
         names = {"coefficient": FRICTION.name} | {
             n.removeprefix("contact_"): n for n in ("contact_slip", *FRICTION_VALUES)
         }
-        friction = struct_of(kernels.Friction, **{name: value_of(values, given) for name, given in names.items()})
-        stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
+        friction = struct_of(kernels.Friction, **{field: self.values[name] for field, name in names.items()})
         area = warp_view(self._area, wp.float64)
-        obstacles = self._obstacles(values)
-        return [s.points, area, obstacles, stiffness, friction, positions]
+        return [s.points, area, self._obstacles(), self.view(STIFFNESS.name), friction, positions]
 
     @override
-    def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor]:
-        return value_of(values, "contact_start"), self._moved
+    def feasible(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.values["contact_start"], self._moved
 
     @override
-    def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
-        own, (s,) = self.launcher, self.sets
-        inputs = [warp_view(own.active, wp.int32), s.points, self._obstacles(values)]
-        inputs += [origin, positions]
-        return [own.record(kernels.bound, (own.batch, s.n_points, self._count), inputs, [share])]
+    def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
+        batch, (s,) = self.launcher, self.sets
+        inputs = [warp_view(batch.active, wp.int32), s.points, self._obstacles(), origin, positions]
+        return [batch.record(kernels.bound, (batch.batch, s.n_points, self._count), inputs, [share])]
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return value_of(values, STIFFNESS.name).sum(1, keepdim=True) / self._reach * self._area
+    def curvature(self) -> torch.Tensor:
+        return self.values[STIFFNESS.name].sum(1, keepdim=True) / self._reach * self._area
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
+    def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
+        batch, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
         names = ("place", "turn", "growth", "stiffness", "coefficient", "load", "normal", "reference")
         shapes = {"turn": (3, 3), **dict.fromkeys(("place", "normal", "reference"), (3,))}
-        out = {name: own.zeros(*size, *shapes.get(name, ())) for name in names}
+        out = {name: batch.zeros(*size, *shapes.get(name, ())) for name in names}
+        inputs = [*self._arguments(s, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
         slopes = struct_of(kernels.Slopes, **out)
-        inputs = self._arguments(s, values, warp_view(positions, wp.vec3d))
-        command = own.record(kernels.adjoint, (own.batch, *size), [*inputs, warp_view(direction, wp.vec3d), slopes], [])
+        command = batch.record(kernels.adjoint, (batch.batch, *size), inputs, [slopes])
 
         def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
+            batch.launch(command)
             shared = zip((*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name), names, strict=False)
             sums = {value: out[name].sum(1) for value, name in shared}
             return sums | {name: out[name.removeprefix("contact_")].clone() for name in FRICTION_VALUES}

@@ -19,9 +19,10 @@ from ..kernels.axial import axial_kernels
 from ..mesh.chambers import Chamber, face_rule
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PointSet, Values, value_of
+from .base import Energy
 from .launcher import Launcher
-from .pointwise import PartPoints, ReadingTerm
+from .pointwise import ReadingTerm
+from .term import PartPoints, PointSet
 
 _CAP = 0.7  # cosine between face normal and chamber axis above which a face is an end cap, without fibres
 _ALIGNED = 0.8  # smallest cosine between a chamber's principal direction and the given axis
@@ -124,8 +125,8 @@ class FibreTerm(ReadingTerm):
     """Kernels of the fibres around every chamber."""
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return self.weight * value_of(values, "fibre_stiffness")[:, self.part_of]
+    def curvature(self) -> torch.Tensor:
+        return self.weight * self.values["fibre_stiffness"][:, self.part_of]
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:

@@ -39,9 +39,10 @@ from typing_extensions import override
 from ..fem.integration_points import Points
 from ..kernels import plastic_sliders as kernels
 from ..mesh.volume_mesh import Mesh
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher, warp_view
 from .solid import PointModuli, Solid
+from .term import PointSet, Slope
 from .viscosity import GreenStrain, StrainTerm
 
 PLASTIC_STRAIN: Final = "plastic_strain"
@@ -121,7 +122,7 @@ class BoundHysteresis(BoundEnergy):
         strain = partial(GreenStrain.apply, step.term)
         trial = strain(q)[:, None].to(plastic.dtype) - plastic
         square = trial.square().sum((-2, -1), keepdim=True)
-        limits = step.constants.value("sliders")[..., 1, None, None, None]
+        limits = step.value("sliders")[..., 1, None, None, None]
         slides = square > limits.square()
         stuck = torch.where(slides, limits / torch.where(slides, square, 1.0).sqrt(), 1.0)  # min(1, e / |A|)
         return plastic + (1.0 - stuck) * trial
@@ -133,45 +134,23 @@ class HysteresisTerm(StrainTerm):
     _kernels = kernels
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], sliders: int) -> None:
-        super().__init__(launcher, sets)
+        points = sum(s.n_points for s in sets)
+        shapes = {"slider_modulus": (points,), "sliders": (sliders, 2), PLASTIC_STRAIN: (sliders, points, 3, 3)}
+        super().__init__(launcher, sets, shapes)
         self._sliders = sliders
 
-    @property
     @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        k, points = self._sliders, self.n_points
-        return {"slider_modulus": (points,), "sliders": (k, 2), PLASTIC_STRAIN: (k, points, 3, 3)}
-
-    @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        modulus, sliders, plastic = (value_of(values, name) for name in self.shapes)
-        views = [
-            warp_view(modulus[:, s.own], wp.float64),
-            warp_view(sliders, wp.vec2d),
-            warp_view(plastic[:, :, s.own], wp.mat33d),
-        ]
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        modulus, plastic = self.values["slider_modulus"][:, s.in_energy], self.values[PLASTIC_STRAIN][:, :, s.in_energy]
+        views = [warp_view(modulus, wp.float64), self.view("sliders", wp.vec2d), warp_view(plastic, wp.mat33d)]
         return [s.points, *views, positions]
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return 2.0 * value_of(values, "slider_modulus") * value_of(values, "sliders")[..., 0].sum(1, keepdim=True)
+    def curvature(self) -> torch.Tensor:
+        return 2.0 * self.values["slider_modulus"] * self.values["sliders"][..., 0].sum(1, keepdim=True)
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own, shapes = self.launcher, {**self.shapes, "sliders": (self._sliders, self.n_points, 2)}
-        out = {name: own.zeros(*shape) for name, shape in shapes.items()}
-        fields, commands = [warp_view(field, wp.vec3d) for field in (positions, direction)], []
-        for s in self.sets:
-            inputs = [*self._arguments(s, values, fields[0]), fields[1]]
-            outputs = [
-                warp_view(out["slider_modulus"][:, s.own], wp.float64),
-                warp_view(out["sliders"][:, :, s.own], wp.vec2d),
-                warp_view(out[PLASTIC_STRAIN][:, :, s.own], wp.mat33d),
-            ]
-            commands.append(own.record(kernels.adjoint, (own.batch, s.n_points), inputs, outputs))
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(*commands)
-            return {name: slope.sum(2) if name == "sliders" else slope.clone() for name, slope in out.items()}
-
-        return differentiate
+    def _slopes(self) -> list[Slope]:
+        k, n = self._sliders, self.n_points
+        plastic = Slope(PLASTIC_STRAIN, (k, n, 3, 3), wp.mat33d, axis=1)
+        return [Slope("slider_modulus", (n,)), Slope("sliders", (k, n, 2), wp.vec2d, axis=1), plastic]

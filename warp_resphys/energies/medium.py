@@ -25,11 +25,10 @@ from ..io.errors import InputError
 from ..kernels import fluid_drag as kernels
 from ..mesh.elements import FACES
 from ..mesh.volume_mesh import Mesh, boundary_faces
-from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from ..stepping.state import Constants
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, points_reader, value_of
-from .launcher import Launcher, warp_view
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep
+from .launcher import Launcher
+from .term import Adjoint, PointSet, Term
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ class BoundMedium(BoundEnergy):
         tangents = torch.einsum("qkd,bfki->bfqdi", self._slopes, step.state.q[:, self._nodes])
         area = torch.linalg.cross(tangents[..., 0, :], tangents[..., 1, :]) * self._weights[:, None]
         names = ("medium_density", "drag_linear", "drag_normal", "drag_tangential", "added_layer")
-        density, linear, normal, tangential, layer = map(step.constants.value, names)
+        density, linear, normal, tangential, layer = map(step.value, names)
         drag = 0.5 * density / h**2
         coefficients = torch.cat(
             torch.broadcast_tensors(linear / h, drag * normal, drag * tangential, density * layer / h**2), 1
@@ -142,13 +141,12 @@ class BoundMedium(BoundEnergy):
         return {**dict.fromkeys(names, places), "medium_coefficients": zeros.expand(-1, 1, 4)}
 
     @override
-    def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
+    def load(self, step: EnergyStep) -> torch.Tensor | None:
         """Returns the buoyancy, minus the weight of the displaced medium."""
-        del inputs, batch, static
         if self._volume is None:
             return None
-        displaced = constants.value("medium_density") * self._volume
-        return -displaced[..., None] * constants.gravity[:, None]
+        displaced = step.value("medium_density") * self._volume
+        return -displaced[..., None] * step.gravity[:, None]
 
     def _at_points(self, field: torch.Tensor) -> torch.Tensor:
         """Interpolates a vertex field (B, N, 3) to the points (B, P, 3)."""
@@ -160,31 +158,34 @@ class MediumTerm(Term):
 
     _kernels = kernels
 
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        places = dict.fromkeys(("medium_reference", "medium_target", "medium_area"), (self.n_points, 3))
-        return {**places, "medium_coefficients": (1, 4)}
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:
+        (s,) = sets
+        places = dict.fromkeys(("medium_reference", "medium_target", "medium_area"), (s.n_points, 3))
+        super().__init__(launcher, sets, {**places, "medium_coefficients": (1, 4)})
+        self._nodes = torch.as_tensor(s.source.nodes, device=s.device)  # (C, K)
+        self._weights = torch.as_tensor(s.source.gradients[..., 0], device=s.device)  # (C, Q, K)
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        *places, coefficients = (value_of(values, name) for name in self.shapes)
-        views = [warp_view(place, wp.vec3d) for place in places]
-        return [s.points, *views, warp_view(coefficients, wp.vec4d), positions]
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        *places, coefficients = self.values
+        views = [self.view(name, wp.vec3d) for name in places]
+        return [s.points, *views, self.view(coefficients, wp.vec4d), positions]
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        area, coefficients = value_of(values, "medium_area"), value_of(values, "medium_coefficients")
-        return area.norm(dim=-1) * (coefficients[..., 0] + coefficients[..., 3])
+    def curvature(self) -> torch.Tensor:
+        coefficients = self.values["medium_coefficients"]
+        return self.values["medium_area"].norm(dim=-1) * (coefficients[..., 0] + coefficients[..., 3])
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
+    def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         """Implements `Term.adjoint` by differentiating the forces in torch."""
-        at_points = points_reader(self.sets[0])
+
+        def at_points(field: torch.Tensor) -> torch.Tensor:
+            return torch.einsum("cqk,bcki->bcqi", self._weights, field[:, self._nodes]).flatten(1, 2)
 
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():
-                leaves = {name: value_of(values, name).detach().requires_grad_() for name in self.shapes}
+                leaves = {name: value.detach().requires_grad_() for name, value in self.values.items()}
                 loss = -(_forces(at_points(positions), *leaves.values()) * at_points(direction)).sum()
                 slopes = torch.autograd.grad(loss, list(leaves.values()))
             return dict(zip(leaves, slopes, strict=True))

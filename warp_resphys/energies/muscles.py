@@ -25,9 +25,10 @@ from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import Energy, PointSet, Values, value_of
+from .base import Energy
 from .launcher import Launcher
-from .pointwise import PartPoints, ReadingTerm
+from .pointwise import ReadingTerm
+from .term import PartPoints, PointSet
 
 STRESS = Quantity(
     *("muscle_stress", "Pa"), per="muscle", typical=1e4, words="stress", shown_unit="kPa", shown_factor=1e-3
@@ -162,6 +163,6 @@ class MuscleTerm(ReadingTerm):
     """Kernels of muscles."""
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        stress, stiffness = value_of(values, "muscle_stress"), value_of(values, "muscle_stiffness")
-        return self.weight * (stress.clamp_min(0.0) + stiffness)[:, self.part_of]
+    def curvature(self) -> torch.Tensor:
+        pull = self.values["muscle_stress"].clamp_min(0.0) + self.values["muscle_stiffness"]
+        return self.weight * pull[:, self.part_of]

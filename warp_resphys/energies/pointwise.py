@@ -16,7 +16,6 @@ deformation gradient), and the values at the point: parameters and inputs, in th
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,52 +24,15 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..fem.integration_points import Points, physical_gradients
+from ..fem.integration_points import physical_gradients
 from ..io.errors import InputError
 from ..kernels.energy_functions import pointwise_kernels
 from ..kernels.points import PartValues
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter
-from .base import Adjoint, Energy, PointSet, Term, Values, value_of
-from .launcher import Launcher, struct_of, warp_view
-
-
-@dataclass(frozen=True)
-class PartPoints(Points):
-    """Weighted points that belong to the parts of an energy, such as chambers or tendons."""
-
-    part: NDArray[np.int64]  # (P,) index of the part
-    weights: NDArray[np.float64]  # (P,) weight of the point's energy: a volume, an area, a length, or one
-
-
-class PartTerm(Term):
-    """A term on one set of `PartPoints` of ``count`` parts, with the `shapes` of its values."""
-
-    def __init__(
-        self, launcher: Launcher, sets: Sequence[PointSet], shapes: Mapping[str, tuple[int, ...]], count: int
-    ) -> None:
-        super().__init__(launcher, sets)
-        (s,) = sets
-        assert isinstance(s.source, PartPoints)
-        self._shapes, self.count = dict(shapes), count
-        self.weights = launcher.upload(s.source.weights, wp.float64)
-        self.part = launcher.upload(s.source.part.astype(np.int32), int)
-        self._one_hot = torch.as_tensor(np.eye(count)[s.source.part], device=launcher.device)  # (P, count)
-        self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
-        self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
-
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return self._shapes
-
-    def views(self, values: Values) -> list[Any]:
-        """Returns the values of the step as kernel arguments, in the order of `shapes`."""
-        return [warp_view(value_of(values, name), wp.float64) for name in self.shapes]
-
-    def sum_parts(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns the sums (B, count) of values (B, P) over the points of each part, in a fixed order."""
-        return values @ self._one_hot
+from .base import Energy
+from .launcher import Launcher, struct_of
+from .term import PartPoints, PartTerm, PointSet, Slope
 
 
 class ReadingTerm(PartTerm):
@@ -97,7 +59,7 @@ class ReadingTerm(PartTerm):
         extra: Sequence[Any] = (),
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
-        self._kernels, self._extra = kernels, extra
+        self._kernels, self._extra, self._shapes = kernels, extra, dict(shapes)
         self._arrays = frozenset(arrays)
         part = self.part_of.cpu().numpy()
         self._columns = {name: self._columns_of(name, part) for name in self._shapes}
@@ -113,32 +75,25 @@ class ReadingTerm(PartTerm):
         return np.stack([part * n + k for k in range(n)])
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        pointers = [value_of(values, name).data_ptr() for name in self._shapes for _ in self._columns[name]]
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        pointers = [self.values[name].data_ptr() for name in self._shapes for _ in self._columns[name]]
         addresses = self.launcher.upload(np.array(pointers, dtype=np.uint64), wp.uint64)
         where = {"addresses": addresses, "sizes": self._sizes, "places": self._column}
         return [s.points, struct_of(PartValues, weights=self.weights, **where), *self._extra, positions]
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own, (s,) = self.launcher, self.sets
-        out = own.zeros(self.n_points, self._kernels.values._length_)
-        inputs = [*self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
-        view = warp_view(out, self._kernels.values)
-        command = own.record(self._kernels.adjoint, (own.batch, s.n_points), inputs, [view])
+    def _slopes(self) -> list[Slope]:
+        return [Slope("", (self.n_points, self._kernels.values._length_), self._kernels.values)]
 
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            slopes, first = {}, 0
-            for name, shape in self._shapes.items():
-                slope = out[..., first : first + len(self._columns[name])]
-                whole = name in self._arrays
-                slope = slope.sum(1) if whole else torch.einsum("bpn,pc->bcn", slope, self._one_hot)
-                slopes[name] = slope.reshape(own.batch, *shape).clone()
-                first += len(self._columns[name])
-            return slopes
-
-        return differentiate
+    @override
+    def _by_values(self, out: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        slopes, first = {}, 0
+        for name, shape in self._shapes.items():
+            slope = out[""][..., first : first + len(self._columns[name])]
+            slope = slope.sum(1) if name in self._arrays else torch.einsum("bpn,pc->bcn", slope, self.one_hot)
+            slopes[name] = slope.reshape(self.launcher.batch, *shape).clone()
+            first += len(self._columns[name])
+        return slopes
 
 
 class PointwiseEnergy(Energy):
@@ -187,9 +142,8 @@ class PointwiseTerm(ReadingTerm):
         super().__init__(launcher, sets, kernels, shapes, energy.count, list(arrays), [wp.float64(energy.size)])
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
+    def curvature(self) -> torch.Tensor:
         """Returns zero: the constant matrix of projective dynamics does not contain these energies."""
-        del values
         return torch.zeros_like(self.weight)[None]
 
 

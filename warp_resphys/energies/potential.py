@@ -9,7 +9,7 @@ those of the solid, elastic and dissipative, and others such as -p V of chambers
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,9 @@ from ..fem.coordinates import Coordinates, DeviceCoordinates
 from ..io.errors import InputError
 from ..kernels import points as kernels
 from ..kernels import reductions
-from .base import PairTangents, PointSet, Term
+from .body_energies import PlacedEnergy
 from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
-from .placement import PlacedEnergy
+from .term import PairTangents, PointSet, Term, Values
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class StepTerms:
     target: torch.Tensor  # (B, N, 3) y [m]
     inertia: torch.Tensor  # (B, N) k [N/m]
     force: torch.Tensor  # (B, N, 3) f [N]
-    # values of the energies' terms by name (`Term.shapes`), with a first axis of 1 or B; None if not needed
-    values: dict[str, torch.Tensor | None] = field(default_factory=dict)
+    # values of each energy's term by name (`Term.values`), with a first axis of 1 or B; None if not needed
+    values: Sequence[Values] = ()
 
 
 class IncrementalPotential(Launcher):
@@ -50,7 +50,6 @@ class IncrementalPotential(Launcher):
 
     Attributes:
         energies: terms of the energies.
-        own_values: buffers of the current values of each energy, by its own names.
         stiffness: (B,) sum of the solids' moduli times volumes, the scale of the energy's rounding error [J].
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
@@ -86,30 +85,23 @@ class IncrementalPotential(Launcher):
         self.coordinates = DeviceCoordinates(coordinates, torch.empty(0, device=device, dtype=torch.float64))
         self.energies: list[Term] = []
         self.sets: list[PointSet] = []
-        self._loads: list[bool] = []
-        first = 0
-        self._placed = tuple(energies)
+        self._n_points = 0
         self.last_pair_tangents: list[PairTangents] = []
+        self._is_load = [placed.energy.is_load for placed in energies]
         for placed in energies:
-            energy, start, sets = placed.energy, first, list[PointSet]()
+            start, sets = self._n_points, list[PointSet]()
             for points in placed.points:
-                part = slice(first, first + points.n_points)
-                own = slice(part.start - start, part.stop - start)
-                sets.append(PointSet(self, points, n_vertices, part, own))
-                first = part.stop
-            self.energies.append(energy.term(self, sets))
+                first, self._n_points = self._n_points, self._n_points + points.n_points
+                in_energy = slice(first - start, self._n_points - start)
+                sets.append(PointSet(self, points, n_vertices, slice(first, self._n_points), in_energy))
+            self.energies.append(placed.energy.term(self, sets))
             self.sets += sets
-            self._loads.append(energy.is_load)
-        self._n_points = first
         self.free_mask = torch.ones(n_vertices, device=device, dtype=torch.float64)
         self.free_mask[eliminated] = 0.0
-        pairs = list(zip(energies, self.energies, strict=True))
-        shapes = {name: shape for placed, term in pairs for name, shape in placed.named(term.shapes).items()}
-        values: dict[str, torch.Tensor | None] = {name: self.zeros(*shape) for name, shape in shapes.items()}
-        self.own_values = [placed.own_values(values, term) for placed, term in pairs]
-        starts = (term.feasible(own) for term, own in zip(self.energies, self.own_values, strict=True))
+        starts = (term.feasible() for term in self.energies)
         self._feasible = [start for start in starts if start is not None]
-        self.terms = StepTerms(self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3), values)
+        fields = self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3)
+        self.terms = StepTerms(*fields, [term.values for term in self.energies])
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
@@ -141,18 +133,17 @@ class IncrementalPotential(Launcher):
         active = warp_view(self.active, wp.int32)
         self._internal_commands: list[Any] = []
         self._load_commands: list[Any] = []
-        for term, values, is_load in zip(self.energies, self.own_values, self._loads, strict=True):
+        for term, is_load in zip(self.energies, self._is_load, strict=True):
             commands = self._load_commands if is_load else self._internal_commands
-            commands += term.before(values, self._position_view, active)
+            commands += term.before(self._position_view, active)
             for s in term.sets:
-                energy = warp_view(self._point_energy[:, s.part], wp.float64)
-                whole = term.whole_cells(s, values, self._position_view)
-                if whole is not None:
+                energy = warp_view(self._point_energy[:, s.in_body], wp.float64)
+                kernel, inputs, by_cells = term.step(s, self._position_view)
+                if by_cells:
                     outputs = [warp_view(self.residual, wp.vec3d), energy]
-                    commands.append(self.record(whole.step, (b, s.cells), [active, *whole.inputs], outputs))
+                    commands.append(self.record(kernel, (b, s.cells), [active, *inputs], outputs))
                     continue
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
-                kernel, inputs = term.step(s, values, self._position_view)
                 commands += [
                     self.record(kernel, (b, s.n_points), [active, *inputs], [stress, energy]),
                     self.gather(s, stress, self.residual),
@@ -182,24 +173,28 @@ class IncrementalPotential(Launcher):
 
     def set_terms(self, terms: StepTerms) -> None:
         """Copies a step's terms into the buffers, with zero inertia and load at fixed vertices."""
-        own = self.terms
-        own.target.copy_(terms.target.detach())
+        mine = self.terms
+        mine.target.copy_(terms.target.detach())
         if self.coordinates.slides:
-            own.target.copy_(self.coordinates.hold(own.target))
-        torch.mul(terms.inertia.detach(), self.free_mask, out=own.inertia)
-        torch.mul(terms.force.detach(), self.free_mask[:, None], out=own.force)
-        for name, buffer in own.values.items():
-            value = terms.values[name]
-            if value is not None and buffer is not None:
-                buffer.copy_(value.detach())
+            mine.target.copy_(self.coordinates.hold(mine.target))
+        torch.mul(terms.inertia.detach(), self.free_mask, out=mine.inertia)
+        torch.mul(terms.force.detach(), self.free_mask[:, None], out=mine.force)
+        for term, values in zip(self.energies, terms.values, strict=True):
+            for name, buffer in term.values.items():
+                if (value := values[name]) is not None:
+                    buffer.copy_(value.detach())
         for positions, moved in self._feasible[1:]:
             self._feasible[0][0][:, moved] = positions[:, moved]
-        for term, values in zip(self.energies, self.own_values, strict=True):
-            term.set_step(values)
-        totals = [term.total_stiffness(values) for term, values in zip(self.energies, self.own_values, strict=True)]
-        given = [total for total in totals if total is not None]
-        if given:
-            self.stiffness.copy_(given[0] if len(given) == 1 else torch.stack(given).sum(0))
+        for term in self.energies:
+            term.set_step()
+        totals = [total for term in self.energies if (total := term.total_stiffness()) is not None]
+        if totals:
+            self.stiffness.copy_(totals[0] if len(totals) == 1 else torch.stack(totals).sum(0))
+
+    @property
+    def value_names(self) -> tuple[tuple[int, str], ...]:
+        """Number of the energy and name of every value of the terms."""
+        return tuple((number, name) for number, term in enumerate(self.energies) for name in term.values)
 
     @property
     def inertia(self) -> torch.Tensor:
@@ -227,8 +222,7 @@ class IncrementalPotential(Launcher):
         self.tangent_active.fill_(1) if active is None else self.tangent_active.copy_(active)
         self.launch(self.tangent_launches)
         self.last_pair_tangents = self.pair_tangents()
-        pairs = zip(self.energies, self.own_values, strict=True)
-        parts = (term.low_rank(values, self._position_view) for term, values in pairs)
+        parts = (term.low_rank(self._position_view) for term in self.energies)
         columns = [part for part in parts if part is not None]
         self.low_rank = torch.cat(columns, 2) if columns else None
         if self.low_rank is not None and self.coordinates.slides:
@@ -243,8 +237,7 @@ class IncrementalPotential(Launcher):
             active: (B,) zero for environments that are left out; None: those of ``active``.
         """
         chosen = self.active if active is None else active
-        pairs = zip(self.energies, self.own_values, strict=True)
-        parts = (term.pair_tangents(values, self._position_view, clamp, chosen) for term, values in pairs)
+        parts = (term.pair_tangents(self._position_view, clamp, chosen) for term in self.energies)
         return [part for part in parts if part is not None]
 
     @property
@@ -269,8 +262,8 @@ class IncrementalPotential(Launcher):
             InputError: the solve cannot start there.
         """
         if self.feasible is not None:
-            for term, values in zip(self.energies, self.own_values, strict=True):
-                term.check_start(values, self.feasible, follows)
+            for term in self.energies:
+                term.check_start(self.feasible, follows)
 
     def place_fixed(self, fixed: torch.Tensor, places: torch.Tensor, least: float) -> bool:
         """Moves the fixed vertices of `feasible` to their places, or towards them as far as bodies let them.
@@ -310,8 +303,7 @@ class IncrementalPotential(Launcher):
 
     def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns launches that bound the way between two arrays of positions (`Term.bounds`)."""
-        pairs = zip(self.energies, self.own_values, strict=True)
-        return [launch for term, values in pairs for launch in term.bounds(values, origin, positions, share)]
+        return [launch for term in self.energies for launch in term.bounds(origin, positions, share)]
 
     @property
     def couples_cells(self) -> bool:
@@ -340,15 +332,12 @@ class IncrementalPotential(Launcher):
         tangents, products = [], []
         masks = [warp_view(self.tangent_active, wp.int32), warp_view(self.clamp, wp.int32)]
         direction = warp_view(self._direction, wp.vec3d)
-        for term, values in zip(self.energies, self.own_values, strict=True):
-            tangents += term.before(values, self._position_view, masks[0])
+        for term in self.energies:
+            tangents += term.before(self._position_view, masks[0])
             for s in term.sets:
                 tangent = warp_view(next(blocks), wp.mat33d)
-                whole, threads = term.whole_cells(s, values, self._position_view), s.n_points
-                if whole is None:
-                    kernel, inputs = term.tangent(s, values, self._position_view)
-                else:
-                    kernel, inputs, threads = whole.tangent, whole.inputs, s.cells
+                kernel, inputs, by_cells = term.tangent(s, self._position_view)
+                threads = s.cells if by_cells else s.n_points
                 tangents.append(self.record(kernel, (self.batch, threads), [*masks, *inputs], [tangent]))
                 stress = s.stress_view(self.zeros(s.n_points, 3, s.width))
                 products += [self.product(s, tangent, direction, stress), self.gather(s, stress, self._product)]
@@ -376,21 +365,17 @@ class IncrementalPotential(Launcher):
             product += self.coordinates.reduce(between)
         return product
 
-    def value_adjoint(self, adjoint: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Returns -z . d residual / d value, (B, *shape), at ``positions`` for every value of the terms, by name.
+    def value_adjoint(self, adjoint: torch.Tensor) -> list[dict[str, torch.Tensor]]:
+        """Returns -z . d residual / d value, (B, *shape), at ``positions`` for the values of each term, by name.
 
         Args:
             adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
         """
         self.prepare_adjoint()
         self._direction.copy_(adjoint)
-        slopes: dict[str, torch.Tensor] = {}
-        for placed, differentiate in zip(self._placed, self._adjoints, strict=True):
-            slopes |= placed.named(differentiate())
-        return slopes
+        return [differentiate() for differentiate in self._adjoints]
 
     def prepare_adjoint(self) -> None:
         """Makes buffers and launches of `value_adjoint`, unless they exist."""
         if not self._adjoints:
-            pairs = zip(self.energies, self.own_values, strict=True)
-            self._adjoints = [t.adjoint(values, self.positions, self._direction) for t, values in pairs]
+            self._adjoints = [term.adjoint(self.positions, self._direction) for term in self.energies]

@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import warp as wp
 from typing_extensions import override
 
 from ..io.errors import InputError
@@ -20,9 +19,9 @@ from ..kernels import follower_pressure as kernels
 from ..mesh.chambers import Chamber, check_chambers, face_rule
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Quantity
-from .base import Adjoint, Energy, PointSet, Values
-from .launcher import Launcher, warp_view
-from .pointwise import PartPoints, PartTerm
+from .base import Energy
+from .launcher import Launcher
+from .term import PartPoints, PartTerm, PointSet, Slope
 
 PRESSURE = Quantity(
     *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
@@ -95,24 +94,17 @@ class PressureTerm(PartTerm):
     _kernels = kernels
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        return [s.points, self.weights, self.part, *self.views(values), positions]
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        return [s.points, self.weights, self.part, self.view("pressure"), positions]
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
+    def curvature(self) -> torch.Tensor:
         return torch.zeros_like(self.weight)[None]
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        del values
-        own, (s,) = self.launcher, self.sets
-        out = own.zeros(self.n_points)
-        views = [warp_view(field, wp.vec3d) for field in (positions, direction)]
-        inputs = [s.points, self.weights, *views]
-        command = own.record(kernels.adjoint, (own.batch, s.n_points), inputs, [warp_view(out, wp.float64)])
+    def _slopes(self) -> list[Slope]:
+        return [Slope("pressure", (self.n_points,))]
 
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            return {"pressure": self.sum_parts(out)}
-
-        return differentiate
+    @override
+    def _adjoint_inputs(self, s: PointSet, positions: Any, direction: Any) -> list[Any]:
+        return [s.points, self.weights, positions, direction]

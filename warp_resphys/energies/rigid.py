@@ -28,10 +28,11 @@ from ..kernels import vertex_rotations as kernels
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import Mass
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, Term, Values, value_of
-from .launcher import Launcher, warp_view
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep
+from .launcher import Launcher
 from .materials import Corotated
 from .solid import VISCOUS, SolidTerm
+from .term import Kernel, PointSet, Slope, Term
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class BoundRigidInertia(BoundInertia):
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
-        inertia = step.constants.value("density") / step.stage.step**2
+        inertia = step.value("density") / step.stage.step**2
         target = weighted_sum(self._factor, step.stage.target[:, self._controls, None].unbind(1))
         return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
 
@@ -115,41 +116,25 @@ class PointInertiaTerm(Term):
 
     _kernels = kernels
 
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        return {"inertia": (self.n_points,), "target": (self.n_points, 3)}
-
-    def _views(self, values: Values) -> list[Any]:
-        return [warp_view(value_of(values, "inertia"), wp.float64), warp_view(value_of(values, "target"), wp.vec3d)]
+    def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:
+        (s,) = sets
+        super().__init__(launcher, sets, {"inertia": (s.n_points,), "target": (s.n_points, 3)})
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        return [s.points, *self._views(values), positions]
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        return [s.points, self.view("inertia"), self.view("target", wp.vec3d), positions]
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        del positions
-        return kernels.tangent, self._views(values)[:1]
+    def tangent(self, s: PointSet, positions: Any) -> Kernel:
+        return Kernel(kernels.tangent, [self.view("inertia")])
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return value_of(values, "inertia")
+    def curvature(self) -> torch.Tensor:
+        return self.values["inertia"]
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own, (s,) = self.launcher, self.sets
-        by_inertia, by_target = own.zeros(self.n_points), own.zeros(self.n_points, 3)
-        fields = [warp_view(field, wp.vec3d) for field in (positions, direction)]
-        inputs = [s.points, *self._views(values), *fields]
-        outputs = [warp_view(by_inertia, wp.float64), warp_view(by_target, wp.vec3d)]
-        command = own.record(kernels.slopes, (own.batch, self.n_points), inputs, outputs)
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(command)
-            return {"inertia": by_inertia.clone(), "target": by_target.clone()}
-
-        return differentiate
+    def _slopes(self) -> list[Slope]:
+        return [Slope("inertia", (self.n_points,)), Slope("target", (self.n_points, 3), wp.vec3d)]
 
 
 @dataclass(frozen=True)
@@ -187,9 +172,9 @@ class RigidityTerm(SolidTerm):
 
     @override
     def improve_start(self, positions: Any) -> None:
-        (s,), own = self.sets, self.launcher
+        (s,), batch = self.sets, self.launcher
         inputs = [s.points, self._centre, self._arms]
-        own.launch(own.record(kernels.straighten, (own.batch, 1), inputs, [positions]))
+        batch.launch(batch.record(kernels.straighten, (batch.batch, 1), inputs, [positions]))
 
 
 class BoundRigidity(BoundEnergy):

@@ -19,10 +19,11 @@ from ..kernels import elasticity as kernels
 from ..kernels import lanes
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from ..stepping.state import Constants, Mass
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, WholeCells, value_of
-from .launcher import Launcher, struct_of, warp_view
+from ..stepping.state import Mass
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
+from .launcher import Launcher, struct_of
 from .materials import Material
+from .term import Kernel, PointSet, Slope, Values
 from .viscosity import GreenStrain, StrainTerm, Viscosity
 
 VISCOUS_STRAIN: Final = "viscous_strain"
@@ -208,8 +209,8 @@ class BoundSolid(BoundEnergy):
         inertia, weight = (spread(volume, parameters["density"]) for volume in (self._mass_volume, self._load_volume))
         return Mass(inertia, weight, parameters["mass_damping"])
 
-    def _viscosity(self, constants: Constants) -> Viscosity:
-        damping, ratio, time = (constants.values[name] for name in ("damping", "prony_ratio", "prony_time"))
+    def _viscosity(self, values: Values) -> Viscosity:
+        damping, ratio, time = (values[name] for name in ("damping", "prony_ratio", "prony_time"))
         zero = self.site.rest_positions.new_zeros(1, 2)
         return Viscosity(zero if damping is None else damping, damping is not None, ratio, time)
 
@@ -219,7 +220,7 @@ class BoundSolid(BoundEnergy):
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
         carried = step.state.memory.get(VISCOUS_STRAIN)
-        viscosity, strain = self._viscosity(step.constants), partial(GreenStrain.apply, step.term)
+        viscosity, strain = self._viscosity(step.values), partial(GreenStrain.apply, step.term)
         return self._values(*viscosity.step_values(strain, step.state.q, carried, step.stage, self.site.time_step))
 
     @override
@@ -228,7 +229,7 @@ class BoundSolid(BoundEnergy):
 
     @override
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
-        viscosity = self._viscosity(step.constants)
+        viscosity = self._viscosity(step.values)
         if viscosity.ratio is None:
             return {}
         strain, carried = partial(GreenStrain.apply, step.term), step.state.memory.get(VISCOUS_STRAIN)
@@ -241,47 +242,46 @@ class SolidTerm(StrainTerm):
     def __init__(
         self, launcher: Launcher, sets: Sequence[PointSet], material: Material, carried: NDArray[np.float64]
     ) -> None:
-        super().__init__(launcher, sets)
+        points, moduli = sum(s.n_points for s in sets), len(material.rules)
+        shapes = ((points, moduli), (2,), (points, 3, 3), (points,))
+        super().__init__(launcher, sets, dict(zip(("stiffness", *VISCOUS), shapes, strict=True)))
         self._law = law = material.law
-        self._kernels, self._vector = kernels.solid_kernels(law), law.moduli
-        self._moduli = len(material.rules)
+        self._kernels, self._vector, self._moduli = kernels.solid_kernels(law), law.moduli, moduli
         self._carried = carried
         self._lanes = dict[PointSet, Any]()
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
         stiff = self._curvature > 0.0
         self._stiff: torch.Tensor | slice = slice(None) if bool(stiff.all()) else stiff  # a slice copies nothing
 
-    @property
     @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        points = self.n_points
-        shapes = ((points, self._moduli), (2,), (points, 3, 3), (points,))
-        return dict(zip(("stiffness", *VISCOUS), shapes, strict=True))
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        at_points = {name: self.values[name][:, s.in_energy] for name in ("stiffness", *VISCOUS[1:])}
+        values = struct_of(self._kernels.Values, viscosity=self.values["viscosity"], **at_points)
+        return [s.points, values, positions]
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        stiffness, viscosity, strain, dilation = (value_of(values, name) for name in ("stiffness", *VISCOUS))
-        at_points = {"strain_offset": strain, "dilation_offset": dilation, "stiffness": stiffness}
-        own = {name: value[:, s.own] for name, value in at_points.items()}
-        return [s.points, struct_of(self._kernels.Values, viscosity=viscosity, **own), positions]
+    def step(self, s: PointSet, positions: Any) -> Kernel:
+        if (cells := self.lane_cells(s)) is None:
+            return super().step(s, positions)
+        return Kernel(lanes.cell_kernels(self._law).step, [*self._arguments(s, positions), cells], by_cells=True)
 
     @override
-    def whole_cells(self, s: PointSet, values: Values, positions: Any) -> WholeCells | None:
+    def tangent(self, s: PointSet, positions: Any) -> Kernel:
+        if (cells := self.lane_cells(s)) is None:
+            return super().tangent(s, positions)
+        return Kernel(lanes.cell_kernels(self._law).tangent, [*self._arguments(s, positions), cells], by_cells=True)
+
+    def lane_cells(self, s: PointSet) -> Any:
+        """Returns the `kernels.lanes.LaneCells` of a set for kernels with one thread per cell, or None without."""
         if self.launcher.by_cells or not getattr(self._law, "LANES", False):
             return None
         if s not in self._lanes:
             self._lanes[s] = self._lane_arrays(s)
-        if (cells := self._lanes[s]) is None:
-            return None
-        own = lanes.cell_kernels(self._law)
-        return WholeCells(own.step, own.tangent, [*self._arguments(s, values, positions), cells])
+        return self._lanes[s]
 
     def _lane_arrays(self, s: PointSet) -> Any:
-        """Returns the `kernels.lanes.LaneCells` of a set.
-
-        None where cells have less than two points without a volume term before the others.
-        """
-        carried = self._carried[s.own].reshape(s.cells, s.points_per_cell, self._moduli)
+        """Returns these, or None where cells have less than two points without a volume term before the others."""
+        carried = self._carried[s.in_energy].reshape(s.cells, s.points_per_cell, self._moduli)
         with_volume = (carried[..., 1:] != 0.0).any((0, 2))
         count = int(np.argmax(with_volume)) if with_volume.any() else s.points_per_cell
         if count < 2:
@@ -298,29 +298,26 @@ class SolidTerm(StrainTerm):
         return struct_of(lanes.LaneCells, **uploaded, shape_points=count)
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return value_of(values, "stiffness") @ self._curvature
+    def curvature(self) -> torch.Tensor:
+        return self.values["stiffness"] @ self._curvature
 
     @override
-    def total_stiffness(self, values: Values) -> torch.Tensor | None:
-        return value_of(values, "stiffness")[..., self._stiff].sum((1, 2))
+    def total_stiffness(self) -> torch.Tensor | None:
+        return self.values["stiffness"][..., self._stiff].sum((1, 2))
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own, shapes = self.launcher, self.shapes
-        out = {name: own.zeros(*shape) for name, shape in {**shapes, "viscosity": (self.n_points, 2)}.items()}
-        types = dict(zip(("stiffness", *VISCOUS), (self._vector, wp.vec2d, wp.mat33d, wp.float64), strict=True))
-        commands = []
-        for s in self.sets:
-            carried = own.upload(self._carried[s.own], self._vector)
-            inputs, along = self._arguments(s, values, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)
-            outputs = [warp_view(out[name][:, s.own], kind) for name, kind in types.items()]
-            commands.append(
-                own.record(self._kernels.adjoint, (own.batch, s.n_points), [*inputs, carried, along], outputs)
-            )
+    def _slopes(self) -> list[Slope]:
+        n = self.n_points
+        shapes = {
+            "stiffness": (n, self._moduli),
+            "viscosity": (n, 2),
+            "strain_offset": (n, 3, 3),
+            "dilation_offset": (n,),
+        }
+        kinds = (self._vector, wp.vec2d, wp.mat33d, wp.float64)
+        return [Slope(*item, kind) for item, kind in zip(shapes.items(), kinds, strict=True)]
 
-        def differentiate() -> dict[str, torch.Tensor]:
-            own.launch(*commands)
-            return {name: slope.sum(1) if name == "viscosity" else slope.clone() for name, slope in out.items()}
-
-        return differentiate
+    @override
+    def _adjoint_inputs(self, s: PointSet, positions: Any, direction: Any) -> list[Any]:
+        carried = self.launcher.upload(self._carried[s.in_energy], self._vector)
+        return [*self._arguments(s, positions), carried, direction]

@@ -15,6 +15,7 @@ So weights add no unknowns to the solve. A string that tightens removes the rela
 perfectly inelastic impact.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -28,12 +29,12 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels.axial import axial_kernels
 from ..mesh.volume_mesh import Mesh
-from ..stepping.inputs import Inputs
 from ..stepping.quantity import Parameter, Quantity
-from ..stepping.state import Constants, ImplicitStage, State
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
+from ..stepping.state import ImplicitStage, State
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher
-from .pointwise import PartPoints, ReadingTerm
+from .pointwise import ReadingTerm
+from .term import PartPoints, PointSet
 
 PAYLOAD = Quantity(
     "payload", "kg", 0.0, closed=True, per="string", typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
@@ -138,22 +139,22 @@ class BoundStrings(BoundEnergy):
             for what, unit in (("position", "m"), ("velocity", "m/s"))
         )
 
-    def _masses(self, inputs: Inputs, batch: int) -> torch.Tensor:
+    def _masses(self, step: EnergyStep) -> torch.Tensor:
         """Returns the masses (B, S), zero without the input [kg]."""
-        payload = inputs.actuation.get(PAYLOAD.name)
-        return self._averages.new_zeros(batch, self._strings.count) if payload is None else payload
+        zeros = self._averages.new_zeros(step.state.batch, self._strings.count)
+        return step.inputs.get(PAYLOAD.name, zeros)
 
     @override
-    def load(self, inputs: Inputs, constants: Constants, batch: int, static: bool) -> torch.Tensor | None:
-        if not static:
+    def load(self, step: EnergyStep) -> torch.Tensor | None:
+        if math.isfinite(step.stage.step):
             return None
-        gravity = constants.gravity.expand(batch, 3)
-        return torch.einsum("bs,sn,bc->bnc", self._masses(inputs, batch), self._averages, gravity)
+        gravity = step.gravity.expand(step.state.batch, 3)
+        return torch.einsum("bs,sn,bc->bnc", self._masses(step), self._averages, gravity)
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
-        mass, compliance = self._inertia(step), step.constants.value("string_compliance")
-        free = self._free(self._stage(self._weights(step)), step.constants)
+        mass, compliance = self._inertia(step), step.value("string_compliance")
+        free = self._free(self._stage(self._weights(step)), step)
         return {"string_target": free, "string_stiffness": mass / (1.0 + compliance * mass)}
 
     @override
@@ -165,31 +166,31 @@ class BoundStrings(BoundEnergy):
     @override
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         weights = self._weights(step)
-        free = self._free(self._stage(weights), step.constants)
+        free = self._free(self._stage(weights), step)
         tied = torch.einsum("sn,bnc->bsc", self._averages, x)
-        at = self._pulled(tied, free, self._inertia(step), step.constants)
+        at = self._pulled(tied, free, self._inertia(step), step)
         new = self.site.method.finish(weights, at, self.site.time_step)
         values = (new.q, new.v, *(new.previous or ()))
         return {memory.name: value for memory, value in zip(self.memory, values, strict=False)}
 
     def _inertia(self, step: EnergyStep) -> torch.Tensor:
         """Returns M = m / h^2, (B, S) [N/m]."""
-        return self._masses(step.inputs, step.state.batch) / step.stage.step**2
+        return self._masses(step) / step.stage.step**2
 
     def _weights(self, step: EnergyStep) -> State:
         """Returns the state of the weights, (B, S, 3), at the start of a step.
 
         Without memory they hang at rest on taut strings, or are at a without gravity.
         """
-        state, constants = step.state, step.constants
+        state = step.state
         stored = [state.memory[memory.name] for memory in self.memory if memory.name in state.memory]
         if len(stored) >= 2:
             previous = (stored[2], stored[3]) if len(stored) == 4 else None
             return State(stored[0], stored[1], previous)
-        gravity = constants.gravity.expand(state.batch, 3)[:, None]
+        gravity = step.gravity.expand(state.batch, 3)[:, None]
         size = gravity.norm(dim=-1, keepdim=True)
-        pull = self._masses(step.inputs, state.batch) * size[..., 0]
-        length = constants.value("string_length") + constants.value("string_compliance") * pull
+        pull = self._masses(step) * size[..., 0]
+        length = step.value("string_length") + step.value("string_compliance") * pull
         length = length + 0.5 * self._strings.toe
         down = torch.where(size > 0.0, gravity / size, 0.0)
         tied = [torch.einsum("sn,bnc->bsc", self._averages, field) for field in (state.q, state.v)]
@@ -198,24 +199,24 @@ class BoundStrings(BoundEnergy):
     def _stage(self, weights: State) -> ImplicitStage:
         return self.site.method.stage(weights, self.site.time_step)
 
-    def _free(self, stage: ImplicitStage, constants: Constants) -> torch.Tensor:
+    def _free(self, stage: ImplicitStage, step: EnergyStep) -> torch.Tensor:
         """Returns y (B, S, 3), where inertia and gravity alone move the weights [m]."""
-        return stage.target + stage.step**2 * constants.gravity[:, None]
+        return stage.target + stage.step**2 * step.gravity[:, None]
 
-    def _pulled(self, tied: torch.Tensor, free: torch.Tensor, mass: torch.Tensor, constants: Constants) -> torch.Tensor:
+    def _pulled(self, tied: torch.Tensor, free: torch.Tensor, mass: torch.Tensor, step: EnergyStep) -> torch.Tensor:
         """Returns the positions p (B, S, 3) of the weights at the end of a stage [m].
 
         Args:
             tied: (B, S, 3) a at the end of the stage [m].
             free: (B, S, 3) y [m].
             mass: (B, S) M [N/m].
-            constants: constants of the roll-out.
+            step: the step.
         """
         line, toe = tied - free, self._strings.toe
         distance = line.norm(dim=-1)
-        excess = distance - constants.value("string_length")
+        excess = distance - step.value("string_length")
         pull = thread_pull(excess, toe)
-        compliance = constants.value("string_compliance")
+        compliance = step.value("string_compliance")
         share = pull / (1.0 + compliance * mass) / distance.clamp_min(torch.finfo(line.dtype).tiny)
         return free + share[..., None] * line
 
@@ -224,5 +225,5 @@ class StringTerm(ReadingTerm):
     """Kernels of the springs that replace strings and weights in a stage."""
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return value_of(values, "string_stiffness")
+    def curvature(self) -> torch.Tensor:
+        return self.values["string_stiffness"]

@@ -1,6 +1,6 @@
 """Kernels of contact between surfaces, and derivatives of its friction by the state at the start of a step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
@@ -16,9 +16,9 @@ from ..kernels.contact import nearest_points
 from ..kernels.contact import surface_pairs as kernels
 from ..stepping.quantity import Quantity
 from .barrier import barrier_pressure, friction_over_slide
-from .base import Adjoint, PairTangents, PointSet, Term, Values, value_of
 from .launcher import HostLaunches, Launcher, struct_of, warp_view
 from .pairs import PairList, Surface
+from .term import Adjoint, PairTangents, PointSet, Term, Values, value_of
 
 STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
 FRICTION = Quantity("surface_friction", "", 0.0, closed=True, per="coefficient")
@@ -93,13 +93,16 @@ class SurfaceTerm(Term):
     _kernels = kernels
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], reach: float) -> None:
-        super().__init__(launcher, sets)
         (s,) = sets
         assert isinstance(s.source, SurfacePoints)
-        self._vertices, self._reach = s.n_vertices, reach
+        members = s.source.members(s.n_vertices)
+        fields = dict.fromkeys(("surface_start", "surface_reference", "surface_place"), (s.n_vertices, 3))
+        shapes = {STIFFNESS.name: (1,), FRICTION.name: (1 + len(members),), "surface_slip": (1,), **fields}
+        super().__init__(launcher, sets, shapes)
+        self._reach = reach
         self._list = PairList(launcher, s.source.placed(s.n_vertices), reach)
         self._whole = launcher.zeros(s.n_vertices, 3) if s.nodes_per_cell > 1 else None  # positions, if some depend
-        self._members = torch.as_tensor(s.source.members(s.n_vertices), device=launcher.device)
+        self._members = torch.as_tensor(members, device=launcher.device)
         self._none = torch.zeros(0, device=launcher.device, dtype=torch.int64)
         self._force, self._energy = launcher.zeros(self.n_points, 3), launcher.zeros(self.n_points)
         self._grips: Grips | None = None
@@ -113,13 +116,6 @@ class SurfaceTerm(Term):
         self._pair_force, self._pair_energy = new(count, 4, 3), new(count)
         self._near = torch.zeros(count, device=self.launcher.device, dtype=torch.int32)
         self._sized = self._list.version
-
-    @property
-    @override
-    def shapes(self) -> Mapping[str, tuple[int, ...]]:
-        n = self._vertices
-        fields = dict.fromkeys(("surface_start", "surface_reference", "surface_place"), (n, 3))
-        return {STIFFNESS.name: (1,), FRICTION.name: (1 + len(self._members),), "surface_slip": (1,), **fields}
 
     def _expand(self, field: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
         """Returns a field (B, N, 3) with the values at all vertices of the surface from those at control vertices.
@@ -135,16 +131,15 @@ class SurfaceTerm(Term):
         return out
 
     @override
-    def set_step(self, values: Values) -> None:
-        start = value_of(values, "surface_start")
+    def set_step(self) -> None:
         self._bounded, self._grips = False, None
-        slides = self.sliding(values, start, value_of(values, STIFFNESS.name))
+        slides = self.sliding(self.values["surface_start"], self.values[STIFFNESS.name])
         self._grips = None if slides is None else Grips.of(self._list, slides)
         self._steps += 1
 
     @override
-    def check_start(self, values: Values, start: torch.Tensor, follows: bool) -> None:
-        given, ours = value_of(values, "surface_start"), self._list
+    def check_start(self, start: torch.Tensor, follows: bool) -> None:
+        given, ours = self.values["surface_start"], self._list
         if not follows:
             when = "at the start of a step, in environment {}"
             ours.check_apart(given, when, "give a state in which the bodies are apart")
@@ -170,21 +165,21 @@ class SurfaceTerm(Term):
         if ours.count:
             self.launcher.launch(self._bound(origin, end, warp_view(share, wp.float64)))
 
-    def _commands(self, values: Values, positions: Any, active: Any) -> list[Any]:
+    def _commands(self, positions: Any, active: Any) -> list[Any]:
         """Returns launches of forces and energies at positions."""
         x = self._expand(wp.to_torch(positions), self._whole)
         if not (self._bounded or self._list.covers(x)):  # By `bounds`, a list holds all pairs up to the next step.
             self._list.find(x, torch.zeros_like(x))
         now = (self._list.version, self._steps)
         if active.ptr not in self._recorded or self._recorded[active.ptr][0] != now:
-            self._recorded[active.ptr] = now, self._record(values, warp_view(x, wp.vec3d), active)
+            self._recorded[active.ptr] = now, self._record(warp_view(x, wp.vec3d), active)
         return self._recorded[active.ptr][1]
 
-    def _record(self, values: Values, positions: Any, active: Any) -> list[Any]:
+    def _record(self, positions: Any, active: Any) -> list[Any]:
         own, ours = self.launcher, self._list
         if self._sized != ours.version:
             self._size(ours.count)
-        stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
+        stiffness = self.view(STIFFNESS.name)
         inputs = [active, ours.pairs, stiffness, wp.float64(self._reach), positions]
         pair_out = [warp_view(self._pair_force, nearest_points.Corners), warp_view(self._pair_energy, wp.float64)]
         sums = [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
@@ -193,23 +188,23 @@ class SurfaceTerm(Term):
         commands = [own.record(kernels.pair_forces, (ours.count,), inputs, [*pair_out, near])] if ours.count else []
         commands.append(own.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums))
         if (grips := self._grips) is not None:
-            inputs = [active, grips.struct, *self._friction(values), positions]
+            inputs = [active, grips.struct, *self._friction(), positions]
             commands.append(own.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs))
             inputs = [*grips.incidence, *grips.outputs, self.n_points, 1]
             commands.append(own.record(kernels.gather, size, inputs, sums))
         return commands
 
-    def _friction(self, values: Values) -> list[Any]:
+    def _friction(self) -> list[Any]:
         """Returns coefficient, slip and reference for the kernels of friction."""
         names = ((FRICTION.name, wp.float64), ("surface_slip", wp.float64), ("surface_reference", wp.vec3d))
-        return [warp_view(value_of(values, name), kind) for name, kind in names]
+        return [self.view(name, kind) for name, kind in names]
 
     @override
-    def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
-        return [HostLaunches(lambda: self._commands(values, positions, active))]
+    def before(self, positions: Any, active: Any) -> list[Any]:
+        return [HostLaunches(lambda: self._commands(positions, active))]
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
         return [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
 
     def _chosen(self, active: torch.Tensor) -> torch.Tensor:
@@ -219,13 +214,13 @@ class SurfaceTerm(Term):
         return (self._near * active[self._list.environment]).nonzero().ravel()
 
     @override
-    def pair_tangents(self, values: Values, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
+    def pair_tangents(self, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
         own, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
         if self._whole is not None:
             positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
             indices, blocks = chosen.to(torch.int32), self._force.new_zeros(len(chosen), 12, 12)
-            stiffness = warp_view(value_of(values, STIFFNESS.name), wp.float64)
+            stiffness = self.view(STIFFNESS.name)
             inputs = [warp_view(indices, wp.int32), self._list.pairs, stiffness, wp.float64(self._reach), positions]
             out = [warp_view(blocks, wp.float64)]
             kernel = kernels.pair_springs if clamp else kernels.pair_tangents
@@ -233,7 +228,7 @@ class SurfaceTerm(Term):
             parts.append(PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks))
         if (grips := self._grips) is not None:
             blocks = self._force.new_zeros(grips.count, 12, 12)
-            inputs = [grips.struct, *self._friction(values), positions]
+            inputs = [grips.struct, *self._friction(), positions]
             own.launch(own.record(kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)]))
             used = active.bool()[grips.environment]
             parts.append(PairTangents(grips.environment[used], grips.nodes[used], blocks[used]))
@@ -243,11 +238,11 @@ class SurfaceTerm(Term):
         return PairTangents(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
 
     @override
-    def feasible(self, values: Values) -> tuple[torch.Tensor, torch.Tensor]:
-        return value_of(values, "surface_place"), self._none
+    def feasible(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.values["surface_place"], self._none
 
     @override
-    def bounds(self, values: Values, origin: Any, positions: Any, share: Any) -> list[Any]:
+    def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         return [HostLaunches(lambda: self._bounding(origin, positions, share))]
 
     def _bounding(self, origin: Any, positions: Any, share: Any) -> list[Any]:
@@ -270,15 +265,15 @@ class SurfaceTerm(Term):
         return self.launcher.record(nearest_points.bound, (self._list.count,), inputs, [share])
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        return value_of(values, STIFFNESS.name).new_zeros(1, self.n_points)
+    def curvature(self) -> torch.Tensor:
+        return self._energy.new_zeros(1, self.n_points)
 
-    def _near_at(self, values: Values, positions: torch.Tensor) -> torch.Tensor:
+    def _near_at(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns the pairs within reach at positions (B, N, 3), whose forces are then those there."""
         if not self._list.covers(positions):
             self._list.find(positions, torch.zeros_like(positions))
         active = warp_view(self.launcher.active, wp.int32)
-        self.launcher.launch(*self._record(values, warp_view(positions, wp.vec3d), active))
+        self.launcher.launch(*self._record(warp_view(positions, wp.vec3d), active))
         return self._chosen(self.launcher.active)
 
     def _pairs(self, chosen: torch.Tensor, x: torch.Tensor) -> "_Near":
@@ -306,9 +301,9 @@ class SurfaceTerm(Term):
         factor = torch.where(ours.kind[chosen] == 0, 1.0, (2.0 - share) * share) * ours.area[chosen]
         return _Near(environment, nodes, w, r, r.norm(dim=-1), part, factor)
 
-    def sliding(self, values: Values, start: torch.Tensor, stiffness: torch.Tensor) -> Sliding | None:
+    def sliding(self, start: torch.Tensor, stiffness: torch.Tensor) -> Sliding | None:
         """Returns friction for the state at the start of a step, or None without pairs within reach."""
-        chosen = self._near_at(values, start.detach())
+        chosen = self._near_at(start.detach())
         if not len(chosen):
             return None
         near = self._pairs(chosen, start)
@@ -342,7 +337,7 @@ class SurfaceTerm(Term):
         gap = torch.full_like(x[..., 0], self._reach)
         slide = torch.full_like(gap, -1.0)
         start, stiffness = value_of(values, "surface_start"), value_of(values, STIFFNESS.name)
-        if (slides := self.sliding(values, start, stiffness)) is not None:
+        if (slides := self.sliding(start, stiffness)) is not None:
             names = ("surface_reference", FRICTION.name, "surface_slip")
             force = slides.force(x, *(value_of(values, name) for name in names))
             ways = slides.slide(x, value_of(values, names[0])).square().sum(-1).clamp_min(_TINY).sqrt()
@@ -351,7 +346,7 @@ class SurfaceTerm(Term):
             slide = slide.ravel().scatter_reduce(0, rows.ravel(), ways.ravel(), "amax").view_as(slide)
             place = (slides.environment[:, None].expand_as(slides.nodes), slides.nodes)
             friction = friction.index_put(place, slides.weights[..., None] * force[:, None], accumulate=True)
-        if len(chosen := self._near_at(values, x.detach())):
+        if len(chosen := self._near_at(x.detach())):
             differentiable = torch.is_grad_enabled()
             with torch.enable_grad():
                 given = x if x.requires_grad else x.detach().requires_grad_()
@@ -368,23 +363,23 @@ class SurfaceTerm(Term):
         return gap[:, own], normal[:, own], friction[:, own], slide[:, own]
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
+    def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         own = self.launcher
         names = ("surface_start", "surface_reference", STIFFNESS.name, FRICTION.name)
 
         def differentiate() -> dict[str, torch.Tensor]:
             x, ways = self._expand(positions), self._expand(direction)
-            chosen = self._near_at(values, x)
+            chosen = self._near_at(x)
             environment, nodes = self._list.environment[chosen], self._list.nodes[chosen]
             work = (self._pair_force[chosen] * ways[environment[:, None], nodes]).sum((1, 2))
-            by_stiffness = own.zeros(1).index_add_(0, environment, -work[:, None]) / value_of(values, STIFFNESS.name)
+            by_stiffness = own.zeros(1).index_add_(0, environment, -work[:, None]) / self.values[STIFFNESS.name]
             start, reference, stiffness, friction = given = [
-                value_of(values, name).detach().requires_grad_() for name in names
+                self.values[name].detach().requires_grad_() for name in names
             ]
             slopes = tuple(torch.zeros_like(value) for value in given)
             with torch.enable_grad():
-                if (slides := self.sliding(values, start, stiffness)) is not None:
-                    force = slides.force(x, reference, friction, value_of(values, "surface_slip"))
+                if (slides := self.sliding(start, stiffness)) is not None:
+                    force = slides.force(x, reference, friction, self.values["surface_slip"])
                     along = ways[slides.environment[:, None], slides.nodes]
                     work = (slides.weights[..., None] * along * force[:, None]).sum()
                     slopes = torch.autograd.grad(work, given)

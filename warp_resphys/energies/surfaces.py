@@ -31,11 +31,12 @@ from ..fem.scene import Scene
 from ..io.errors import InputError, naming
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, PointSet, value_of
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep
 from .contact import ContactForces
 from .launcher import Launcher
 from .pairs import PairList, Surface
 from .surface_term import FRICTION, STIFFNESS, SurfacePoints, SurfaceTerm
+from .term import PointSet, value_of
 
 _LEAST: Final = 1e-4  # share of D within which surfaces count as touching
 
@@ -197,7 +198,7 @@ class BoundSurfaceContact(BoundEnergy):
         Gaps are the least of a vertex, the distance at which contact begins where none is nearer; slides the largest.
         """
         assert isinstance(step.term, SurfaceTerm)
-        shared = {q.name: step.constants.value(q.name).expand(step.state.batch, -1) for q in (STIFFNESS, FRICTION)}
+        shared = {q.name: step.value(q.name).expand(step.state.batch, -1) for q in (STIFFNESS, FRICTION)}
         values = {n: v.double() for n, v in {**shared, **self.begin_step(step)}.items() if v is not None}
         gap, normal, friction, slide = (out.to(x) for out in step.term.forces(values, x.double()))
         sticks = (slide >= 0.0) & (slide < value_of(values, "surface_slip").to(x))

@@ -26,7 +26,7 @@ L. Euler: Remarques sur l'effet du frottement dans l'equilibre. Memoires de l'ac
 P. R. Dahl: A solid friction model. The Aerospace Corporation, TOR-0158(3107-18)-1, 1968.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,10 +38,10 @@ from typing_extensions import override
 
 from ..kernels import tendon_segments as kernels
 from ..stepping.quantity import Quantity
-from .base import Adjoint, BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PointSet, Values, value_of
+from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher, launch, warp_view
-from .pointwise import PartPoints, PartTerm
 from .strings import thread_pull
+from .term import Adjoint, Kernel, PartPoints, PartTerm, PointSet, Values, value_of
 
 TENSION = Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N")
 CONTRACTION = Quantity(
@@ -212,8 +212,8 @@ class BoundTendons(BoundEnergy):
     def _values(self, step: EnergyStep) -> dict[str, torch.Tensor]:
         """Returns parameters and inputs, (1 or B, T, ...)."""
         zeros = step.state.q.new_zeros(step.state.batch, self.energy.count)
-        constants = {name: step.constants.value(name) for name in (STIFFNESS.name, FRICTION.name, BRISTLE.name, ROUTE)}
-        return constants | {q.name: step.inputs.actuation.get(q.name, zeros) for q in self.energy.inputs}
+        constants = {name: step.value(name) for name in (STIFFNESS.name, FRICTION.name, BRISTLE.name, ROUTE)}
+        return constants | {q.name: step.inputs.get(q.name, zeros) for q in self.energy.inputs}
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:
@@ -229,7 +229,7 @@ class BoundTendons(BoundEnergy):
         return dict.fromkeys(STEP_VALUES, self._entry.new_zeros(batch, len(self._entry)))
 
     @override
-    def at_pose(self, q: torch.Tensor, values: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
+    def at_pose(self, q: torch.Tensor, values: Values) -> dict[str, torch.Tensor | None]:
         """Returns friction that does not change with the slide, which makes both bounds equal to it."""
         (decay, lengths), lines = self._geometry(q, values), self._lines
         fall = decay @ lines.beyond.mT
@@ -272,7 +272,7 @@ class TendonTerm(PartTerm):
         self._lines = TendonLines(s.source, count, toe, self.weight)
         self._toe = wp.float64(toe)
         first = np.searchsorted(s.source.part, np.arange(count + 1)).astype(np.int32)
-        self._first, self._part = launcher.upload(first, int), self.part
+        self._first = launcher.upload(first, int)
         self._rest = launcher.upload(s.source.rest, wp.mat33d)
         self._anchors = launcher.upload(s.source.anchors, wp.mat33d)
         self._tension = launcher.zeros(s.n_points)
@@ -284,12 +284,12 @@ class TendonTerm(PartTerm):
         self._operator = torch.as_tensor(np.moveaxis(operator, -1, 0).copy(), device=launcher.device)  # (.., P, N)
 
     @override
-    def before(self, values: Values, positions: Any, active: Any) -> list[Any]:
+    def before(self, positions: Any, active: Any) -> list[Any]:
         (s,) = self.sets
-        route = warp_view(value_of(values, ROUTE), wp.vec3d)
-        scalars = [warp_view(value_of(values, q.name), wp.float64) for q in (TENSION, CONTRACTION, STIFFNESS)]
+        route = self.view(ROUTE, wp.vec3d)
+        scalars = [self.view(q.name) for q in (TENSION, CONTRACTION, STIFFNESS)]
         if self._rubs:
-            friction = [value_of(values, name) for name in (*STEP_VALUES, BRISTLE.name)]
+            friction = [self.values[name] for name in (*STEP_VALUES, BRISTLE.name)]
         else:
             friction = [*(self.launcher.zeros(s.n_points),) * 4, self.launcher.zeros(self.count) + 1.0]
         inputs = [active, s.points, self._anchors, self._first, self._rest, self._toe, route, *scalars]
@@ -303,30 +303,30 @@ class TendonTerm(PartTerm):
         return [warp_view(buffer, wp.vec3d) for buffer in (self._spring, self._friction)]
 
     @override
-    def _arguments(self, s: PointSet, values: Values, positions: Any) -> list[Any]:
-        route = warp_view(value_of(values, ROUTE), wp.vec3d)
-        scalars = (value_of(values, TENSION.name), value_of(values, STIFFNESS.name), self._tension)
+    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
+        route = self.view(ROUTE, wp.vec3d)
+        scalars = (self.values[TENSION.name], self.values[STIFFNESS.name], self._tension)
         views = [route, *(warp_view(x, wp.float64) for x in scalars), *self._changes]
         return [s.points, self._anchors, self._first, self.part, *views, positions]
 
     @override
-    def tangent(self, s: PointSet, values: Values, positions: Any) -> tuple[Any, list[Any]]:
-        route, tension = warp_view(value_of(values, ROUTE), wp.vec3d), warp_view(self._tension, wp.float64)
-        return kernels.tangent, [s.points, self._anchors, self.part, route, tension, positions]
+    def tangent(self, s: PointSet, positions: Any) -> Kernel:
+        route, tension = self.view(ROUTE, wp.vec3d), warp_view(self._tension, wp.float64)
+        return Kernel(kernels.tangent, [s.points, self._anchors, self.part, route, tension, positions])
 
     @override
-    def low_rank(self, values: Values, positions: Any) -> torch.Tensor | None:
-        stiffness, slopes = value_of(values, STIFFNESS.name), self._friction[..., 2]
+    def low_rank(self, positions: Any) -> torch.Tensor | None:
+        stiffness, slopes = self.values[STIFFNESS.name], self._friction[..., 2]
         sprung, rubs = bool((stiffness > 0.0).any()), self._rubs and bool((slopes > 0.0).any())
         if not (sprung or rubs):
             return None
-        route = value_of(values, ROUTE)
+        route = self.values[ROUTE]
         lines = self._lines.lines(wp.to_torch(positions), route)
         u = lines / lines.norm(dim=-1, keepdim=True).clamp_min(_TINY)
         columns = route[:, self.part_of].movedim(-1, 1)[:, : len(self._operator), :, None] * u[:, None]  # (B, .., P, 3)
         weights = []  # (B, P, r) of the segments' lengths in the columns
         if sprung:
-            weights.append(self._one_hot * (stiffness * self._spring[..., 2]).sqrt()[:, None])
+            weights.append(self.one_hot * (stiffness * self._spring[..., 2]).sqrt()[:, None])
         if rubs:
             weights.append(self._lines.beyond * slopes.sqrt()[:, None])
         by_column = columns[..., None] * torch.cat(weights, -1)[:, None, :, None]  # (B, .., P, 3, r)
@@ -334,27 +334,27 @@ class TendonTerm(PartTerm):
         return gradient.unflatten(2, (3, -1)).flatten(1, 2)
 
     @override
-    def curvature(self, values: Values) -> torch.Tensor:
-        tension, stiffness = value_of(values, TENSION.name), value_of(values, STIFFNESS.name)
+    def curvature(self) -> torch.Tensor:
+        tension, stiffness = self.values[TENSION.name], self.values[STIFFNESS.name]
         # |F c|^2 <= |c|^2 |F|^2, and the square of a sum of n lengths is at most n times the sum of their squares.
-        columns = value_of(values, ROUTE).square().sum(-1)
+        columns = self.values[ROUTE].square().sum(-1)
         stretching = (tension * columns)[:, self.part_of] / self._segment_length
         if self._rubs:  # A guide's slope is at most the sum of its bounds over the bristle length.
-            _, drop, rise, _ = (value_of(values, name) for name in STEP_VALUES)
+            _, drop, rise, _ = (self.values[name] for name in STEP_VALUES)
             beyond = self._lines.beyond
-            slopes = (drop + rise) / value_of(values, BRISTLE.name)[:, self.part_of] * beyond.sum(0)
+            slopes = (drop + rise) / self.values[BRISTLE.name][:, self.part_of] * beyond.sum(0)
             stretching = stretching + columns[:, self.part_of] * (slopes @ beyond.mT)
-        return stretching + (stiffness * columns * self._one_hot.sum(0))[:, self.part_of]
+        return stretching + (stiffness * columns * self.one_hot.sum(0))[:, self.part_of]
 
     @override
-    def adjoint(self, values: Values, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
+    def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
         """Implements `Term.adjoint`: the residual along z is the sum of tensions times the changes of lengths."""
-        names = [name for name in self.shapes if name != ROUTE or self._lines.columns > 1]
+        names = [name for name in self.values if name != ROUTE or self._lines.columns > 1]
 
         def differentiate() -> dict[str, torch.Tensor]:
             with torch.enable_grad():
-                leaves = {name: value_of(values, name).detach().requires_grad_() for name in names}
-                route = leaves.get(ROUTE, value_of(values, ROUTE))
+                leaves = {name: self.values[name].detach().requires_grad_() for name in names}
+                route = leaves.get(ROUTE, self.values[ROUTE])
                 lines = self._lines.lines(positions, route)
                 lengths = lines.norm(dim=-1)
                 rates = (lines * self._lines.changes(direction, route)).sum(-1) / lengths.clamp_min(_TINY)

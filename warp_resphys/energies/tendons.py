@@ -32,7 +32,7 @@ from ..kernels import tendon_segments as kernels
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, PointSet
+from .base import BoundEnergy, Energy, EnergySite
 from .launcher import Launcher
 from .tendon_forces import (
     BRISTLE,
@@ -46,6 +46,7 @@ from .tendon_forces import (
     TendonPoints,
     TendonTerm,
 )
+from .term import PointSet
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from typing_extensions import override
 from ..kernels import elasticity as kernels
 from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.state import ImplicitStage
-from .base import Term
 from .launcher import warp_view
+from .term import Term
 
 Strain = Callable[[torch.Tensor], torch.Tensor]  # (B, N, 3) positions to the Green strain (B, P, 3, 3)
 StepValues = tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]
@@ -126,7 +126,9 @@ class StrainTerm(Term):
         at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
         view = warp_view(at, wp.vec3d)
         commands = [
-            own.record(kernels.strain, (own.batch, s.n_points), [s.points, view], [warp_view(out[:, s.own], wp.mat33d)])
+            own.record(
+                kernels.strain, (own.batch, s.n_points), [s.points, view], [warp_view(out[:, s.in_energy], wp.mat33d)]
+            )
             for s in self.sets
         ]
         recorded = own.capture(*commands)
@@ -157,7 +159,7 @@ class StrainTerm(Term):
         along, stress = own.zeros(self.n_points, 3, 3), own.zeros(self.n_points, 3, 3)
         place, commands = warp_view(at, wp.vec3d), []
         for s in self.sets:
-            direction, view = (warp_view(values[:, s.own], wp.mat33d) for values in (along, stress))
+            direction, view = (warp_view(values[:, s.in_energy], wp.mat33d) for values in (along, stress))
             inputs = [s.points, place, direction]
             commands.append(own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view]))
             commands.append(own.gather(s, view, out))

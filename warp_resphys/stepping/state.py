@@ -167,8 +167,8 @@ class Constants:
     load_mass: torch.Tensor  # (1 or B, N) mass that gravity acts on [kg]
     gravity: torch.Tensor  # (1 or B, 3) [m/s^2]
     mass_damping: torch.Tensor  # (1 or B, 1 or N) [1/s]
-    # values of the energies by name; None where an optional term is switched off
-    values: Mapping[str, torch.Tensor | None]
+    # values of every energy by name; None where an optional term is switched off
+    values: Sequence[Mapping[str, torch.Tensor | None]]
 
     @property
     def batch(self) -> int:
@@ -177,14 +177,8 @@ class Constants:
 
     @property
     def _tensors(self) -> tuple[torch.Tensor, ...]:
-        values = (value for value in self.values.values() if value is not None)
+        values = (value for energy in self.values for value in energy.values() if value is not None)
         return (self.mass, self.gravity, self.mass_damping, *values)
-
-    def value(self, name: str) -> torch.Tensor:
-        """Returns a value that is never None, such as an energy's parameter."""
-        value = self.values[name]
-        assert value is not None
-        return value
 
     def check_batch(self, batch: int) -> None:
         """Raises InputError unless every constant has one value or one per environment."""

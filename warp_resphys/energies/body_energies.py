@@ -1,42 +1,19 @@
 """The energies of a simulator, from its bodies and their materials."""
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar, cast
-
-import torch
+from dataclasses import dataclass
+from typing import Any, cast
 
 from ..fem.bodies import Body
 from ..fem.integration_points import Points
 from ..io.errors import InputError
-from ..stepping.inputs import Inputs
-from ..stepping.state import Constants, ImplicitStage, State
-from .base import Energy, EnergyStep, Term
+from .base import Energy
 from .hysteresis import Hysteresis
 from .materials import Material
 from .rigid import PointInertia, rigid_energies
 from .solid import solids_of
 
-T = TypeVar("T")
 Materials = Mapping[str, Any]  # by name of a region or body: a material, or the materials of its regions
-DEPENDENT = "dependent_"  # prefix of the inertia of dependent vertices
-
-
-@dataclass(frozen=True)
-class SimulatorStep:
-    """One time step of a simulator, or a static equilibrium after a state: a step without end (`endless`)."""
-
-    state: State  # state at the start
-    stage: ImplicitStage  # the implicit solve of the step
-    inputs: Inputs
-    constants: Constants
-    terms: Sequence[Term]  # kernels of all energies for the state's batch
-
-    @classmethod
-    def endless(cls, state: State, inputs: Inputs, constants: Constants, terms: Sequence[Term]) -> "SimulatorStep":
-        """Returns a static equilibrium, in which inertia has no part."""
-        return cls(state, ImplicitStage(math.inf, state.q, state.q, ()), inputs, constants, terms)
 
 
 @dataclass(frozen=True)
@@ -66,34 +43,6 @@ class PlacedEnergy:
         """
         shifted = tuple(own.shifted(first) for own in points)
         return cls(energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first)
-
-    def named(self, values: Mapping[str, T]) -> dict[str, T]:
-        """Renames values from the energy's names to names in the simulator."""
-        return {f"{self.prefix}{name}": value for name, value in values.items()} if self.prefix else dict(values)
-
-    def own(self, values: Mapping[str, T]) -> Mapping[str, T]:
-        """Selects the values of the energy, and renames them from names in the simulator to its own names."""
-        if not self.prefix:
-            return values
-        return {name.removeprefix(self.prefix): x for name, x in values.items() if name.startswith(self.prefix)}
-
-    def own_constants(self, constants: Constants) -> Constants:
-        """Returns the constants with the energy's names."""
-        return replace(constants, values=self.own(constants.values)) if self.prefix else constants
-
-    def own_inputs(self, inputs: Inputs) -> Inputs:
-        """Returns the inputs of the energy, with its names."""
-        return Inputs(**self.own(inputs.actuation)) if self.prefix else inputs
-
-    def step(self, step: SimulatorStep, number: int) -> EnergyStep:
-        """Returns a step as the energy sees it, whose number among all is given."""
-        state = replace(step.state, memory=self.own(step.state.memory)) if self.prefix else step.state
-        inputs, constants = self.own_inputs(step.inputs), self.own_constants(step.constants)
-        return EnergyStep(state, step.stage, inputs, constants, step.terms[number])
-
-    def own_values(self, values: Mapping[str, torch.Tensor | None], term: Term) -> dict[str, torch.Tensor | None]:
-        """Returns the values of the energy's term, with the energy's names."""
-        return {name: values[f"{self.prefix}{name}"] for name in term.shapes}
 
 
 def joined_names(materials: Material | Materials) -> dict[str, Material]:
@@ -133,7 +82,7 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
     if (contact := getattr(whole, "contact", None)) is not None:
         placed.append(PlacedEnergy.of(whole, whole, 0, contact, contact.points(whole.mesh)))
     if whole.coordinates:
-        placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), DEPENDENT))
+        placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), "dependent_"))
     return placed
 
 

@@ -20,11 +20,12 @@ from .control.files import BASELINES, plan_table, plans_file, reduced_file
 from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
 from .energies.catalogue import law_path
+from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.duration import announcement
 from .experiment.evaluate import check_mesh, evaluate, time_models
-from .experiment.experiment import LEARNED
+from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.files import (
     CONTROL,
     DATASET,
@@ -47,14 +48,13 @@ from .experiment.files import (
     training_file,
     weights_file,
 )
+from .experiment.folds import Fold, run_folds, workers_for
 from .experiment.identify import identify
 from .experiment.identify_law import identify_law
 from .experiment.laboratory import run_laboratory
 from .experiment.learn import train
-from .experiment.models import SIMFREE
-from .experiment.parts import Fold, run_folds, workers_for
 from .experiment.prediction_intervals import intervals_of_folds
-from .experiment.reconstruct import ablation_stages, print_ablation, reconstruct
+from .experiment.reconstruct import reconstruct
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes

@@ -24,6 +24,7 @@ from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
+from warp_resphys.learning import fitting
 from warp_resphys.learning.correction import force_frames
 from warp_resphys.settings.stages import LEARNING, NETWORKS, StageSettings
 from warp_resphys.settings.trials import Split
@@ -108,9 +109,9 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
     learned = {}
     for frame in ("corotated", "world"):
         keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
-        monkeypatch.setattr(learn, "Trainer", keep)
+        monkeypatch.setattr(fitting, "Trainer", keep)
         experiment = Experiment(stage.model_copy(update={"force_frame": frame}), finished)
-        assert learn.trainer_of(experiment, "resphys", stage.training)[1].force_frame == frame
+        assert learn.fitting_of(experiment, "resphys").trainer(stage.training)[1].force_frame == frame
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
     frames = force_frames(experiment.model_simulator("resphys"), "corotated")
     size = float(kept.outputs[0].abs().max())

@@ -13,9 +13,9 @@ from warp_resphys.data.base_motion import rigid
 from warp_resphys.data.dataset import read_dataset
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.muscles import Muscle, Muscles
+from warp_resphys.experiment.ablation import generate_motion, read_motion
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET
-from warp_resphys.experiment.reconstruct import generate_motion, read_motion
 from warp_resphys.experiment.simulate import simulate, vertices_in
 from warp_resphys.experiment.trials import split_of, trials_of
 from warp_resphys.io.errors import InputError

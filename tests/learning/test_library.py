@@ -6,8 +6,11 @@ import torch
 
 import warp_resphys as wr
 from warp_resphys.data.markers import WHOLE_STATE
-from warp_resphys.learning.library import evaluate, fit_force, identify, reconstruct
+from warp_resphys.learning.evaluation import evaluate
+from warp_resphys.learning.fitting import Fitting, fit_force
+from warp_resphys.learning.library import identify
 from warp_resphys.learning.observed_motions import ObservedMotions
+from warp_resphys.learning.reconstruction import reconstruct
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -57,28 +60,30 @@ def test_youngs_modulus_is_recovered(robot):
 def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.04, 0.07, 0.1, 0.13, known_start=True)
-    samples = reconstruct(wrong, seen)
-    assert samples.q.shape == samples.outputs[0].shape == (4 * STEPS, len(MESH.vertices), 3)
+    found = reconstruct(wrong, seen)
+    q, forces = (torch.from_numpy(array) for array in found.of(found.names, "q", "force"))
+    assert q.shape == forces.shape == (4, STEPS + 1, len(MESH.vertices), 3)
     # With its own forces, the simulator goes where the robot went.
-    forces = samples.outputs[0].unflatten(0, (4, STEPS))
-    assert float(evaluate(wrong, seen, lambda state, step: forces[:, step]).max()) < 1e-6
+    assert evaluate(wrong, seen, lambda state, step: forces[:, step + 1]).max() < 1e-6
 
     network = NetworkSettings(position_modes=3, velocity_modes=3, force_modes=4, layers=1, width=16)
-    force = fit_force(wrong, samples, network=network, trainer=TrainerSettings(epochs=60))
+    force = fit_force(wrong, seen, found, network=network, trainer=TrainerSettings(epochs=60))
     unseen = let_go(robot, 0.09, known_start=True)
     corrected, uncorrected = evaluate(wrong, unseen, force), evaluate(wrong, unseen)
     at_rest = (torch.from_numpy(unseen.dataset.observed[0]) - wrong.rest_positions).norm(dim=-1).mean(-1)
     assert corrected.shape == (STEPS + 1, 1)
-    assert float(corrected[0]) == 0.0
+    assert corrected[0, 0] == 0.0
     assert float(corrected.mean()) < 0.2 * float(uncorrected.mean())
     assert float(corrected.mean()) < 0.2 * float(at_rest.mean())
     # The same seed gives the same network, whatever torch drew before; held-out motions choose the weights.
     short = TrainerSettings(epochs=2)
-    first, again = (fit_force(wrong, samples, network=network, trainer=short) for _ in range(2))
-    assert torch.equal(first(samples.q, samples.v), again(samples.q, samples.v))
-    chosen = TrainerSettings(epochs=60, rollout_every=20)
-    judged = fit_force(wrong, samples, unseen, network=network, trainer=chosen)
-    assert float(evaluate(wrong, unseen, judged).mean()) < 0.2 * float(uncorrected.mean())
+    first, again = (fit_force(wrong, seen, found, network=network, trainer=short).network for _ in range(2))
+    assert torch.equal(first(q[:, 3], 0.0 * q[:, 3]), again(q[:, 3], 0.0 * q[:, 3]))
+    chosen = {"trainer": TrainerSettings(epochs=60, rollout_every=20), "validation": ["motion 3"]}
+    judged = fit_force(wrong, seen, found, network=network, **chosen)
+    assert evaluate(wrong, unseen, judged).mean() < 0.2 * uncorrected.mean()
+    held_out = 1e3 * evaluate(wrong, seen, judged, names=["motion 3"])[1:].mean()
+    assert judged.training["kept"]["validation_rollout_error_mm"] == pytest.approx(held_out, rel=1e-6)
 
 
 def test_the_network_has_the_actuation_as_input():
@@ -95,10 +100,11 @@ def test_the_network_has_the_actuation_as_input():
         some = wr.Inputs(tendon_tension=tension[:, rows])
         return ObservedMotions.of(simulator, q[:, rows], start.map(lambda t: t[list(rows)]), some)
 
-    samples = reconstruct(simulator, motion(0, 2))
+    found, learned = reconstruct(simulator, motion(0, 2)), motion(0, 2)
+    samples = Fitting(simulator, learned, found, found.names).samples(found.names)
     assert torch.equal(samples.actuation[:, 0], torch.cat([tension[:, 0, 0], tension[:, 2, 0]]))
     network = NetworkSettings(position_modes=2, velocity_modes=2, force_modes=3, layers=1, width=16)
-    force = fit_force(simulator, samples, network=network, trainer=TrainerSettings(epochs=60))
+    force = fit_force(simulator, learned, found, network=network, trainer=TrainerSettings(epochs=60))
     uncorrected = evaluate(simulator, motion(1))
     assert float(evaluate(simulator, motion(1), force).mean()) < 0.2 * float(uncorrected.mean())
     factor = identify(simulator, motion(0, 1, 2), {"tendon_tension_factor": (0.5, 3.0)})
@@ -109,9 +115,9 @@ def test_forces_from_markers_bring_the_markers_there(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.1, markers=MARKERS)
     seen.dataset.observed[0, 5, 1] = np.nan
-    samples = reconstruct(wrong, seen)
-    forces = samples.outputs[0]
-    replayed = evaluate(wrong, seen, lambda state, step: forces[step][None])
+    found = reconstruct(wrong, seen)
+    (forces,) = (torch.from_numpy(array).double() for array in found.of(found.names, "force"))
+    replayed = evaluate(wrong, seen, lambda state, step: forces[:, step + 1])
     assert float(replayed[1:].max()) < 0.02 * float(evaluate(wrong, seen).mean())
 
 
@@ -124,5 +130,5 @@ def test_invalid_motions_are_refused(robot):
     motion = ObservedMotions.of(robot, robot.rollout(start, 3).q, start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         identify(robot, motion, {"mass": (1.0, 2.0)})
-    with pytest.raises(wr.InputError, match="does not train recurrent networks"):
-        fit_force(robot, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
+    with pytest.raises(ValueError, match=r"trainer\.sequence is missing"):
+        fit_force(robot, motion, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from warp_resphys import State
-from warp_resphys.experiment.models import Learned
-from warp_resphys.learning.correction import LearnedPredictor, Range
+from warp_resphys.learning.correction import Learned, LearnedPredictor, Range
 from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.settings.learning import NetworkSettings
 

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from ..experiment.files import DRIVEN
-from ..experiment.models import Learned
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
+from ..learning.correction import Learned
 from .baselines import LinearModel
 from .polynomials import Polynomial, SquaredPolynomial
 from .reduced import ReducedModel

@@ -12,9 +12,9 @@ import torch
 from ..data.input_response import SLOPES, InputResponse, draw_inputs, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
-from ..experiment.models import Learned
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
+from ..learning.correction import Learned
 from ..robot.commands import RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..data.dataset import Dataset, read_dataset
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING
-from ..experiment.parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
+from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.progress import Progress
 from ..io.settings import parse
 from ..io.stages import StageContext, finished_record
@@ -154,21 +154,23 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     control = settings.control
     controllers = controllers_of(control)
     robot = load(context.run_dir, control.models[-1], settings.device)
-    task, parts = Task(control, robot), list[TrialPart]()
+    task, cut_up = Task(control, robot), list[TrialPart]()
     for seconds in control.seconds:
         for name in _names(task, seconds):
-            parts += split_into_parts(context, (name,), task.steps(seconds) + 1, name)
-    work_on(parts, _driven, workers)
+            steps = task.steps(seconds)
+            cut_up.append(TrialPart(name, (name,), steps + 1, partial(_driven, settings, context.run_dir, name, steps)))
+    parts = Parts.of(context, workers)
+    parts.run(cut_up)
     motions = {}
-    for part in parts:
+    for part in cut_up:
         (name,) = part.names
-        points, inputs, took = (part.read(key) for key in ("points", "inputs", "seconds"))
+        points, inputs, took = (parts.read(part, key) for key in ("points", "inputs", "seconds"))
         path = read_motion(context.run_dir / plans_file(control.models[-1]), PLANNED, name).path
         motions[name] = DrivenMotion(path, points, inputs, took)
     common = {"controllers": controllers, "time_step": robot.time_step}
     write_motions(context.run_dir / DRIVEN, PLAYED, motions, **common)
     write_json(context.run_dir / CONTROL, _summary(context.run_dir, control, controllers, motions))
-    remove_parts(context)
+    parts.remove()
 
 
 def controllers_of(control: ControlSettings) -> list[str]:
@@ -181,10 +183,9 @@ def controllers_of(control: ControlSettings) -> list[str]:
     ]
 
 
-def _driven(part: TrialPart, report: Report) -> Arrays:
+def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report: Report) -> Arrays:
     """One motion with all controllers, each on a body of its own: points, inputs and computing times."""
-    settings: StageSettings = part.context.settings
-    control, folder, (name,) = settings.control, part.context.run_dir, part.names
+    control = settings.control
     robot = load(folder, control.models[-1], settings.device)
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
     laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
@@ -203,7 +204,7 @@ def _driven(part: TrialPart, report: Report) -> Arrays:
         own = rest[len(plans) + len(controllers)]
         controllers.append(JacobianFeedback(jacobian, control.limits, gain, task.time_step, task.tracked, path, own))
     points, inputs, seconds = list[FloatArray](), list[FloatArray](), list[FloatArray]()
-    for step in range(part.frames - 1):
+    for step in range(steps):
         seen = laboratory.seen(step)
         acting, took = np.zeros((count, task.parts)), np.zeros(count)
         acting[: len(plans)] = [plan.inputs[step] for plan in plans.values()]

@@ -20,8 +20,7 @@ from ..learning.reconstruction import make_reconstructor
 from ..report.wording import duration_text
 from ..settings.stages import StageSettings
 from .evaluate import CHECKED_SECONDS
-from .experiment import MODELS, Experiment
-from .models import SIMFREE
+from .experiment import MODELS, SIMFREE, Experiment
 from .trials import evenly
 
 _LEAST_SECONDS = 60.0  # of the estimates that are shown

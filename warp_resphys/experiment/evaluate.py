@@ -3,23 +3,25 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from itertools import chain, product
+from itertools import chain
 from statistics import mean, pstdev
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..data.dataset import STATIC, Dataset
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
+from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import ConvergenceError, InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, read_array, read_hdf5, write_json
+from ..io.parts import Parts, TrialPart
 from ..io.progress import Progress
 from ..io.stages import StageContext
-from ..learning.correction import known_positions
+from ..learning.correction import Learned
+from ..learning.evaluation import TrialRollout, first_frame, rollout_parts
 from ..learning.metrics import PHASES, errors_per_marker, marker_errors, summarise, summarise_trajectories
 from ..learning.replay import Replay
 from ..settings.stages import StageSettings
@@ -27,8 +29,6 @@ from .build import finer
 from .checks import check_memory
 from .experiment import LEARNED, Experiment
 from .files import ERRORS, MESH_CHECK, ROLLOUTS, TIMES, first_change, phases_of, reconstruction_file
-from .models import POSE_STEPS, SIMFREE, ModelRollout, first_frame, learned_of
-from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 from .prediction_intervals import INTERVAL_MODELS, counted, intervals_of, linearised, remaining, spreads_of
 from .without_physics import without_physics
 
@@ -45,15 +45,21 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     names = [name for group in settings.groups.values() for name in group]
     amplitudes = _amplitudes(experiment, settings.groups["1"])
     filmed = max(amplitudes, key=lambda name: amplitudes[name])  # the largest motion
-    parts = _parts(context, experiment, names, compared, filmed)
+
+    def roll_out(model: str, names: Sequence[str], label: str) -> list[TrialPart]:
+        made = experiment.model_simulator(model), experiment.motions, names, experiment.learned(model)
+        return rollout_parts(*made, experiment.identified(model), settings.batch, filmed, f"{label}{model}")
+
     with_intervals = [model for model in INTERVAL_MODELS if model in compared]
-    calibrating = _parts(context, experiment, settings.calibration, with_intervals, filmed, "calibration_")
-    work_on([*chain(*parts.values(), *calibrating.values())], _rolled_out, workers)
+    cut_up = {model: roll_out(model, names, "") for model in compared}
+    calibrating = {model: roll_out(model, settings.calibration, "calibration_") for model in with_intervals}
+    parts = Parts.of(context, workers)
+    parts.run([*chain(*cut_up.values(), *calibrating.values())])
     order = [*chain(*experiment.dataset.batches(names))]
     rows = [order.index(name) for name in names]
     observed, plain, missing = without_physics(experiment, names)
     frames = experiment.dataset.observed.shape[1]
-    observed |= {model: read_parts(its_parts, "observed", frames)[rows] for model, its_parts in parts.items()}
+    observed |= {model: parts.joined(own, "observed", frames)[rows] for model, own in cut_up.items()}
     test = settings.groups["1"]
     linear = linearised(experiment, test)
     spreads = spreads_of(experiment, test, linear)
@@ -63,75 +69,31 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in observed.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)
-            if model not in parts:
+            if model not in cut_up:
                 continue
-            bodies = next(part.read("film") for part in parts[model] if filmed in part.names)
+            bodies = next(parts.read(part, "film") for part in cut_up[model] if filmed in part.names)
             substeps = round(settings.time_step / experiment.model_simulator(model).time_step)
             create(file, f"{model}_film", bodies[np.minimum(substeps * shown, len(bodies) - 1)], "m")
         create(file, "film_steps", shown)
         for model, spread in spreads.items():
             create(file, f"{model}_spread", spread, "m^2", time_axis=1)
     left = {
-        model: np.concatenate([part.read("left") for part in its_parts])[rows]
-        for model, its_parts in parts.items()
+        model: np.concatenate([parts.read(part, "left") for part in own])[rows]
+        for model, own in cut_up.items()
         if model in LEARNED and settings.range_guard
     }
     errors = summary(context, experiment, settings.groups, observed, left) | {"baselines": plain}
     errors |= {"missing_baselines": missing} if missing else {}
-    sideways = np.concatenate([part.read("sideways") for part in parts["resphys"]])
+    sideways = np.concatenate([parts.read(part, "sideways") for part in cut_up["resphys"]])
     if known := {name: size for name, size in zip(order, sideways.tolist(), strict=True) if math.isfinite(size)}:
         errors["sideways_mm"] = {name: known[name] for name in test if name in known}
     errors |= remaining(experiment, test, linear, observed)
     if settings.calibration:
         calibrated = [*chain(*experiment.dataset.batches(settings.calibration))]
-        known = {model: read_parts(own, "observed", frames) for model, own in calibrating.items()}
+        known = {model: parts.joined(own, "observed", frames) for model, own in calibrating.items()}
         errors |= intervals_of(experiment, calibrated, known, observed, spreads)
     write_json(context.run_dir / ERRORS, errors)
-    remove_parts(context)
-
-
-def _parts(
-    context: StageContext,
-    experiment: Experiment,
-    names: Sequence[str],
-    models: Sequence[str],
-    filmed: str,
-    label: str = "",
-) -> dict[str, list[TrialPart]]:
-    """Splits the roll-outs of trials into parts, by model."""
-    parts: dict[str, list[TrialPart]] = {model: [] for model in models}
-    for (number, batch), model in product(enumerate(experiment.dataset.batches(names)), models):
-        steps = math.ceil(experiment.dataset.seconds(batch) / experiment.model_simulator(model).time_step)
-        if model == SIMFREE and experiment.dataset.begin_of(batch[0]) == STATIC:
-            steps = POSE_STEPS
-        label_of_part = f"{label}{model}{number}"
-        parts[model] += split_into_parts(
-            context, batch, steps + 1, label_of_part, (model, filmed), experiment.settings.batch
-        )
-    return parts
-
-
-def _rolled_out(part: TrialPart, report: Report) -> Arrays:
-    """Roll-outs by a model: points at the frames, steps at which trials left the training range, filmed vertices.
-
-    And the estimated sideways displacement of bodies before their release [mm], NaN where it is not estimated.
-    """
-    experiment = Experiment(part.context.settings, part.context.run_dir, "count")
-    model, filmed = part.more
-    run, points, bodies = ModelRollout(experiment, model, part.names), list[torch.Tensor](), list[torch.Tensor]()
-    predictor = run.predictor(learned_of(experiment, model))
-    for state in run.roll(predictor):
-        points.append(run.points(state))
-        bodies += [known_positions(state)[row].float() for row, name in enumerate(part.names) if name == filmed]
-        report()
-    shift = run.start.shift
-    sideways = torch.full((len(part.names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)
-    arrays: dict[str, tuple[NDArray[Any], str]] = {"observed": (run.at_frames(points), "m")}
-    arrays["sideways"] = (sideways.cpu().numpy(), "mm")
-    if predictor is not None:
-        left = predictor.left_at
-        arrays["left"] = (np.full(len(part.names), -1) if left is None else left.cpu().numpy(), "1")
-    return arrays | ({"film": (torch.stack(bodies).cpu().numpy(), "m")} if bodies else {})
+    parts.remove()
 
 
 def _amplitudes(experiment: Experiment, names: Sequence[str]) -> dict[str, float]:
@@ -165,7 +127,7 @@ def summary(
     count, step = len(names), settings.time_step
     points = counted(experiment, every)
     observed = as_markers(points, dataset.labels)
-    first = [first_frame(experiment, [name]) for name in every]
+    first = [first_frame(dataset, [name]) for name in every]
     models = {model: as_markers(values, dataset.labels) for model, values in simulated.items()}
     if dataset.bound is None and not settings.with_law:
         models["reconstruction"] = _reconstructed(context, names)
@@ -278,10 +240,11 @@ def time_models(context: StageContext) -> None:
     experiment = Experiment(settings, context.run_dir, "count")
     names = experiment.dataset.moving(settings.groups["1"])
     simulator = experiment.model_simulator("resphys")
-    learned = learned_of(experiment, "resphys")
+    learned = experiment.learned("resphys")
     replays = {name: experiment.motions.replay(simulator, [name], experiment.identified("resphys")) for name in names}
     starts = {name: experiment.motions.start(replay) for name, replay in replays.items()}
-    rows: dict[str, tuple[str, Any, Any]] = {"simulation": ("simulation", None, experiment.simulator("simulation"))}
+    uncorrected = experiment.simulator("simulation")
+    rows: dict[str, tuple[str, Learned | None, Simulator]] = {"simulation": ("simulation", None, uncorrected)}
     target, shared = settings.target, ("mesh", "parts", "time_step")
     if target is not None and all(getattr(target, key) == getattr(settings, key) for key in shared):
         rows["target"] = ("simulation", None, experiment.simulator("target"))
@@ -290,11 +253,12 @@ def time_models(context: StageContext) -> None:
     steps = 0
     with Progress(context.name, len(rows) * len(names), "trials") as progress, torch.no_grad():
         for row, (model, network, stepping) in rows.items():
-            runs = [ModelRollout(experiment, model, [name], starts[name], stepping) for name in names]
+            identified, motions = experiment.identified(model), experiment.motions
+            runs = [TrialRollout(stepping, motions, [name], identified, start=starts[name]) for name in names]
             seconds = []
             for number, run in enumerate((runs[0], *runs)):
                 steps = min(run.steps, _WARM_UP) if number == 0 else run.steps
-                predictor = run.predictor(network)
+                predictor = None if network is None else run.predictor(network)
                 state = run.begin(predictor)
                 rolled = run.roll(predictor)
                 next(rolled)

@@ -7,24 +7,29 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
+from numpy.typing import NDArray
 
 from ..data.dataset import Dataset, read_dataset
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import WHOLE_STATE, Observation
 from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
-from ..io.files import read_json
+from ..io.files import read_array, read_hdf5, read_json
+from ..learning.correction import Learned
+from ..learning.networks import NextState, ResidualForce, StateMap
 from ..learning.observed_motions import Identified, ObservedMotions
 from ..learning.parameters import split_name
+from ..learning.reconstruction import ReconstructedTrials
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.run import models_of
 from ..settings.stages import StageSettings
 from .build import bound_markers, build_body, build_simulator, marker_view_of
-from .files import DATASET, IDENTIFICATION, LAW_FILE, SCALED_DATASET, read_if_there
+from .files import DATASET, IDENTIFICATION, LAW_FILE, SCALED_DATASET, read_if_there, reconstruction_file, weights_file
 from .simulate import target_settings
 
 LAW: Final = "law"
-LEARNED: Final = ("simfree", "resphys_uncorrected", "resphys")
+SIMFREE: Final = "simfree"
+LEARNED: Final = (SIMFREE, "resphys_uncorrected", "resphys")
 # By model: the simulator that it uses or corrects, and the identification that provides its parameters.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "published": ("published", None),
@@ -36,6 +41,11 @@ MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "resphys_uncorrected": ("simulation", None),
     "resphys": ("identified", "sysid"),
 }
+
+
+def network_of(model: str) -> type[StateMap]:
+    """Returns the class of a learned model's network."""
+    return NextState if model == SIMFREE else ResidualForce
 
 
 @dataclass(frozen=True)
@@ -167,3 +177,27 @@ class Experiment:
         """The simulator that a model uses or corrects."""
         kind = self.sources(model)[0]
         return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
+
+    def learned(self, model: str) -> Learned | None:
+        """Trained network of a model; None for models without a network.
+
+        Raises:
+            DataFileError: the file is missing or damaged.
+        """
+        if model not in LEARNED:
+            return None
+        return Learned.read(self.folder / weights_file(model), network_of(model), self.like.device)
+
+    def reconstructed(self, model: str) -> ReconstructedTrials | None:
+        """Trials that were reconstructed with a model's simulator; None without any."""
+        path = self.folder / reconstruction_file(model)
+        if not path.is_file():
+            return None
+        with read_hdf5(path, "reconstruction") as file:
+            names = tuple(map(str, file.attrs["names"]))
+
+        def read(name: str) -> NDArray[Any]:
+            with read_hdf5(path, "reconstruction") as file:
+                return read_array(file, name)
+
+        return ReconstructedTrials(names, read)

@@ -6,7 +6,9 @@ slightly from their nominal places, and cameras see the markers in their own fra
 """
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -23,6 +25,7 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.fan_out import ALONE, Workers
 from ..io.files import write_json
+from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..io.stages import StageContext
 from ..mesh.selection import select_vertices
 from ..settings.stages import StageSettings
@@ -33,7 +36,6 @@ from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
 from .build import bound_markers, build_body, build_simulator, nominal_places
 from .files import TRUTH
-from .parts import Arrays, Report, TrialPart, remove_parts, split_into_parts, work_on
 from .simulate import distributed, played, substeps_of, target_settings, true_motions
 
 _LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
@@ -80,7 +82,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         ConvergenceError, WorkerError: a step of the simulation fails.
     """
     settings: StageSettings = context.settings
-    laboratory, trials, parts = settings.laboratory, settings.trials, list[TrialPart]()
+    laboratory, trials, cut_up = settings.laboratory, settings.trials, list[TrialPart]()
     for begins in dict.fromkeys(trial.begins for trial in trials):
         names = [trial.name for trial in trials if trial.begins == begins]
         if begins == STATIC:
@@ -91,10 +93,12 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
         else:
             assert laboratory.seconds is not None
             frames = max(int(laboratory.seconds / laboratory.time_step) + 1, 2) + 1
-        parts += split_into_parts(context, names, frames, begins, batch=settings.batch)
-    work_on(parts, _played, workers)
+        for first, some in cut(names, settings.batch):
+            cut_up.append(TrialPart(f"{begins}_{first:03d}", some, frames, partial(_played, settings, some, frames)))
+    parts = Parts.of(context, workers)
+    parts.run(cut_up)
     setup = make_setup(settings)
-    markers = {name: row for part in parts for name, row in zip(part.names, part.read("markers"), strict=True)}
+    markers = {name: row for part in cut_up for name, row in zip(part.names, parts.read(part, "markers"), strict=True)}
     noise = [_record(context, setup, trial, markers[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
         material, fibres, muscles = (getattr(laboratory, key) for key in ("material", "fibres", "muscles"))
@@ -114,7 +118,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
             "released_s": {name: at for name, at in released.items() if at is not None},
         }
         write_json(context.run_dir / TRUTH, truth)
-    remove_parts(context)
+    parts.remove()
 
 
 def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray) -> float:
@@ -248,17 +252,16 @@ def _inputs_of(settings: StageSettings, trial: Trial) -> FloatArray:
     return trial.scale * drawn
 
 
-def _played(part: TrialPart, report: Report) -> Arrays:
+def _played(settings: StageSettings, names: Sequence[str], frames: int, report: Report) -> Arrays:
     """Tracked markers of bodies in the laboratory in the frame of the body: released, driven, or in a static pose.
 
     At every step of released bodies, from time zero on, and at the frames of driven bodies, whose inputs are
     interpolated linearly.
     """
-    settings: StageSettings = part.context.settings
     setup, binding = make_setup(settings), settings.binding
     simulator = laboratory_simulator(settings, setup.gravity)
     by_name = {trial.name: trial for trial in settings.trials}
-    trials = [by_name[name] for name in part.names]
+    trials = [by_name[name] for name in names]
     begins, released = trials[0].begins, trials[0].is_released
     markers = bound_markers(binding, simulator.body.mesh, setup.tracked, binding.observed).to(simulator.rest_positions)
     payload = np.array([trial.payload for trial in trials])
@@ -288,7 +291,7 @@ def _played(part: TrialPart, report: Report) -> Arrays:
     if not released:
         substeps = 0 if begins == STATIC else substeps_of(settings.time_step, settings.laboratory, "laboratory")
     seen = []
-    for state in played(part, simulator, substeps, settings.data, trials, begin, inputs_at):
+    for state in played(frames, simulator, substeps, settings.data, trials, begin, inputs_at):
         seen.append(markers(state.q))
         report()
     return {"markers": (torch.stack(seen, 1).cpu().numpy(), "m")}

@@ -13,9 +13,8 @@ from ..io.arrays import FloatArray
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage
-from .experiment import Experiment
+from .experiment import SIMFREE, Experiment
 from .files import ROLLOUTS, since_change
-from .models import SIMFREE
 from .sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
 from .without_physics import without_physics
 

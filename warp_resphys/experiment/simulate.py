@@ -11,7 +11,7 @@ which is exact for fields of the degree of the cells (tests/experiment/test_targ
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from typing import Any
 
@@ -25,7 +25,7 @@ from ..data.markers import WHOLE_STATE, MarkerMap, Observation
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
-from ..io.fan_out import ALONE
+from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.stages import StageContext
 from ..mesh.selection import select_vertices
 from ..mesh.surface import locate
@@ -48,7 +48,6 @@ from ..stepping.rotations import twisted
 from ..stepping.state import State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET
-from .parts import Arrays, Report, TrialPart, read_parts, remove_parts, split_into_parts, work_on
 
 _LARGEST_DISTANCE = 0.2  # of a vertex from the cell of the other mesh that it is extrapolated from, over its diagonal
 
@@ -138,9 +137,9 @@ def simulate(context: StageContext) -> None:
         check_steps(poses, points, "data.base_motion")
     for name, moved in obstacles.items():
         check_steps(moved[0], points, f"data.obstacle_motion.{name}", f"the obstacle {name!r}")
-    parts = split_into_parts(context, names, frames)
-    work_on(parts, _free_motion, ALONE)
-    observed = read_parts(parts, "observed")
+    parts, part = Parts.of(context), TrialPart("part_000", names, frames, partial(_free_motion, settings, names))
+    parts.run([part])
+    observed = parts.read(part, "observed")
     Dataset(
         names,
         labels=(),
@@ -151,11 +150,11 @@ def simulate(context: StageContext) -> None:
         payload=np.zeros(len(names)),
         gravity=np.asarray(settings.gravity, dtype=np.float64),
         time_step=settings.time_step,
-        velocity=read_parts(parts, "velocity"),
+        velocity=parts.read(part, "velocity"),
         base=base,
         obstacles=obstacles,
     ).write(context.run_dir / DATASET)
-    remove_parts(context)
+    parts.remove()
 
 
 def true_motions(
@@ -185,7 +184,7 @@ def true_motions(
 
 
 def played(
-    part: TrialPart,
+    frames: int,
     simulator: Simulator,
     substeps: int,
     data: SimulatedData | ReadingSettings,
@@ -196,7 +195,7 @@ def played(
     """Yields the states at the frames of bodies that stand in for real ones.
 
     Args:
-        part: part of the stage.
+        frames: number of frames.
         simulator: of the bodies.
         substeps: steps from frame to frame.
         data: motions of trials without their own.
@@ -204,7 +203,7 @@ def played(
         begin: state of the first frame.
         inputs_at: inputs besides motions, at a share of the time from a frame to the next.
     """
-    times = simulator.time_step * np.arange((part.frames - 1) * substeps + 1)
+    times = simulator.time_step * np.arange((frames - 1) * substeps + 1)
     base, obstacles = true_motions(data, trials, times)
     constants, moving = simulator.prepare(), dict[str, torch.Tensor]()  # inputs at the times, by name
     if obstacles:
@@ -222,16 +221,15 @@ def played(
         now = inputs_at(frame, share).replace(**{name: own[number + 1] for name, own in moving.items()})
         return simulator.step(state, now, constants)
 
-    yield from islice(states(step, begin, range((part.frames - 1) * substeps)), 0, None, substeps)
+    yield from islice(states(step, begin, range((frames - 1) * substeps)), 0, None, substeps)
 
 
-def _free_motion(part: TrialPart, report: Report) -> Arrays:
+def _free_motion(settings: StageSettings, names: Sequence[str], report: Report) -> Arrays:
     """Positions and velocities of all vertices of released bodies, or of bodies with a moving base."""
-    settings: StageSettings = part.context.settings
     target, seen = build_target(settings, settings.target), list[tuple[torch.Tensor, torch.Tensor]]()
-    trials = [trial for trial in settings.trials if trial.name in part.names]
+    trials = [trial for trial in settings.trials if trial.name in names]
     begin = initial_state(target.simulator, settings.data, trials)
-    for state in played(part, target.simulator, target.substeps, settings.data, trials, begin):
+    for state in played(settings.data.steps + 1, target.simulator, target.substeps, settings.data, trials, begin):
         seen.append((target.seen(state.q), target.seen(state.v)))
         report()
     observed, velocity = (torch.stack(values, 1).cpu().numpy() for values in zip(*seen, strict=True))

@@ -4,19 +4,22 @@ Trained models are predictors of a roll-out, with a guard against states outside
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
 
 import torch
 
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
+from ..io.files import read_checkpoint, write_checkpoint
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .networks import NextState, StateMap
+from .networks import NextState, ResidualForce, StateMap, restore
 
 COROTATED: Final = "corotated"
+_KINDS: Final = {ResidualForce: "residual force", NextState: "next state"}  # of checkpoints
 DIVERGENCE_DISTANCE = 10.0  # body lengths from rest beyond which a roll-out has diverged
 
 # Function of the state and the number of the step: a residual force (B, N, 3) [N] to add, or the next state.
@@ -233,6 +236,59 @@ class LearnedPredictor:
             fields[0] = fields[0] * weight[:, None, None]
         force = fields[0] if self._frames is None else self._frames.to_world(q, v, fields[0])
         return force if self._base is None else self._base.force_outside(force, step)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A trained network with the settings of its roll-outs.
+
+    Attributes:
+        network: network that predicts a residual force or the next state.
+        range_: training range to which roll-outs clamp its inputs; None for no clamping.
+        force_frame: frame of the predicted forces, see `force_frames`.
+        training: ``kept``, the selection and error of the weights, and ``epochs``, a record of each.
+    """
+
+    network: StateMap
+    range_: Range | None = None
+    force_frame: str = "world"
+    training: Mapping[str, Any] = field(default_factory=dict)
+
+    def to(self, device: torch.device) -> "Learned":
+        """Returns the model on a device; its network moves there."""
+        range_ = None if self.range_ is None else self.range_.to(device)
+        return replace(self, network=self.network.to(device), range_=range_)
+
+    @property
+    def replaces_simulator(self) -> bool:
+        """Whether the network predicts the next state, in place of a simulator."""
+        return isinstance(self.network, NextState)
+
+    def description(self) -> dict[str, Any]:
+        """Metadata of a checkpoint besides the description of the network."""
+        return {"range": None if self.range_ is None else self.range_.description(), "force_frame": self.force_frame}
+
+    def write(self, path: Path, fingerprint: str) -> None:
+        """Writes a checkpoint of the network.
+
+        Raises:
+            DataFileError: the file cannot be written.
+        """
+        metadata = {**self.network.description(), **self.description(), **self.training.get("kept", {})}
+        metadata["fingerprint"] = fingerprint
+        write_checkpoint(path, _KINDS[type(self.network)], self.network.state_dict(), metadata)
+
+    @classmethod
+    def read(cls, path: Path, network_type: type[StateMap], device: torch.device) -> "Learned":
+        """Reads a checkpoint.
+
+        Raises:
+            DataFileError: the file is missing or damaged.
+        """
+        tensors, description = read_checkpoint(path, _KINDS[network_type])
+        network, limits = restore(network_type, tensors, description).to(device), description["range"]
+        range_ = None if limits is None else Range.restore(limits, network.linear)
+        return cls(network, range_, str(description["force_frame"]))
 
 
 def force_frames(simulator: Simulator, kind: str) -> VertexFrames | None:

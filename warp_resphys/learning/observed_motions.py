@@ -46,6 +46,11 @@ class Identified:
     own: Mapping[str, float] = field(default_factory=dict)
     placement: Mapping[str, Any] | None = None
 
+    @classmethod
+    def of(cls, parameters: "Identified | Mapping[str, float] | None") -> "Identified":
+        """Returns parameters given as a mapping, or none."""
+        return parameters if isinstance(parameters, Identified) else cls(parameters or {})
+
     def values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Returns (1,) values of all parameters, on the device of a simulator."""
         return {name: simulator.tensor([value]) for name, value in {**self.parameters, **self.own}.items()}

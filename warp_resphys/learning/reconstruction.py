@@ -1,4 +1,4 @@
-r"""Reconstruction of residual forces from observed states or sparse markers.
+r"""ReconstructedStep of residual forces from observed states or sparse markers.
 
 For each step of an observed trajectory, find the force f that minimises
 
@@ -13,32 +13,41 @@ markers do not determine to zero.
 import copy
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import scipy.optimize
 import torch
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
 from ..dynamics.modes import vibration_modes
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
+from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..linalg.least_squares import minimise
 from ..linalg.threads import threads_for
+from ..settings.learning import ReconstructionSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import states
 from ..stepping.state import State
+from .metrics import mean_distance
+from .observed_motions import Identified, ObservedMotions
 from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, StepProblem
 
 log = logging.getLogger(__name__)
 
+UNITS: Final = {"q": "m", "v": "m/s", "force": "N", "error": "mm"}
+_STATIC_STEP = 1e6  # s, time step for static poses, in which inertia is negligible
+
 
 @dataclass(frozen=True)
-class Reconstruction:
+class ReconstructedStep:
     """One reconstructed step."""
 
     state: State  # after the step with the force
@@ -94,7 +103,7 @@ class Reconstructor(ABC):
         observed: torch.Tensor,
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-    ) -> Reconstruction:
+    ) -> ReconstructedStep:
         """Reconstructs the force of a step from a state to an observation.
 
         Args:
@@ -132,7 +141,7 @@ class LeastSquares(Reconstructor):
         observed: torch.Tensor,
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-    ) -> Reconstruction:
+    ) -> ReconstructedStep:
         acting, constants = inputs or Inputs(), self._constants
         step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
         with threads_for(state.q[0].numel()), torch.no_grad():
@@ -150,7 +159,7 @@ class LeastSquares(Reconstructor):
                     x,
                     None,
                 )
-            return Reconstruction(problem.without_force().finish(x), force, result.iterations)
+            return ReconstructedStep(problem.without_force().finish(x), force, result.iterations)
 
 
 class LBFGSB(Reconstructor):
@@ -166,7 +175,7 @@ class LBFGSB(Reconstructor):
         observed: torch.Tensor,
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
-    ) -> Reconstruction:
+    ) -> ReconstructedStep:
         sim, like, acting = self.simulator, state.q, inputs or Inputs()
         free = sim.rest_positions.new_ones(sim.body.n_vertices, 1)
         free[sim.fixed] = 0.0
@@ -202,12 +211,12 @@ class LBFGSB(Reconstructor):
         force = free * sim.tensor(result.x.reshape(like.shape))
         with torch.no_grad():
             new = sim.step(state, acting.plus(force), self._constants)
-        return Reconstruction(new, force, int(result.nit))
+        return ReconstructedStep(new, force, int(result.nit))
 
 
 def follow(
     method: Reconstructor, state: State, targets: Iterable[torch.Tensor], inputs: Inputs | None = None
-) -> Iterator[Reconstruction]:
+) -> Iterator[ReconstructedStep]:
     """Yields the steps that bring bodies to observed points; each starts from the force of the last one.
 
     Args:
@@ -217,13 +226,13 @@ def follow(
         inputs: of the steps.
     """
 
-    def step(last: Reconstruction, now: tuple[int, torch.Tensor]) -> Reconstruction:
+    def step(last: ReconstructedStep, now: tuple[int, torch.Tensor]) -> ReconstructedStep:
         number, observed = now
         with torch.enable_grad():
             result = method.step(last.state, observed, None if inputs is None else inputs.at(number), last.force)
-        return Reconstruction(result.state.detach(), result.force.detach(), result.iterations)
+        return ReconstructedStep(result.state.detach(), result.force.detach(), result.iterations)
 
-    start = Reconstruction(state, torch.zeros_like(state.q), 0)
+    start = ReconstructedStep(state, torch.zeros_like(state.q), 0)
     return islice(states(step, start, enumerate(targets)), 1, None)
 
 
@@ -272,3 +281,98 @@ def make_reconstructor(
         raise InputError(f"{modes} modes are asked for, but reconstruction.method=lbfgsb has none: take gauss_newton.")
     settings = (simulator, observation, regularisation, tolerance, max_iterations)
     return LBFGSB(*settings) if method == "lbfgsb" else LeastSquares(problems[method], modes, *settings)
+
+
+@dataclass(frozen=True)
+class ReconstructedTrials:
+    """Reconstructed states and forces of R trials.
+
+    Attributes:
+        names: of the trials.
+        read: returns an array of all trials by its name: ``q`` (R, K + 1, N, 3) [m], ``v`` [m/s], ``force`` [N], that
+            of the step that ends in a state, zero in the first one, and ``error`` (R, K + 1), the mean distance of the
+            observed points that were reached [mm].
+    """
+
+    names: tuple[str, ...]
+    read: Callable[[str], NDArray[Any]]
+
+    def of(self, names: Sequence[str], *arrays: str) -> list[NDArray[Any]]:
+        """Returns some arrays of some trials."""
+        rows = [self.names.index(name) for name in names]
+        index = slice(rows[0], rows[-1] + 1) if rows == [*range(rows[0], rows[-1] + 1)] else rows
+        return [self.read(name)[index] for name in arrays]
+
+
+def reconstruct(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    names: Sequence[str] | None = None,
+    *,
+    parameters: Identified | Mapping[str, float] | None = None,
+    settings: ReconstructionSettings | None = None,
+    parts: Parts | None = None,
+) -> ReconstructedTrials:
+    """Finds the forces with which a simulator follows observed motions, step by step.
+
+    Args:
+        simulator: to correct. With markers, BDF2 replaces the midpoint rule.
+        motions: observed states or markers.
+        names: of the trials; all by default.
+        parameters: values in place of the simulator's, such as `Identification.parameters`.
+        settings: method, regularisation [unit^2/N^2], tolerance and iterations; the defaults of the class if None.
+        parts: workers and files of the work; this process and its memory if None.
+
+    Raises:
+        InputError: a setting out of range, or an input that the body does not take.
+        ConvergenceError: a step without a solution.
+    """
+    parts, known = parts or Parts("reconstruct"), Identified.of(parameters)
+    used, wanted, cut_up = (
+        without_ringing(simulator, motions.observe),
+        settings or ReconstructionSettings(),
+        list[TrialPart](),
+    )
+    for number, whole in enumerate(motions.dataset.batches(names or motions.dataset.names)):
+        frames = motions.learned_steps(int(motions.dataset.seconds(whole) / used.time_step + 1e-6)) + 1
+        for first, batch in cut(whole, parts.batch):
+            work = partial(_reconstructed, used, motions, batch, known, wanted)
+            cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
+    parts.run(cut_up)
+    return ReconstructedTrials(tuple(name for part in cut_up for name in part.names), partial(parts.joined, cut_up))
+
+
+def _reconstructed(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    names: Sequence[str],
+    identified: Identified,
+    settings: ReconstructionSettings,
+    report: Report,
+) -> Arrays:
+    """Reconstruction of trials that begin in the same way, see `ReconstructedTrials`.
+
+    Forces from markers are in single precision, which rounds positions to 1e-8 m.
+    """
+    replay = motions.replay(simulator, names, identified)
+    start = motions.start(replay, identified)
+    constants, inputs, resting = replay.prepare(identified.values(simulator))
+    observed = motions.targets(replay, start)
+    state = replay.initial_state(start, constants, resting)
+    if replay.is_static:  # One very long step leads to the static pose.
+        simulator = replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
+        observed = torch.cat([torch.full_like(observed, torch.nan), observed], 1)
+        inputs = resting
+    method = make_reconstructor(simulator, **dict(settings), observation=replay.observe)
+    reached, forces = [state], [torch.zeros_like(state.q)]
+    report()
+    for step in follow(method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs):
+        reached.append(step.state)
+        forces.append(step.force)
+        report(iterations=step.iterations)
+    points = torch.stack([replay.observe(state.q) for state in reached], 1).cpu().numpy()
+    series = {"q": [state.q for state in reached], "v": [state.v for state in reached], "force": forces}
+    arrays = {name: torch.stack(values, 1).cpu().numpy() for name, values in series.items()}
+    arrays["error"] = mean_distance(points, observed.cpu().numpy())
+    dtype = "float64" if motions.dataset.bound is None else "float32"
+    return {name: (values.astype(dtype), UNITS[name]) for name, values in arrays.items()}

@@ -13,15 +13,14 @@ from ..data.markers import Markers
 from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
-from ..experiment.experiment import LEARNED, Experiment
+from ..experiment.experiment import LEARNED, SIMFREE, Experiment, network_of
 from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
-from ..experiment.models import SIMFREE, Learned, kind_of, learned_of
 from ..io.classes import check_packages
 from ..io.errors import DataFileError, InputError, listed
 from ..io.files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
 from ..io.stages import finished_record, planned
-from ..learning.correction import Range
+from ..learning.correction import Learned, Range
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
 from ..learning.placement import PlacedMarkers, Placement
@@ -169,7 +168,7 @@ class Description:
         stored, learned = fields.pop("network", None), None
         if stored is not None:
             weights = {name.removeprefix(_NETWORK): x for name, x in tensors.items() if name.startswith(_NETWORK)}
-            network = restore(kind_of(fields["model"])[0], weights, stored)
+            network = restore(network_of(fields["model"]), weights, stored)
             range_ = None if stored["range"] is None else Range.restore(stored["range"], network.linear)
             learned = Learned(network, range_, stored["force_frame"])
         intervals = fields.pop("intervals")
@@ -243,7 +242,7 @@ def describe(folder: Path, model: str) -> Description:
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
     own = intervals["models"].get(model, {})
-    learned, actuation = learned_of(experiment, model), settings.actuation
+    learned, actuation = experiment.learned(model), settings.actuation
     base = None if learned is None else experiment.motions.base_movement_mask(simulator)
     moved = dataset.contact_at(dataset.names, simulator.body, dataset.time_step)
     return Description(

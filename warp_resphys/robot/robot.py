@@ -14,7 +14,6 @@ from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.trajectory import Motion
 from ..energies.materials import MASS_DAMPING
-from ..experiment.models import POSE_STEPS
 from ..io.errors import ConvergenceError, InputError, number_of
 from ..learning.correction import (
     DIVERGENCE_DISTANCE,
@@ -23,6 +22,7 @@ from ..learning.correction import (
     equilibrium_under_feedback,
     force_frames,
 )
+from ..learning.evaluation import POSE_STEPS
 from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters

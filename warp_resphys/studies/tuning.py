@@ -21,12 +21,13 @@ from optuna.trial import BaseTrial, FixedTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..experiment.experiment import LEARNED, Experiment
-from ..experiment.learn import run_epochs, trainer_of
+from ..experiment.learn import fitting_of
 from ..experiment.trials import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.progress import show
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
 from ..io.stages import StageInterrupted, run_stages
+from ..learning.fitting import run_epochs
 from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import PageTable
 from ..report.wording import number_text
@@ -88,8 +89,8 @@ def tune(settings: TunedRun, folder: Path) -> None:
         tried = {key: _suggest(trial, key, values) for key, values in space.items()}
         try:
             with naming(f"trial {trial.number}, with {tried}: "):
-                trainer, _ = trainer_of(experiment, search.model, _changed(training, tried))
-                run_epochs(f"trial {trial.number}", trainer, lambda kept: None, watch)
+                trainer, _ = fitting_of(experiment, search.model).trainer(_changed(training, tried))
+                run_epochs(f"trial {trial.number}", trainer, watch=watch)
         except KeyboardInterrupt as error:
             again = "the same command continues with another one"
             raise StageInterrupted(f"interrupted in trial {trial.number}; {again}") from error

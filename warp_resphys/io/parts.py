@@ -1,0 +1,171 @@
+"""Work on trials in parts, in one process or several; interrupted work keeps its finished parts, each in a file."""
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from .fan_out import ALONE, Workers, fan_out
+from .files import atomic_hdf5, create, is_final, read_array, read_hdf5
+from .progress import Progress
+from .stages import StageContext
+
+Report = Callable[..., None]
+Arrays = Mapping[str, tuple[NDArray[Any], str]]  # with their units
+# Computes the arrays (R, ...) of a part; the argument is to be called after each frame, with named values that are
+# displayed beside the progress bar. It is pickled for other processes.
+Work = Callable[[Report], Arrays]
+
+
+@dataclass(frozen=True)
+class TrialPart:
+    """Some trials of a piece of work.
+
+    Attributes:
+        label: name of the file.
+        names: names of the R trials.
+        frames: number of frames per trial that the progress bar expects; there may be a few more or less.
+        work: computes the arrays.
+    """
+
+    label: str
+    names: tuple[str, ...]
+    frames: int
+    work: Work
+
+    def compute(self, advance: Callable[..., None]) -> Arrays:
+        """Computes the arrays; `advance` counts the frames."""
+        count, rolled = len(self.names), 0
+
+        def report(**shown: object) -> None:
+            nonlocal rolled
+            rolled += 1
+            advance(count if rolled <= self.frames else 0, **shown)
+
+        with torch.no_grad():
+            arrays = self.work(report)
+        advance(count * max(self.frames - rolled, 0))
+        return arrays
+
+
+def cut(names: Sequence[str], most: int | None) -> Iterator[tuple[int, tuple[str, ...]]]:
+    """Yields trials, at most some at a time, with the number of the first; None for all at once."""
+    size = most or max(len(names), 1)
+    for first in range(0, len(names), size):
+        yield first, tuple(names[first : first + size])
+
+
+class Parts:
+    """The parts of a piece of work, with their arrays.
+
+    Args:
+        name: of the work, displayed beside the progress bar.
+        workers: share the parts.
+        folder: of the files of the parts; None keeps the arrays in memory.
+        fingerprint: of all that the arrays depend on; files with another one are written again.
+        batch: most trials of a part; None for no limit.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        workers: Workers = ALONE,
+        folder: Path | None = None,
+        fingerprint: str = "",
+        batch: int | None = None,
+    ) -> None:
+        self.name, self.workers, self.folder, self.fingerprint, self.batch = name, workers, folder, fingerprint, batch
+        self._kept: dict[str, Arrays] = {}
+
+    @classmethod
+    def of(cls, context: StageContext, workers: Workers = ALONE, batch: int | None = None) -> "Parts":
+        """Returns the parts of a stage, with their files in the folder of the run."""
+        return cls(context.name, workers, context.run_dir / f"{context.name}_parts", context.fingerprint, batch)
+
+    def run(self, parts: Sequence[TrialPart]) -> None:
+        """Computes the parts that are not done.
+
+        Raises:
+            ConvergenceError, WorkerError: a part could not be computed.
+            DataFileError: a file could not be written.
+        """
+        left, workers = [part for part in parts if not self._is_done(part)], self.workers
+        total, missing = (sum(part.frames * len(part.names) for part in subset) for subset in (parts, left))
+        with Progress(self.name, total, "frames", total - missing) as progress:
+            if workers.alone or (workers.address is None and len(parts) == 1):
+                with threadpool_limits(1):  # As in worker processes, for the same results.
+                    for part in left:
+                        self._keep(part, part.compute(progress.advance))
+                return
+            if self.folder is not None:
+                self.folder.mkdir(parents=True, exist_ok=True)
+            frames = [part.frames * len(part.names) for part in left]
+            shared, crew = self.folder or Path.cwd(), workers.at_most(len(left))
+            results = fan_out(partial(_compute, self), left, crew, shared, lambda at: progress.advance(frames[at]))
+            if self.folder is None:
+                self._kept |= {part.label: arrays for part, arrays in zip(left, results, strict=True)}
+
+    def _is_done(self, part: TrialPart) -> bool:
+        if self.folder is None:
+            return part.label in self._kept
+        return is_final(self._path(part), self.name, self.fingerprint)
+
+    def _keep(self, part: TrialPart, arrays: Arrays) -> None:
+        if self.folder is None:
+            self._kept[part.label] = arrays
+            return
+        with atomic_hdf5(self._path(part), self.name, {"fingerprint": self.fingerprint}) as file:
+            for name, (values, unit) in arrays.items():
+                create(file, name, values, unit)
+
+    def _path(self, part: TrialPart) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{part.label}.h5"
+
+    def read(self, part: TrialPart, name: str) -> NDArray[Any]:
+        """Returns an array of a part.
+
+        Raises:
+            DataFileError: the file or the array is missing or damaged.
+        """
+        if self.folder is None:
+            return self._kept[part.label][name][0]
+        with read_hdf5(self._path(part), self.name) as file:
+            return read_array(file, name)
+
+    def joined(self, parts: Sequence[TrialPart], name: str, frames: int = 0) -> NDArray[Any]:
+        """Returns an array of all parts, (R, T, ...), see `padded`."""
+        return padded([self.read(part, name) for part in parts], frames)
+
+    def remove(self) -> None:
+        """Deletes the files of the parts."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _compute(parts: Parts, part: TrialPart) -> Arrays | None:
+    """Computes a part in a worker process; returns its arrays where they have no file."""
+    arrays = part.compute(lambda count=1, **shown: None)
+    if parts.folder is None:
+        return arrays
+    parts._keep(part, arrays)
+    return None
+
+
+def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:
+    """Joins arrays (R, T, ...) along R, with at least `frames` frames: NaN past the end of shorter arrays."""
+    frames = max(frames, *(array.shape[1] for array in arrays))
+
+    def extended(array: NDArray[Any]) -> NDArray[Any]:
+        missing = frames - array.shape[1]  # Integer arrays of full length keep their type.
+        widths = [(0, 0), (0, missing), *[(0, 0)] * (array.ndim - 2)]
+        return np.pad(array, widths, constant_values=np.nan) if missing else array
+
+    return np.concatenate([extended(array) for array in arrays])

@@ -1,0 +1,278 @@
+"""Roll-outs of a simulator, a simulator with a learned force, or a network alone, over observed motions."""
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from ..data.dataset import GIVEN, Dataset
+from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray
+from ..io.errors import ConvergenceError
+from ..io.parts import Arrays, Parts, Report, TrialPart, cut
+from ..stepping.rollout import states
+from ..stepping.state import State
+from .correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
+from .metrics import marker_errors, summarise
+from .observed_motions import Identified, ObservedMotions
+from .replay import Start
+
+POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
+
+
+def evaluate(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    force: Learned | Predictor | None = None,
+    *,
+    names: Sequence[str] | None = None,
+    parameters: Identified | Mapping[str, float] | None = None,
+    parts: Parts | None = None,
+) -> FloatArray:
+    """Rolls a simulator out from the start of observed motions and measures its error.
+
+    Args:
+        simulator: to evaluate.
+        motions: observed states or markers.
+        force: learned force from `fit_force`, or a function of the state and the number of the step that returns forces
+            (B, N, 3) [N] for trials that begin alike; None for the simulator alone.
+        names: of the R trials; all by default.
+        parameters: values in place of the simulator's, such as `Identification.parameters`.
+        parts: workers and files of the work; this process and its memory if None.
+
+    Returns:
+        (T, R) mean distance of the observed points in the unit of the observation, such as m; NaN where none was seen,
+        infinite after a simulation diverged.
+
+    Raises:
+        InputError: an input that the body does not take.
+        ConvergenceError: no initial equilibrium.
+    """
+    dataset, parts = motions.dataset, parts or Parts("evaluate")
+    names = dataset.names if names is None else names
+    cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
+    parts.run(cut_up)
+    order = [name for part in cut_up for name in part.names]
+    points = parts.joined(cut_up, "observed", dataset.observed.shape[1])[[order.index(name) for name in names]]
+    shown, observed = simulator.tensor(points), simulator.tensor(dataset.observed[dataset.rows(names)])
+    away = motions.observe.residual(shown.nan_to_num(math.inf), observed).norm(dim=-1).nan_to_num(math.inf)
+    seen = torch.isfinite(observed).all(-1)
+    return np.asarray(torch.where(seen, away, torch.nan).nanmean(2).T.cpu().numpy())
+
+
+def rollout_parts(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    names: Sequence[str],
+    force: Learned | Predictor | None = None,
+    parameters: Identified | Mapping[str, float] | None = None,
+    batch: int | None = None,
+    filmed: str = "",
+    label: str = "rollout",
+) -> list[TrialPart]:
+    """Returns the parts of roll-outs of any trials, see `roll_out`.
+
+    Args:
+        simulator: see `evaluate`.
+        motions: see `evaluate`.
+        names: of the trials.
+        force: see `evaluate`.
+        parameters: see `evaluate`.
+        batch: most trials of a part; None for no limit.
+        filmed: name of the trial whose vertices are kept.
+        label: first part of the names of the files.
+    """
+    used, parts = replace(simulator, solver=replace(simulator.settings, on_failure="count")), list[TrialPart]()
+    for number, whole in enumerate(motions.dataset.batches(names)):
+        steps = math.ceil(motions.dataset.seconds(whole) / simulator.time_step)
+        if not motions.dataset.moving(whole) and isinstance(force, Learned) and force.replaces_simulator:
+            steps = POSE_STEPS
+        for first, some in cut(whole, batch):
+            work = partial(roll_out, used, motions, some, force, Identified.of(parameters), filmed)
+            parts.append(TrialPart(f"{label}{number}_{first:03d}", some, steps + 1, work))
+    return parts
+
+
+def roll_out(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    names: Sequence[str],
+    force: Learned | Predictor | None,
+    identified: Identified,
+    filmed: str,
+    report: Report,
+) -> Arrays:
+    """Rolls out trials that begin in the same way.
+
+    Args:
+        simulator: its solver settings must count failures rather than raise them.
+        motions: see `evaluate`.
+        names: of the R trials.
+        force: see `evaluate`.
+        identified: parameters of the simulator.
+        filmed: name of the trial whose vertices are kept.
+        report: called after every step.
+
+    Returns:
+        ``observed`` (R, T, M, D) points at the frames, NaN where the roll-out diverged; ``sideways`` (R,) estimated
+        displacement of bodies before their release [mm], NaN where it is not estimated; with a network, ``left`` (R,)
+        steps at which trials left the training range, -1 where they did not; ``film`` (K + 1, N, 3) vertices [m].
+    """
+    data_driven = isinstance(force, Learned) and force.replaces_simulator
+    run, points, bodies = TrialRollout(simulator, motions, names, identified, data_driven), [], list[torch.Tensor]()
+    predictor = run.predictor(force) if isinstance(force, Learned) else force
+    for state in run.roll(predictor):
+        points.append(run.points(state))
+        lost = state.lost
+        bodies += [
+            torch.where(lost[row], torch.nan, state.q[row]).float() for row, name in enumerate(names) if name == filmed
+        ]
+        report()
+    shift = run.start.shift
+    sideways = torch.full((len(names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)
+    arrays: dict[str, Any] = {"observed": (run.at_frames(points), motions.observe.unit)}
+    arrays["sideways"] = (sideways.cpu().numpy(), "mm")
+    if isinstance(predictor, LearnedPredictor):
+        left = predictor.left_at
+        arrays["left"] = (np.full(len(names), -1) if left is None else left.cpu().numpy(), "1")
+    return arrays | ({"film": (torch.stack(bodies).cpu().numpy(), "m")} if bodies else {})
+
+
+class TrialRollout:
+    """Trials that begin in the same way, to be rolled out with any network.
+
+    Args:
+        simulator: its solver settings must count failures rather than raise them.
+        motions: observed motions.
+        names: names of the trials.
+        identified: parameters of the simulator.
+        data_driven: whether a network replaces the simulator.
+        start: how the trials begin; estimated if None.
+
+    Attributes:
+        replay: of the trials.
+        start: how they begin.
+        steps: number of steps that covers all frames, rounded up to whole time steps of the inputs.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        motions: ObservedMotions,
+        names: Sequence[str],
+        identified: Identified | None = None,
+        data_driven: bool = False,
+        start: Start | None = None,
+    ) -> None:
+        self._simulator, self._motions, self._data_driven = simulator, motions, data_driven
+        self._values = {} if identified is None else identified.values(simulator)
+        self.replay = motions.replay(simulator, names, identified)
+        self.start = motions.start(self.replay, identified) if start is None else start
+        self._constants, self._inputs, self._resting = self.replay.prepare(self._values)
+        self._first: State | None = None  # of motions, whatever the network
+        substeps = round(motions.dataset.time_step / simulator.time_step)
+        self.steps = -(-self.replay.steps(self.start) // substeps) * substeps
+        if self.replay.is_static:
+            self.steps = POSE_STEPS if data_driven else 0
+
+    def predictor(self, learned: Learned) -> LearnedPredictor:
+        """Returns the predictor of a network in these trials."""
+        frames = None if self._data_driven else force_frames(self._simulator, learned.force_frame)
+        base = self._motions.base(self.replay.trials.names, self._simulator)
+        conditions = self._motions.conditions(self.replay, self._values, self._data_driven)
+        return LearnedPredictor(learned.network, conditions, learned.range_, frames, base)
+
+    @torch.no_grad()
+    def begin(self, predictor: Predictor | None) -> State:
+        """Initial states of the trials; for static poses these are the final states, too.
+
+        Raises:
+            ConvergenceError: the equilibrium of an initial state was not found.
+        """
+        force: Any = predictor if self.replay.is_static and not self._data_driven else None
+        if force is not None:
+            return self.replay.initial_state(self.start, self._constants, self._resting, force=force)
+        if self._first is None:
+            self._first = self.replay.initial_state(self.start, self._constants, self._resting)
+        return self._first
+
+    @torch.no_grad()
+    def roll(self, predictor: Predictor | None) -> Iterator[State]:
+        """Yields the state of each step; a pose without equilibrium is lost.
+
+        Raises:
+            ConvergenceError: the equilibrium from which a motion begins was not found.
+        """
+        try:
+            state = self.begin(predictor)
+        except ConvergenceError:
+            if not self.replay.is_static:
+                raise
+            state = self._simulator.rest_state(len(self.replay.trials.names))
+            state = state.with_memory({"lost": ~state.lost})
+        step = CorrectedSimulator(self._simulator, predictor, self._inputs, self._constants).step
+        yield from states(step, state, range(self.steps))
+
+    def points(self, state: State) -> torch.Tensor:
+        """(R, M, D) observed points of a state; NaN where the roll-out has diverged."""
+        return torch.where(state.lost[:, None, None], torch.nan, self.replay.observe(state.q))
+
+    def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
+        """(R, T, M, D) observed points at the frames of the trials, from those of all steps (R, M, D)."""
+        series = torch.stack([*points[-1:]] if self.replay.is_static else [*points], 1)
+        return np.asarray(self.replay.at_frames(series, self.start).cpu().numpy())
+
+    def errors(self, learned: Learned) -> list[FloatArray]:
+        """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged."""
+        motions, observed, steps = self._motions, self.replay.trials.observed, self.steps
+        observed = observed[:, : motions.learned_steps(observed.shape[1] - 1) + 1]
+        if motions.train_fraction < 1.0:
+            steps = min(steps, motions.learned_steps(steps))
+        series: list[torch.Tensor] = []
+        with contextlib.suppress(ConvergenceError):
+            for state in islice(self.roll(self.predictor(learned)), steps + 1):
+                if series and bool(state.lost.all()):
+                    series = []
+                    break
+                series.append(self.points(state))
+        if not series:
+            return [np.full(1, np.nan) for _ in observed]
+        first = first_frame(motions.dataset, self.replay.trials.names)
+        pairs = zip(self.at_frames(series)[:, first:], observed[:, first:].cpu().numpy(), strict=True)
+        return [marker_errors(x[: len(y)], y) for x, y in pairs]
+
+
+def first_frame(dataset: Dataset, names: Sequence[str]) -> int:
+    """First frame that counts in errors: 1 if the roll-out starts from the given state, else 0."""
+    return int(dataset.begin_of(names[0]) == GIVEN)
+
+
+def rollout_error(
+    simulator: Simulator, motions: ObservedMotions, names: Sequence[str], identified: Identified, data_driven: bool
+) -> Callable[[Learned], float]:
+    """Returns a function that computes the mean error of a network over trials [mm]; infinite if a roll-out diverged.
+
+    Args:
+        simulator: its solver settings must count failures rather than raise them.
+        motions: observed motions.
+        names: names of the trials.
+        identified: parameters of the simulator.
+        data_driven: whether a network replaces the simulator.
+    """
+    runs: list[TrialRollout] = []
+
+    def error(learned: Learned) -> float:
+        if not runs:  # The starts of the trials are estimated once, at the first call.
+            batches = motions.dataset.batches(names)
+            runs.extend(TrialRollout(simulator, motions, batch, identified, data_driven) for batch in batches)
+        rows = [row for run in runs for row in run.errors(learned)]
+        mean = summarise(rows)["mean"]
+        return float("inf") if mean is None else mean
+
+    return error

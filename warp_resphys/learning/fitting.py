@@ -1,0 +1,356 @@
+"""Fits networks to observed motions: residual forces, and next states in place of the simulator.
+
+On single steps of reconstructed trials, or through the simulator on whole motions or windows (`in_the_loop`).
+"""
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from ..data.dataset import STATIC
+from ..dynamics.modes import RestStiffness
+from ..dynamics.simulator import Simulator
+from ..io.progress import Progress
+from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
+from .correction import Learned, Range, force_frames
+from .evaluation import rollout_error
+from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from .networks import NextState, ResidualForce, StateMap, build_model
+from .observed_motions import Identified, ObservedMotions
+from .reconstruction import ReconstructedTrials
+from .replay import Replay, Start, Windows
+from .training import EpochTrainer, Samples, SequenceTrainer, Trainer
+
+log = logging.getLogger(__name__)
+_SAVE_SECONDS = 10.0
+
+Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
+Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
+
+
+def fit_force(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    reconstructed: ReconstructedTrials,
+    *,
+    train: Sequence[str] | None = None,
+    validation: Sequence[str] = (),
+    parameters: Identified | Mapping[str, float] | None = None,
+    network: NetworkSettings | None = None,
+    trainer: TrainerSettings | None = None,
+    in_the_loop: InTheLoopSettings | None = None,
+    seed: int = 0,
+    **more: Any,
+) -> Learned:
+    """Trains a network that predicts the residual force of a simulator from its state and inputs.
+
+    Args:
+        simulator: to correct.
+        motions: observed states or markers.
+        reconstructed: from `reconstruct`.
+        train: names of the trials to learn from; by default all that are not in `validation`.
+        validation: names of the trials that choose the weights, by the error of their roll-outs; the training trials if
+            empty.
+        parameters: as for `reconstruct`.
+        network: kind and size; the defaults of the class if None.
+        trainer: epochs, rates and noise of training on steps; the defaults of the class if None.
+        in_the_loop: training through the simulator; None for training on steps.
+        seed: of the weights, batches and noise; torch's global generator is restored.
+        more: further attributes of `Fitting`.
+
+    Returns:
+        The network, to pass to `evaluate`. It maps q (S, N, 3) [m], v (S, N, 3) [m/s] and the inputs (S, A) to forces
+        (S, N, 3) [N].
+
+    Raises:
+        InputError: sizes that do not fit the motions.
+    """
+    names = motions.dataset.names
+    train = [name for name in names if name not in validation] if train is None else train
+    fitting = Fitting(
+        simulator, motions, reconstructed, tuple(train), tuple(validation), Identified.of(parameters), **more
+    )
+    settings = TrainingSettings(
+        network=network or NetworkSettings(), trainer=trainer or TrainerSettings(), in_the_loop=in_the_loop, seed=seed
+    )
+    with torch.random.fork_rng():
+        return fit(fitting, settings)
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What a network is fitted to.
+
+    Attributes:
+        simulator: whose force is learned, or which shows the network's states.
+        motions: observed trials.
+        reconstructed: their states and forces.
+        train: names of the trials to learn from.
+        validation: names of the trials that choose the weights.
+        identified: parameters of the simulator.
+        data_driven: whether the network predicts the next state, in place of the simulator.
+        force_frame: ``world``, or ``corotated`` for forces that turn with the body.
+        range_guard: whether roll-outs clamp the network's inputs to their range in training.
+        fades: whether the force fades out beyond that range.
+        device: of the training.
+    """
+
+    simulator: Simulator
+    motions: ObservedMotions
+    reconstructed: ReconstructedTrials | None
+    train: tuple[str, ...]
+    validation: tuple[str, ...] = ()
+    identified: Identified = field(default_factory=Identified)
+    data_driven: bool = False
+    force_frame: str = "world"
+    range_guard: bool = False
+    fades: bool = False
+    device: torch.device | str = "cpu"
+
+    def samples(self, names: Sequence[str]) -> Samples:
+        """Collects the single steps of trials; a static pose is one step without motion.
+
+        States are in the frame of the base. The output is the force during the step, rotated to the rest shape if
+        forces are corotated, or the displacement and velocity at the end of the step. Steps without any visible marker
+        are left out.
+        """
+        samples = Samples.joined([self._samples(batch) for batch in self.motions.dataset.batches(names)])
+        frames = None if self.data_driven else force_frames(self.simulator, self.force_frame)
+        if frames is None:
+            return samples
+        return replace(samples, outputs=(frames.to_rest(samples.q, samples.v, *samples.outputs),))
+
+    def _samples(self, names: Sequence[str]) -> Samples:
+        """Samples of trials that begin in the same way, with forces in the world frame."""
+        q, v, force, seen = self._states(names, simulated=self.data_driven)
+        base, like = self.motions.base(names, self.simulator), self.simulator.rest_positions
+        if base is not None:
+            pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
+            inside = [base.enter(x.to(like), w.to(like), k) for k, (x, w) in pairs]
+            q, v = (torch.stack(field, 1).to(q) for field in zip(*inside, strict=True))
+            forces = enumerate(force.unbind(1))  # The force of a frame belongs to the previous step.
+            force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
+        if self.motions.dataset.begin_of(names[0]) == STATIC:
+            q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
+        steps, whole = q.shape[1] - 1, bool(seen.all())
+
+        def pick(field: torch.Tensor) -> torch.Tensor:
+            return field.flatten(0, 1) if whole else field[seen]
+
+        values, replay = self.identified.values(self.simulator), self.motions.replay(self.simulator, names)
+        inputs = self.motions.conditions(replay, values, self.data_driven)
+        if inputs is not None:  # (K, R, A), or (R, A) constant in time
+            inputs = inputs[:steps].swapaxes(0, 1) if inputs.ndim == 3 else inputs[:, None].expand(-1, steps, -1)
+            inputs = pick(inputs.expand(-1, steps, -1).to(self.device))
+        now = pick(q[:, :-1]), pick(v[:, :-1])
+        lengths = tuple(seen.sum(1).tolist())
+        if not self.data_driven:
+            return Samples(*now, (pick(force[:, 1:]),), inputs, lengths)
+        return Samples(*now, (pick(q[:, 1:]) - like.to(q), pick(v[:, 1:])), inputs, lengths)
+
+    def _states(self, names: Sequence[str], simulated: bool = True) -> tuple[torch.Tensor, ...]:
+        """Positions, velocities and forces (R, K + 1, N, 3) of trials, and (R, K) whether steps were seen.
+
+        States are the reconstructed ones; those of the trials themselves, with zero forces, if `simulated` and known.
+        """
+        dataset = self.motions.dataset
+        if simulated and dataset.velocity is not None:
+            rows = dataset.rows(names)
+            q, v = (torch.as_tensor(field[rows], device=self.device) for field in (dataset.observed, dataset.velocity))
+            return q, v, q.new_zeros(()).expand_as(q), torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool)
+        assert self.reconstructed is not None
+        arrays = self.reconstructed.of(names, "q", "v", "force", "error")
+        q, v, force, error = (torch.as_tensor(array, device=self.device) for array in arrays)
+        return q, v, force, error[:, 1:].isfinite()
+
+    def new_network(self, train: Samples, settings: TrainingSettings) -> StateMap:
+        """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
+        rest, network = self.simulator.rest_positions.to(train.q.device), settings.network
+        if not self.motions.dataset.moving(self.train):
+            network = self._limited(network, len(train.q))
+        torch.manual_seed(settings.seed)
+        by_displacement = not self.data_driven and network.kind == "reduced" and network.force_basis == "displacement"
+        stiffness = RestStiffness(self.simulator) if by_displacement else None
+        force = None if self.data_driven else train.outputs[0]
+        kind = NextState if self.data_driven else ResidualForce
+        return build_model(kind, network, rest, train.q, train.v, force, train.actuation, stiffness)
+
+    def _limited(self, network: NetworkSettings, poses: int) -> NetworkSettings:
+        """The group ``network`` with at most as many modes as there are training poses."""
+        names = ("position_modes",) if self.data_driven else ("position_modes", "force_modes")
+        many = {name: getattr(network, name) for name in names if getattr(network, name) > poses}
+        if many:
+            reduced = " and ".join(f"network.{name} from {count}" for name, count in many.items())
+            log.info("reduced %s to %d, the number of training poses", reduced, poses)
+        return network.changed(**dict.fromkeys(many, poses))
+
+    def trainer(self, settings: TrainingSettings, name: str = "") -> Prepared:
+        """Prepares the trainer of a new network; the result depends on the settings only.
+
+        Args:
+            settings: of the training.
+            name: of the training, displayed beside progress bars.
+
+        Raises:
+            InputError: a setting out of range, or an empty split.
+        """
+        samples = self.samples(self.train)
+        if settings.in_the_loop is not None:
+            return self._through_the_simulator(samples, settings, settings.in_the_loop, name)
+        return self._on_steps(samples, settings)
+
+    def _on_steps(self, train: Samples, settings: TrainingSettings) -> Prepared:
+        """Prepares training on single steps, validated by roll-outs: of the training trials without others."""
+        judged = self.validation or self.train
+        validation = self.samples(judged) if self.validation else train
+        network = self.new_network(train, settings)
+        learned = Learned(network, self._range_of(network, train), self.force_frame)
+        counting = replace(self.simulator, solver=replace(self.simulator.settings, on_failure="count"))
+        error = rollout_error(counting, self.motions, judged, self.identified, self.data_driven)
+        kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
+
+        def judge(weights: StateMap) -> float:
+            return error(replace(learned, network=weights))
+
+        return kind(network, train, validation, judge, settings.trainer, settings.seed), learned
+
+    def _range_of(self, network: StateMap, train: Samples) -> Range | None:
+        """Training range of a network's inputs, to which roll-outs clamp them; None without a guard."""
+        if not self.range_guard:
+            return None
+        with torch.no_grad():
+            missed = network.missed(train.q, train.v) if self.fades else None
+            return Range.of(network.encode(train.q, train.v, train.actuation), missed)
+
+    def _through_the_simulator(
+        self, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings, name: str
+    ) -> Prepared:
+        """Prepares training through the simulator, on whole trials or on windows; whole trials choose the weights.
+
+        The reconstruction provides the modes of motions and forces, the states at which windows begin, and the force to
+        begin with if it is not zero. From zero and without validation trials, the number of epochs is found by
+        cross-validation, holding out each training trial once; it may be zero.
+        """
+        parameters, train, validation = self.identified.values(self.simulator), self.train, self.validation
+        replays = self.motions.replays(self.simulator, train + validation, self.identified)
+
+        def loss(names: Sequence[str], window: int | None = None) -> MotionLoss:
+            groups = (self._group(*pair, names, parameters, window) for pair in replays)
+            return MotionLoss([group for group in groups if group is not None], parameters)
+
+        def make_network() -> ResidualForce:
+            network = self.new_network(samples, settings)
+            assert isinstance(network, ResidualForce)
+            return network.double()
+
+        epochs, after = None, 0
+        if loop.start == "steps":
+            first, _ = self._on_steps(samples, settings)
+            run_epochs(f"{name}: steps", first)
+            network, after = first.use_best().double().train(), first.best_epoch
+        elif loop.hold_out and not validation and len(train) > 1:
+            parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
+            with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
+                epochs = cross_validated_epochs(make_network, parts, loop, progress.advance)
+            log.debug("%s: %d epochs are best for held-out trials", name, epochs)
+            network = make_network()
+        else:
+            network = make_network()
+        trainer = InTheLoop(network, loss(train, loop.window), loss(validation or train), loop, epochs, after)
+        trainer.begin()
+        return trainer, Learned(trainer.model, self._range_of(trainer.model, samples), self.force_frame)
+
+    def _group(
+        self,
+        replay: Replay,
+        start: Start,
+        names: Sequence[str],
+        parameters: Mapping[str, torch.Tensor],
+        window: int | None,
+    ) -> TrialGroup | None:
+        """The trials of a replay that are among some, with the windows of the loss; None without any."""
+        batch, simulator = replay.trials.names, self.simulator
+        rows = [batch.index(name) for name in names if name in batch]
+        if not rows:
+            return None
+        part, windows = Replay(simulator, replay.observe, replay.trials.select(rows)), None
+        if window is not None:
+            q, v, *_ = self._states(part.trials.names)
+            windows = Windows(q.to(simulator.rest_positions), v.to(simulator.rest_positions), window)
+        inputs, base = self.motions.conditions(part, parameters), self.motions.base(part.trials.names, simulator)
+        frames = force_frames(simulator, self.force_frame)
+        return TrialGroup(part, start.select(rows), inputs, frames, base, windows)
+
+
+def fit(
+    fitting: Fitting,
+    settings: TrainingSettings,
+    name: str = "fit_force",
+    resumed: Snapshot | None = None,
+    save: Callable[[Snapshot], None] = lambda kept: None,
+) -> Learned:
+    """Trains a network to the end.
+
+    Args:
+        fitting: what it is fitted to.
+        settings: of the training.
+        name: displayed beside the progress bar.
+        resumed: a snapshot from which an interrupted training goes on.
+        save: is called with a snapshot every ten seconds, and when the training ends or is interrupted.
+    """
+    trainer, learned = fitting.trainer(settings, name)
+    if resumed is not None:
+        trainer.resume(*resumed)
+    run_epochs(name, trainer, save)
+    best = trainer.use_best()
+    error = trainer.best_error if math.isfinite(trainer.best_error) else None
+    if error is None:
+        log.warning("%s: the selected weights diverge on the validation split", name)
+    kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
+    return replace(learned, network=best, training={"kept": kept, "epochs": trainer.history})
+
+
+def run_epochs(
+    name: str,
+    trainer: EpochTrainer[Any],
+    save: Callable[[Snapshot], None] = lambda kept: None,
+    watch: Callable[[Mapping[str, float]], None] | None = None,
+) -> None:
+    """Trains to the end; saves the last complete epoch regularly, and whenever training ends or is interrupted.
+
+    Args:
+        name: description of the progress bar.
+        trainer: trainer, possibly resumed.
+        save: saves a snapshot.
+        watch: is called with the record of every epoch; an exception raised by it ends the training.
+    """
+    saved = time.monotonic()
+    kept = _copy(trainer.snapshot())
+    with Progress(name, trainer.settings.epochs, "epochs", trainer.epoch) as progress:
+        try:
+            while not trainer.finished:
+                record = trainer.run_epoch()
+                kept = _copy(trainer.snapshot())
+                if time.monotonic() - saved > _SAVE_SECONDS:
+                    save(kept)
+                    saved = time.monotonic()
+                shown: dict[str, object] = {"loss": f"{record['train_loss']:.2e}"}
+                if not math.isnan(trainer.best_error):
+                    shown["rollout"] = f"{trainer.best_error:.2g} mm"
+                progress.advance(1, **shown)
+                if watch is not None:
+                    watch(record)
+        finally:
+            save(kept)
+
+
+def _copy(snapshot: Snapshot) -> Snapshot:
+    """Copies a snapshot, whose tensors the next epoch changes in place."""
+    tensors, metadata = snapshot
+    copies = {name: tensor.detach().clone() for name, tensor in tensors.items()}
+    return copies, {**metadata, "history": list(metadata["history"])}

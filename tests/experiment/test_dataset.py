@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from warp_resphys.data.dataset import Dataset, read_dataset
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.files import driving, first_change, phases_of, since_change
 from warp_resphys.io.files import read_hdf5
 
@@ -16,7 +16,7 @@ def dataset(begins, names="abc", resting=None, **inputs):
     channels = {name: ("left", "right")[: values.shape[2]] for name, values in inputs.items()}
     fields = {"inputs": inputs, "channels": channels, "resting": resting or {}}
     about = (times, observed, observed[:, 0], np.zeros(rows), np.zeros(3), 0.05)
-    return Dataset(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), units=UNITS, **fields)
+    return Trials(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), units=UNITS, **fields)
 
 
 UNITS = {"pressure": "Pa", "tendon_tension": "N", "tendon_contraction": "m", "muscle_stress": "Pa"}
@@ -26,7 +26,7 @@ UNITS["muscle_contraction"] = "1"
 def test_inputs_are_kept_with_the_unit_of_their_quantity(tmp_path):
     own = dataset(("rest",), **{name: k + np.arange(24.0).reshape(1, 12, 2) for k, name in enumerate(UNITS)})
     own.write(tmp_path / "dataset.h5")
-    again = read_dataset(tmp_path / "dataset.h5")
+    again = Trials.read(tmp_path / "dataset.h5")
     assert again.channels == own.channels
     with read_hdf5(tmp_path / "dataset.h5", "dataset") as file:
         assert {name: file[name].attrs["units"] for name in UNITS} == UNITS
@@ -39,7 +39,7 @@ def test_inputs_before_the_trials_are_kept_and_joined_with_trials_at_rest(tmp_pa
     driven = dataset(("driven",), resting={"pressure": np.array([[3.0, 5.0]])}, pressure=values)
     rest = dataset(("rest",), "b", pressure=values)
     driven.write(tmp_path / "dataset.h5")
-    np.testing.assert_array_equal(read_dataset(tmp_path / "dataset.h5").resting["pressure"], [[3.0, 5.0]])
+    np.testing.assert_array_equal(Trials.read(tmp_path / "dataset.h5").resting["pressure"], [[3.0, 5.0]])
     np.testing.assert_array_equal(driven.joined(rest).resting["pressure"], [[3.0, 5.0], [0.0, 0.0]])
     np.testing.assert_array_equal(rest.joined(driven).resting["pressure"], [[0.0, 0.0], [3.0, 5.0]])
     assert rest.joined(rest).resting == {}

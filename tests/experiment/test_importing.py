@@ -10,10 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, settings
-from warp_resphys.data.dataset import Dataset, payload_inputs, read_dataset
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
-from warp_resphys.data.trials import Trials
+from warp_resphys.data.trials import Trials, payload_inputs
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH
@@ -25,6 +24,7 @@ from warp_resphys.io.files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.settings.stages import IMPORTED, PLAYED, StageSettings
@@ -62,7 +62,9 @@ def true_markers(played, setup, trials, times):
     held = torch.as_tensor(setup.tracked).expand(len(trials), -1, -1)
     blank = held[:, None].expand(-1, times.shape[1], -1, -1)
     inputs = Inputs(attached_mass=torch.as_tensor(masses["attached_mass"]))
-    motions = Trials(tuple(trial.name for trial in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs)
+    motions = TrialBatch(
+        tuple(trial.name for trial in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs
+    )
     start = Start(simulator.rest_state(len(trials)), torch.zeros(len(trials), dtype=torch.float64))
     with torch.no_grad():
         return Replay(simulator, read, motions)(start)[0].numpy()
@@ -70,8 +72,8 @@ def true_markers(played, setup, trials, times):
 
 def test_simulated_markers_come_back_within_noise(laboratory):
     folder, run = laboratory
-    dataset = read_dataset(folder / DATASET)
-    motions = dataset.trials(dataset.names, build_body(run), run.payload_at)
+    dataset = Trials.read(folder / DATASET)
+    motions = TrialBatch.of(dataset, dataset.names, build_body(run), run.payload_at, run.time_step)
     bound = dataset.bound
     assert motions.names == ("m0", "m50", "m90")
     assert dataset.labels == TIPS
@@ -226,7 +228,7 @@ def test_a_trial_with_markers_of_its_own(shelf):
     swing, same = (data["observed"][2] - data["held"][2] for data in (results, whole))
     np.testing.assert_allclose(swing[:, [0, 3, 2]], same, rtol=0.0, atol=5e-5)
     assert set(read_json(shelf.folder / REGISTRATION)["load101"]["shift_mm"]) == {"Tip - 1", "Tip - 3", "Tip - 4"}
-    assert read_dataset(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
+    assert Trials.read(shelf.folder / DATASET).sets == ((0, 2, 3), (0, 1, 2))
 
 
 def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
@@ -372,9 +374,9 @@ def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
     times, seen, weight = np.zeros((1, 7)), np.zeros((1, 7, 1, 3)), np.zeros(1)
     inputs = {"pressure": np.arange(6.0)[None, :, None]}
     words = (("a",), ("m",), ("rest",))
-    dataset = Dataset(*words, times, seen, seen[:, 0], weight, np.zeros(3), 0.01, inputs=inputs, base=base)
+    dataset = Trials(*words, times, seen, seen[:, 0], weight, np.zeros(3), 0.01, inputs=inputs, base=base)
     body = build_body(settings("experiment=beam_real"))
-    given = dataset.trials(["a"], body, None, 0.01 * ratio).inputs.fields
+    given = dataset.acting(["a"], body, None, 0.01 * ratio)[0].fields
     times = 0.01 * ratio * (np.arange(count) + 1.0)
     np.testing.assert_allclose(given["pressure"][:, 0, 0], ((times - 0.005 * ratio) / 0.01).astype(int))
     moved = given["fixed_positions"][:, 0] - torch.from_numpy(body.mesh.vertices[body.fixed_vertices])

@@ -12,10 +12,10 @@ from support.main_job import run_without_report
 from support.played_run import check_robots
 from warp_resphys import Body
 from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
-from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
+from warp_resphys.data.trials import Trials
 from warp_resphys.energies.contact import Contact
 from warp_resphys.energies.obstacles import Box, HalfSpace, Sphere
 from warp_resphys.energies.surfaces import FrictionPair, SurfaceContact
@@ -218,7 +218,7 @@ class TestMotions:
             *("laboratory.train=[lift1,slide]", "laboratory.validation=[mixed]", "laboratory.test=[lift2]"),
         ]
         folder = run_without_report(tmp_path, *pushed)
-        dataset, configured = read_dataset(folder / "dataset.h5"), settings(*pushed)
+        dataset, configured = Trials.read(folder / "dataset.h5"), settings(*pushed)
         poses = dataset.obstacles["bar"]
         for row, name in enumerate(dataset.names):
             trial = configured.laboratory.trials[name].obstacle_motion["bar"]

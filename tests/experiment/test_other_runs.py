@@ -9,9 +9,9 @@ from support.main_job import finish, run
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
 from warp_resphys.data.base_motion import prescribed
-from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.input_response import wave_inputs
 from warp_resphys.data.marker_view import MarkerView
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator
 from warp_resphys.experiment.report import read_recordings
 from warp_resphys.experiment.sensitivity import sensitivities
@@ -60,7 +60,7 @@ class TestArm:
         folder = finish(*self.OPTIONS, "data.payload_at={z:-0.1}", "actuation.sees_payload=true", own, factor)
         identified = results(folder)["parameters"]["sysid"]
         assert identified.keys() == {"youngs_modulus", "poissons_ratio", "attached_mass_factor"}
-        dataset = read_dataset(folder / "dataset.h5")
+        dataset = Trials.read(folder / "dataset.h5")
         np.testing.assert_allclose(dataset.payload, [0.0, 0.03, 0.01, 0.02])
         heights = dataset.observed[:, 0, :, 2].mean(-1)  # m, at rest: the heavier, the lower
         assert np.argsort(-heights).tolist() == np.argsort(dataset.payload).tolist()
@@ -76,7 +76,7 @@ class TestArm:
         own += ["data.sequences=0", "data.cutoff=null", "data.begins=held", "data.seconds=0.1"]
         folder = finish(*self.OPTIONS, *own, "data.rest=file", "data.alignment=own")
         results(folder)
-        dataset = read_dataset(folder / "dataset.h5")
+        dataset = Trials.read(folder / "dataset.h5")
         assert set(dataset.begins) == {"released"}
         moved = (dataset.held - dataset.bound).mean(1)  # (4, 3) [m]
         for row, direction in zip(moved, ([1, 0], [0, 1], [1, 1], [-0.6, 0.4]), strict=True):
@@ -89,7 +89,7 @@ class TestArm:
         poses = ["+laboratory.trials={t000:{begins:static},t003:{begins:static}}", "data.sequences=5"]
         split = ["data.train=[t000,t001]", "data.validation=[t002]", "data.test=[t003,t004]"]
         folder = finish(*self.OPTIONS, *poses, *split)
-        metrics, dataset = results(folder), read_dataset(folder / "dataset.h5")
+        metrics, dataset = results(folder), Trials.read(folder / "dataset.h5")
         assert list(dataset.begins) == ["static", "rest", "rest", "static", "rest"]
         assert np.isfinite(dataset.observed[0, 0]).all()
         assert np.isnan(dataset.observed[0, 1:]).all()  # a pose has one frame
@@ -126,7 +126,7 @@ def test_a_base_that_moves_is_told_by_markers():
     assert errors["simulation"] > 3.0  # mm
     assert errors["sysid"] < 0.7 * errors["simulation"]
     assert errors["resphys"] < 1.05 * errors["sysid"]
-    dataset = read_dataset(folder / "dataset.h5")
+    dataset = Trials.read(folder / "dataset.h5")
     swing = {"frequency": 3.0, "rotation": [0.2, 0.2, 0.0]}
     motion = parse(MotionSettings, {"start": 0.05, "ramp": 0.05, "swings": {"a": swing}})
     truth = prescribed(motion, dataset.times[1])
@@ -148,7 +148,7 @@ CRAWLS = [
 @pytest.mark.usefixtures("folder", "no_report")
 def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothing():
     folder = finish(*CRAWLS)
-    metrics, dataset, configured = results(folder), read_dataset(folder / "dataset.h5"), settings(*CRAWLS)
+    metrics, dataset, configured = results(folder), Trials.read(folder / "dataset.h5"), settings(*CRAWLS)
     moved = 1e3 * (dataset.observed[:, -1] - dataset.observed[:, 0])[..., 0].mean(-1)
     ways = dict(zip(dataset.names, moved, strict=True))
     assert ways["faster"] > 4.0  # mm
@@ -304,7 +304,7 @@ def test_limbs_that_swim_are_identified_by_their_shape(folder):
     motions = swum(wanted, tracked)
     write(folder / "recordings", motions)
     run_folder = finish(*LIMBS)
-    dataset = read_dataset(run_folder / "dataset.h5")
+    dataset = Trials.read(run_folder / "dataset.h5")
     assert dataset.sets == ((4, 5, 6, 7), (0, 1, 2, 3))
     for name, (commanded, markers) in motions.items():
         row = dataset.names.index(name)

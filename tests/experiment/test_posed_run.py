@@ -8,7 +8,7 @@ import warp_resphys
 from support.configured import settings
 from support.main_job import finish, run_without_report
 from support.played_run import check_robots
-from warp_resphys.data.dataset import read_dataset
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.io.files import read_array, read_hdf5, read_json
 from warp_resphys.report.identification_section import own_table
@@ -68,7 +68,7 @@ def write(folder, places_of_poses):
 def test_poses_of_unnamed_markers_identify_the_body(poses, folder):
     write(folder / "recordings", poses)
     run = finish(*TINY, *trials())
-    dataset = read_dataset(run / "dataset.h5")
+    dataset = Trials.read(run / "dataset.h5")
     rows = [dataset.names.index(name) for name in POSES]
     assert set(dataset.begins) == {"static"}
     np.testing.assert_allclose(dataset.observed[rows, 0], poses[:, :4], atol=3e-4)  # named and turned back
@@ -104,7 +104,7 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
         f"+identify.parameters.tendon_tension_factor={gain}",
         *("mesh_check=null", "identify.max_evaluations=8"),
     )
-    assert dict(zip((data := read_dataset(folder / "dataset.h5")).names, data.sessions, strict=True)) == sessions
+    assert dict(zip((data := Trials.read(folder / "dataset.h5")).names, data.sessions, strict=True)) == sessions
     found = read_json(folder / "identification.json")["sysid"]
     own = {name.removeprefix("tendon_tension_factor@"): value for name, value in found["own"].items()}
     assert own.keys() == {"weak", "strong", "second"} == {name.split("@")[1] for name in found["own_deviation"]}

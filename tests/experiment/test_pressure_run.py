@@ -14,8 +14,8 @@ from support.configured import check, composed, settings
 from support.main_job import finish, without_reports
 from support.segment_run import TRACKED, place_segment
 from warp_resphys import pipeline
-from warp_resphys.data.dataset import Dataset, read_dataset
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learn
 from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment
@@ -142,7 +142,7 @@ class Recordings:
         """The dataset of their import."""
         (imports,) = [stage for stage in self.stages(*overrides) if stage.name == "import"]
         import_recordings(StageContext("import", self.folder, "", imports.settings))
-        return read_dataset(self.folder / "dataset.h5")
+        return Trials.read(self.folder / "dataset.h5")
 
     def refused(self):
         """The sentence with which they are refused, before the run or by its import."""
@@ -271,7 +271,7 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
     about = (np.tile(0.01 * np.arange(5), (2, 1)), observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
     pressed = {"pressure": np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 0.0]])[..., None]}
     more = {"bound": np.zeros((1, 3)), "inputs": pressed}
-    experiment.__dict__["dataset"] = Dataset(("a", "b"), ("m",), ("rest", "rest"), *about, **more)
+    experiment.__dict__["dataset"] = Trials(("a", "b"), ("m",), ("rest", "rest"), *about, **more)
     markers = {"sysid": good, "resphys": lost}
     results = summary(StageContext("evaluate", tmp_path, "", stage), experiment, {"1": ("a", "b")}, markers, left)
     assert results["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)

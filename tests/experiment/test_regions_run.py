@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import warp_resphys
 from support.main_job import run_without_report
-from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.rigid_bodies import angles, arms
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.files import DATASET, REGISTRATION, TRUTH
 from warp_resphys.io.files import read_array, read_hdf5, read_json
 from warp_resphys.robot.description import Description, describe
@@ -45,7 +45,7 @@ def test_each_silicone_is_identified(folder):
 
 
 def test_the_rest_frames_show_how_a_rigid_body_is_mounted(folder):
-    dataset, truth = read_dataset(folder / DATASET), read_json(folder / TRUTH)["bound"]
+    dataset, truth = Trials.read(folder / DATASET), read_json(folder / TRUTH)["bound"]
     assert dataset.labels == ("plate +++", "plate +--", "plate -+-", "plate --+")
     true = np.array([truth[label] for label in dataset.labels])
     np.testing.assert_allclose(dataset.bound.mean(axis=0), true.mean(axis=0), atol=2e-5)
@@ -60,7 +60,7 @@ def test_the_rest_frames_show_how_a_rigid_body_is_mounted(folder):
 
 def test_positions_and_orientations_have_their_own_errors_as_robots_count_them(folder):
     metrics = read_json(folder / "metrics.json")
-    seen = read_dataset(folder / DATASET)
+    seen = Trials.read(folder / DATASET)
     with read_hdf5(folder / "rollouts.h5", "rollouts") as file:
         simulated = read_array(file, "sysid_observed")[0]
     observed = seen.observed[seen.names.index("m50")]

@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.configured import settings
-from warp_resphys.data.dataset import read_dataset
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.rigid_bodies import angles, motion_between
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.files import DATASET, TRUTH
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_json
@@ -33,7 +33,7 @@ BASES = {"Base - 1": [0.006, -0.01, -0.001], "Base - 2": [0.006, 0.04, 0.0275], 
 def imported(folder, *overrides):
     """The dataset of a run of the first stages."""
     run_stages(acquisition_stages(settings(*HANGS, *overrides)), folder)
-    return read_dataset(folder / DATASET)
+    return Trials.read(folder / DATASET)
 
 
 def recorded(folder, train, test):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.configured import check, composed, settings
 from warp_resphys import Body, Simulator, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.data.base_motion import rigid
-from warp_resphys.data.dataset import read_dataset
+from warp_resphys.data.trials import Trials
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.muscles import Muscle, Muscles
 from warp_resphys.experiment.ablation import generate_motion, read_motion
@@ -78,7 +78,7 @@ def simulated(folder, *overrides):
     run = settings(*overrides)
     (stage,) = acquisition_stages(run)
     simulate(StageContext("simulate", Path(folder), "fingerprint", stage.settings))
-    return read_dataset(Path(folder) / DATASET), run
+    return Trials.read(Path(folder) / DATASET), run
 
 
 def by_hand(weight, steps):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from warp_resphys.data.dataset import Dataset
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.without_physics import without_physics
 from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.settings.learning import ReleaseSettings
@@ -35,7 +35,7 @@ def experiment(levels, begins, learned, **changes):
         "bound": held[0],
         "inputs": {"pressure": pressure},
     }
-    dataset = Dataset(**given | changes)
+    dataset = Trials(**given | changes)
     settings = SimpleNamespace(split=SimpleNamespace(train=learned), release=ReleaseSettings())
     return SimpleNamespace(dataset=dataset, settings=settings, motions=ObservedMotions(dataset))
 

@@ -9,13 +9,13 @@ import torch
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import WHOLE_STATE, bind_markers
-from warp_resphys.data.trials import Trials
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.observed_motions import at_steps
 from warp_resphys.learning.replay import Replay, Start, Windows
+from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
@@ -46,7 +46,7 @@ def motions_of(times, markers, held=None):
     names = tuple(f"m{i}" for i in range(count))
     attached = torch.zeros(count, len(MESH.vertices), dtype=torch.float64)
     attached[:, TIP] = LOADS[:count] / len(TIP)
-    return Trials(names, times, markers, held, Inputs(attached_mass=attached))
+    return TrialBatch(names, times, markers, held, Inputs(attached_mass=attached))
 
 
 class TestAtSteps:
@@ -241,7 +241,7 @@ class TestWindows:
         result = real.rollout(real.static_equilibrium(Inputs(load)), self.STEPS)
         q, v = (field.transpose(0, 1).contiguous() for field in (result.q, result.v))
         times = (STEP * torch.arange(self.STEPS + 1, dtype=torch.float64)).expand(2, -1)
-        trials = Trials(("a", "b"), times, q, q[:, 0], Inputs())
+        trials = TrialBatch(("a", "b"), times, q, q[:, 0], Inputs())
         start = Start(State(q[:, 0], v[:, 0]), torch.zeros(2, dtype=torch.float64))
         return real, trials, start, Windows(q, v, self.WINDOW)
 

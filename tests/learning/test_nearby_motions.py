@@ -8,12 +8,12 @@ import torch
 
 from warp_resphys import Body, Corotated, Simulator, Tendons
 from warp_resphys.data.markers import WHOLE_STATE
-from warp_resphys.data.trials import Trials
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
@@ -50,7 +50,7 @@ def replayed(frames, kind=Simulator, energies=(), static=False, **options):
     force = torch.zeros(2, *held.shape[1:]).double()
     force[:, select_vertices(MESH, x=0.1), 1] = torch.tensor([[0.002], [-0.004]]).double()
     at = Inputs(external_force=force)
-    blank = Trials(("a", "b"), times, held[:, None].repeat(1, frames, 1, 1), held, at, at if static else Inputs())
+    blank = TrialBatch(("a", "b"), times, held[:, None].repeat(1, frames, 1, 1), held, at, at if static else Inputs())
     replay = Replay(sim, WHOLE_STATE, blank)
     start = Start.resting(held.clone())
     with torch.no_grad():

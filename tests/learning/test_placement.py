@@ -12,7 +12,6 @@ from support.regions import beam
 from warp_resphys import Body, Corotated, Rigid, Simulator
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_vertices
 from warp_resphys.data.rigid_bodies import angles, arms
-from warp_resphys.data.trials import Trials
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.misfit import Misfit
@@ -20,6 +19,7 @@ from warp_resphys.learning.nuisance import NuisanceFit
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.inputs import Inputs
@@ -101,7 +101,7 @@ def test_the_placement_minimises_its_sum_of_squares():
 
     held, names = torch.as_tensor(PLACES).expand(2, -1, -1), ("first", "second")
     observed = torch.where(seen[0][..., None], at - errors[0], torch.nan)
-    trials = Trials(names, torch.arange(3).double().expand(2, -1), observed, held)
+    trials = TrialBatch(names, torch.arange(3).double().expand(2, -1), observed, held)
     group = (Replay(SIM, DisplacedMarkers(bind(), 4), trials), Start.resting(REST.expand(2, -1, -1)))
     series = [torch.cat([at, *(at + turn for turn in turns.unbind(-1))], 2)[None]]
     placed = NuisanceFit([group], weights, accuracy, CENTRE, 0.0)(series, 1e-5)[1]
@@ -138,7 +138,7 @@ def posed(observe, noise=0.0, seed=0, truth=TRUTH):
     count = len(WEIGHTS)
     held = torch.as_tensor(PLACES).expand(count, -1, -1)
     names, inputs = tuple(f"w{i}" for i in range(count)), Inputs(attached_mass=attached)
-    blank = Trials(names, torch.zeros(count, 1).double(), held[:, None], held, inputs)
+    blank = TrialBatch(names, torch.zeros(count, 1).double(), held[:, None], held, inputs)
     start = Start.resting(REST.expand(count, -1, -1))
     with torch.no_grad():
         seen = Replay(SIM, observe, blank)(start, {name: one(value) for name, value in truth.items()})[0]
@@ -202,7 +202,7 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
     attached = torch.zeros(count, len(mesh.vertices), dtype=torch.float64)
     attached[1:, np.intersect1d(cap, select_vertices(mesh, x=0.1, y=0.03))] = torch.tensor([[0.01], [0.02]]).double()
     held = torch.as_tensor(nominal).expand(count, -1, -1)
-    blank = Trials(names, torch.zeros(count, 1).double(), held[:, None], held, Inputs(attached_mass=attached))
+    blank = TrialBatch(names, torch.zeros(count, 1).double(), held[:, None], held, Inputs(attached_mass=attached))
     start = Start.resting(torch.as_tensor(mesh.vertices).expand(count, -1, -1))
     with torch.no_grad():
         seen = Replay(simulator, follow_vertices(mesh, cap, true), blank)(start)[0].numpy()

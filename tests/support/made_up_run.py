@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from support.configured import settings
-from warp_resphys.data.dataset import Dataset
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
@@ -128,7 +128,7 @@ def write_recordings(folder: Path):
     times[-1, -3:], markers[-1, -3:] = times[-1, -4], np.nan
     held, payload = np.repeat(BOUND[None], 3, 0) + 2e-4, np.array([*TRIALS.values()])
     words = tuple(TRIALS), tuple(TRACKED), ("released",) * 3
-    Dataset(*words, times, markers, held, payload, GRAVITY, STEP, bound=BOUND).write(folder / "dataset.h5")
+    Trials(*words, times, markers, held, payload, GRAVITY, STEP, bound=BOUND).write(folder / "dataset.h5")
     base = np.array(list(REFERENCE.values())) + 5e-4
     seen = dict(zip(TRACKED, BOUND + 2e-4, strict=True)), dict(zip(REFERENCE, base, strict=True))
     _write_recordings(folder, TRIALS, *seen, rng)
@@ -271,7 +271,7 @@ def write_arm_run(
         times = np.tile(ARM_STEP * np.arange(steps + 1), (len(names), 1))
         words, x = (names, tuple(labels), ("rest",) * len(names)), markers[rows]
         own = {"bound": bound, "inputs": {"pressure": drawn[rows]}, "channels": channels}
-        Dataset(*words, times, x, x[:, 0], np.zeros(len(x)), GRAVITY, ARM_STEP, **own).write(folder / name)
+        Trials(*words, times, x, x[:, 0], np.zeros(len(x)), GRAVITY, ARM_STEP, **own).write(folder / name)
     rolled, film = list(driven)[train:], np.arange(0, steps + 1, 2)
     observed = {m: np.stack([bent(bound, driven[name], m, sag) for name in rolled]) for m in models}
     films = {m: bent(mesh.vertices, driven[rolled[0]], m, sag)[film] for m in models}
@@ -340,7 +340,7 @@ def write_vertex_run(folder, run, *, models=tuple(PERIODS)[:-1], diverged=(), st
     target = np.stack([swinging(vertices, size, steps=steps) for size in AMPLITUDES.values()])
     times = np.tile(STEP * np.arange(steps + 1), (3, 1))
     words = names, (), (begins,) * 3
-    Dataset(*words, times, target, target[:, 0], np.zeros(3), GRAVITY, STEP).write(folder / "dataset.h5")
+    Trials(*words, times, target, target[:, 0], np.zeros(3), GRAVITY, STEP).write(folder / "dataset.h5")
     runs = {
         m: np.stack([swinging(vertices, AMPLITUDES[t], PERIODS[m], OFFSETS.get(m, 0.0), steps) for t in test])
         for m in models

@@ -5,7 +5,7 @@ import torch
 
 from warp_resphys import box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
-from warp_resphys.data.trials import Trials
+from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
@@ -27,4 +27,4 @@ def blank(frames=12, masses=(0.0, 0.05), rate=100.0):
     attached[:, TIP] = double(masses)[:, None] / len(TIP)
     names = tuple(f"m{i}" for i in range(count))
     places = held[:, None].repeat(1, frames, 1, 1) + 1e-3
-    return Trials(names, times, places, held, Inputs(attached_mass=attached))
+    return TrialBatch(names, times, places, held, Inputs(attached_mass=attached))

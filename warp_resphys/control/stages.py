@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ..data.dataset import Dataset, read_dataset
+from ..data.trials import Trials
 from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN, RECEDING
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
@@ -82,7 +82,7 @@ def plan_motions(context: StageContext) -> None:
     if settings.must_reach:
         task.check_reach(reduced, plan.reach)
     # The point starts where the recordings have it before anything moved.
-    start = task.tracked @ np.nanmean(read_dataset(context.run_dir / DATASET).held, axis=0).ravel()
+    start = task.tracked @ np.nanmean(Trials.read(context.run_dir / DATASET).held, axis=0).ravel()
     plans = dict[str, PlannedMotion]()
     total = (plan.corrections + 1) * sum(map(task.steps, settings.control.seconds))
     with Progress(context.name, total, "steps") as progress:
@@ -107,7 +107,7 @@ def fit_baselines(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    task, driven, data = Task(settings.control, robot), driven_input(robot), read_dataset(context.run_dir / DATASET)
+    task, driven, data = Task(settings.control, robot), driven_input(robot), Trials.read(context.run_dir / DATASET)
     assert driven.high is not None
     train, validation = (
         [_series(data, name, driven.name, robot.time_step) for name in names]
@@ -129,7 +129,7 @@ def fit_baselines(context: StageContext) -> None:
     write_baselines(context.run_dir / BASELINES, linear, moved.T / np.diag(pressed))
 
 
-def _series(data: Dataset, name: str, driven: str, time_step: float) -> tuple[FloatArray, FloatArray]:
+def _series(data: Trials, name: str, driven: str, time_step: float) -> tuple[FloatArray, FloatArray]:
     """Resamples a trial at a robot's steps: markers (T + 1, 3 M) [m] and inputs (T, n)."""
     (row,) = data.rows([name])
     observed = data.observed if data.smoothed is None else data.smoothed

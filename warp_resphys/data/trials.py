@@ -1,83 +1,303 @@
-"""Trials: the inputs of a body, its initial condition, and its observation."""
+"""Simulated or recorded trials on the body, in a file and in memory."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Self
 
+import numpy as np
 import torch
 
+from ..energies.strings import PAYLOAD, Strings
+from ..fem.bodies import Body
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
+from ..io.files import atomic_hdf5, create, read_array, read_hdf5
+from ..mesh.selection import select_vertices
+from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
+from ..stepping.rotations import rotations
+from .base_motion import at_times, contact_inputs
+
+GIVEN: Final = "given"  # beginning of trials whose initial state is known
+RELEASED: Final = "released"
+STATIC: Final = "static"
+UNDER_INPUTS: Final = "driven"  # of a body at rest under the inputs of the first frame
+SLACK: Final = "slack"  # the same, where these do not act; as UNDER_INPUTS in a dataset
+RESTING: Final = ("rest", UNDER_INPUTS, SLACK)  # of motions that inputs begin, read at the time steps
+_KIND = "dataset"
+_UNITS = {
+    **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
+    **{"velocity": "m/s", "times": "s", "payload": "kg", "base": "m, rad", "initial": "m, m/s"},
+}
 
 
 @dataclass(frozen=True)
 class Trials:
-    """R trials of one body with the same observed points, in the frame of the body.
+    """R trials of one body, in the frame of the body, as stored in `DATASET`.
 
-    The observation is a map of the positions, such as markers or all vertices. A static pose is a trial of one frame.
+    Attributes:
+        names: names of the trials.
+        labels: labels of the M tracked markers; empty if every vertex is observed.
+        begins: how each trial begins, see `settings.trials.Begins`; held bodies are ``released`` here.
+        times: (R, T) times of the frames [s]; trials that end early repeat their last time.
+        observed: (R, T, M, 3) observed positions [m], NaN where a marker was not seen.
+        held: (R, M, 3) positions before time zero [m], NaN for markers that a trial does not have.
+        payload: (R,) mass hanging on the body [kg].
+        gravity: (3,) gravity [m/s^2].
+        time_step: time step of the inputs [s].
+        bound: (M, 3) markers on the undeformed body [m]; None for vertices.
+        initial: (R, 2, N, 3) initial positions [m] and velocities [m/s] of trials with a given state; None: the first
+            of `observed` and `velocity`.
+        smoothed: (R, T, M, 3) smoothed positions that residual forces are fitted to [m]; None to fit `observed`.
+        velocity: (R, T, N, 3) velocities of the vertices [m/s], in simulated trials.
+        inputs: (R, K, ...) inputs of the body during each step by name, such as ``pressure`` (R, K, C) [Pa];
+            (R, ...) if constant.
+        channels: names of the C channels, by input.
+        resting: (R, C) inputs before time zero, by name, of trials that begin under inputs; empty if none does.
+        base: (R, K + 1, 6) motion of the base at the steps, see `data.base_motion`; None if the base stands still.
+        obstacles: (R, K + 1, 6) motions of obstacles at the steps by name, see `data.obstacle_motion`.
+        sessions: session in which each trial was recorded; empty if there is one.
+        units: units of the inputs.
     """
 
     names: tuple[str, ...]
-    times: torch.Tensor  # (R, T) of the frames [s]; trials that end early repeat their last time
-    observed: torch.Tensor  # (R, T, M, D) [unit of the observation], NaN where a point was not seen and after the end
-    held: torch.Tensor  # (R, M, D) observed points before time zero [unit]
-    # of the R environments; inputs that change over time have a value for each step of the simulation
-    inputs: Inputs = field(default_factory=Inputs)
-    # before time zero, for trials that begin at rest; weights are the same as in `inputs`
-    resting: Inputs = field(default_factory=Inputs)
-    session: str = ""  # in which all of them were recorded, if there are several
+    labels: tuple[str, ...]
+    begins: tuple[str, ...]
+    times: FloatArray
+    observed: FloatArray
+    held: FloatArray
+    payload: FloatArray
+    gravity: FloatArray
+    time_step: float
+    bound: FloatArray | None = None
+    initial: FloatArray | None = None
+    smoothed: FloatArray | None = None
+    velocity: FloatArray | None = None
+    inputs: Mapping[str, FloatArray] = field(default_factory=dict)
+    channels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    resting: Mapping[str, FloatArray] = field(default_factory=dict)
+    base: FloatArray | None = None
+    obstacles: Mapping[str, FloatArray] = field(default_factory=dict)
+    sessions: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        """Checks that the shapes agree.
+    def session(self, name: str) -> str:
+        """Session in which a trial was recorded; empty if there is one."""
+        return self.sessions[self.names.index(name)] if self.sessions else ""
+
+    def begin_of(self, name: str) -> str:
+        """How a trial begins: given, released, rest, driven or static."""
+        return self.begins[self.names.index(name)]
+
+    def batches(self, names: Sequence[str]) -> list[tuple[str, ...]]:
+        """Groups trials by how they begin and their session; the trials of a group can be simulated as one batch."""
+        groups: dict[tuple[str, str], list[str]] = {}
+        for name in names:
+            groups.setdefault((self.begin_of(name), self.session(name)), []).append(name)
+        return [tuple(group) for group in groups.values()]
+
+    def moving(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names of the trials that are motions, not static poses."""
+        return tuple(name for name in names if self.begin_of(name) != STATIC)
+
+    def seconds(self, names: Sequence[str]) -> float:
+        """Time of the last frame of trials [s]; zero of poses."""
+        moving = self.moving(names)
+        return float(self.times[self.rows(moving)].max()) if moving else 0.0
+
+    @property
+    def present(self) -> BoolArray:
+        """(R, M) whether a trial has a marker, i.e. whether any of its frames shows the marker."""
+        seen = np.asarray(np.isfinite(self.observed).all(axis=-1))
+        return np.asarray(seen.any(axis=1))
+
+    @property
+    def sets(self) -> tuple[tuple[int, ...], ...]:
+        """Sets of marker indices that occur in the trials; empty if every trial has all markers."""
+        kept = np.unique(self.present, axis=0)
+        return () if kept.all() else tuple(tuple(np.flatnonzero(row).tolist()) for row in kept)
+
+    def write(self, path: Path) -> None:
+        """Writes the trials to a file, see `read`.
 
         Raises:
-            InputError: they do not agree, or no point of a trial was seen.
+            DataFileError: the file cannot be written.
         """
-        r, t, m, d = self.observed.shape
-        batches = [v.shape[i] for inputs in (self.inputs, self.resting) for v, i in inputs.axes().values()]
-        if self.times.shape != (r, t) or self.held.shape != (r, m, d) or set(batches) - {r}:
-            raise InputError("the times, the held points and the inputs do not belong to the same trials.")
-        for name, seen in zip(self.names, self.seen, strict=True):
-            if not bool(seen.any()):
-                raise InputError(f"no marker of the trial {name!r} was seen: leave it out.")
+        words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
+        words |= {"sessions": self.sessions} if self.sessions else {}
+        words |= {"obstacles": tuple(self.obstacles)} if self.obstacles else {}
+        words |= {f"{name}_channels": channels for name, channels in self.channels.items()}
+        attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
+        with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
+            for name, unit in _UNITS.items():
+                if getattr(self, name) is not None:
+                    axis = int(name in ("observed", "smoothed", "velocity"))
+                    create(file, name, getattr(self, name), units=unit, time_axis=axis)
+            for name, values in self.inputs.items():
+                create(file, name, values, units=self.units.get(name) or "1", time_axis=1)
+            for name, values in self.obstacles.items():
+                create(file, f"obstacles/{name}", values, units=_UNITS["base"])
+            for name, values in self.resting.items():
+                create(file, f"{name}_resting", values, units=self.units.get(name) or "1")
 
-    @property
-    def seen(self) -> torch.Tensor:
-        """Whether a point was seen, (R, T, M) bool."""
-        return torch.isfinite(self.observed).all(-1)
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Reads trials written by `write`.
 
-    @property
-    def amplitude(self) -> torch.Tensor:
-        """Root mean square distance of the observed points from the held ones, (R,) [m]."""
-        square = (self.observed - self.held[:, None]).square().sum(-1)
-        return square.nanmean((1, 2)).sqrt()
-
-    @property
-    def loss_weight(self) -> torch.Tensor:
-        """Weights (R,) of sums of squares that give the mean over trials of the mean square over squared amplitude."""
-        return 1.0 / (self.seen.sum((1, 2)) * self.amplitude**2 * len(self.names))
-
-    def select(self, indices: list[int]) -> "Trials":
-        """Returns the trials with these indices."""
-        pick = torch.as_tensor(indices, device=self.times.device)
-        fields = (self.times[pick], self.observed[pick], self.held[pick])
-        names = tuple(self.names[i] for i in indices)
-        return Trials(names, *fields, self.inputs.select(pick), self.resting.select(pick), self.session)
-
-    def first(self, seconds: float) -> "Trials":
-        """Returns the trials with the frames after a time [s] left out or marked as not seen."""
-        inside = self.times <= seconds + 1e-9
-        last = int(inside.any(0).sum())
-        observed = torch.where(inside[..., None, None], self.observed, torch.nan)
-        return replace(self, times=self.times[:, :last], observed=observed[:, :last])
+        Raises:
+            DataFileError: the file is missing, damaged or of another kind.
+        """
+        with read_hdf5(path, _KIND) as file:
+            names, labels, begins, inputs = (
+                tuple(map(str, file.attrs[key])) for key in ("names", "labels", "begins", "inputs")
+            )
+            r = len(names)
+            times = read_array(file, "times", (r, None))
+            observed = read_array(file, "observed", (r, times.shape[1], len(labels) or None, 3))
+            m = observed.shape[2]
+            shapes = {
+                "bound": (m, 3),
+                "smoothed": observed.shape,
+                "velocity": observed.shape,
+                "initial": (r, 2, None, 3),
+            }
+            optional: dict[str, Any] = {
+                name: read_array(file, name, shape) if name in file else None for name, shape in shapes.items()
+            }
+            return cls(
+                names,
+                labels,
+                begins,
+                times,
+                observed,
+                held=read_array(file, "held", (r, m, 3)) if "held" in file else observed[:, 0],
+                payload=read_array(file, "payload", (r,)) if "payload" in file else np.zeros(r),
+                gravity=np.asarray(file.attrs["gravity"], dtype=np.float64),
+                time_step=float(file.attrs["time_step"]),
+                base=read_array(file, "base", (r, None, 6)) if "base" in file else None,
+                inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
+                resting={n: read_array(file, f"{n}_resting", (r, None)) for n in inputs if f"{n}_resting" in file},
+                channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
+                sessions=tuple(map(str, file.attrs.get("sessions", ()))),
+                obstacles={
+                    str(name): read_array(file, f"obstacles/{name}", (r, None, 6))
+                    for name in file.attrs.get("obstacles", ())
+                },
+                **optional,
+            )
 
     def joined(self, other: "Trials") -> "Trials":
-        """Returns these trials followed by others, with the same number of frames and the same kinds of inputs."""
-        times, observed, held = (
-            torch.cat([getattr(t, n) for t in (self, other)]) for n in ("times", "observed", "held")
+        """Returns these trials followed by others of the same body with the same number of frames."""
+        arrays = {
+            name: None if getattr(self, name) is None else np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in ("times", "observed", "held", "payload", "initial", "smoothed", "velocity", "base")
+        }
+        inputs, obstacles = (
+            {name: np.concatenate([values, theirs[name]]) for name, values in own.items()}
+            for own, theirs in ((self.inputs, other.inputs), (self.obstacles, other.obstacles))
         )
-        inputs, resting = self.inputs.joined(other.inputs), self.resting.joined(other.resting)
-        return Trials(self.names + other.names, times, observed, held, inputs, resting, self.session)
+        resting = {
+            name: np.concatenate(
+                [own.resting.get(name, np.zeros_like(own.inputs[name][:, 0])) for own in (self, other)]
+            )
+            for name in {**self.resting, **other.resting}
+        }
+        words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
+        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting, "obstacles": obstacles}
+        return replace(self, **changed)
 
-    def to(self, like: torch.Tensor) -> "Trials":
-        """Returns the trials on the device and in the precision of a tensor."""
-        fields = (self.times.to(like), self.observed.to(like), self.held.to(like))
-        return Trials(self.names, *fields, self.inputs.to(like), self.resting.to(like), self.session)
+    def rows(self, names: Sequence[str]) -> list[int]:
+        """Indices of trials."""
+        return [self.names.index(name) for name in names]
+
+    def _during(self, name: str, rows: Sequence[int], time_step: float) -> FloatArray:
+        """(K', R, ...) an input resampled to a time step, by its values at the middle of each; (R, ...) if constant."""
+        values = self.inputs[name][rows]
+        if values.ndim == (3 if name in ("external_force", "fixed_positions") else 2):
+            return values
+        count = round(values.shape[1] * self.time_step / time_step)
+        at = ((np.arange(count) + 0.5) * time_step / self.time_step).astype(np.int64)
+        resampled: FloatArray = values[:, np.minimum(at, values.shape[1] - 1)].swapaxes(0, 1).copy()
+        return resampled
+
+    def base_at(self, names: Sequence[str], time_step: float) -> torch.Tensor | None:
+        """(K + 1, R, 6) motion of the base in trials, resampled to another time step; None if the base stands still."""
+        return None if self.base is None else torch.from_numpy(self._poses_at(self.base, names, time_step))
+
+    def _poses_at(self, poses: FloatArray, names: Sequence[str], time_step: float) -> FloatArray:
+        """(K' + 1, R', 6) poses (R, K + 1, 6) of some trials, resampled to another time step."""
+        times = self.time_step * np.arange(poses.shape[1])
+        new = time_step * np.arange(round(times[-1] / time_step) + 1)
+        return np.stack([at_times(poses[row], times, new) for row in self.rows(names)], axis=1)
+
+    def contact_at(self, names: Sequence[str], body: Body, time_step: float) -> dict[str, FloatArray]:
+        """(K + 1, R, O) inputs of a body's contact in trials by name, those that move an obstacle in any trial."""
+        if not self.obstacles:
+            return {}
+        acting = [name for name, values in contact_inputs(body, self.obstacles).items() if values.any()]
+        poses = {name: self._poses_at(own, names, time_step) for name, own in self.obstacles.items()}
+        inputs = contact_inputs(body, poses)
+        return {name: inputs[name] for name in acting}
+
+    def acting(
+        self, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float
+    ) -> tuple[Inputs, Inputs]:
+        """Returns what acts on trials that begin in the same way, in float64 on the CPU.
+
+        Args:
+            names: names of the trials.
+            body: body that carries the payloads.
+            payload_at: see `payload_inputs`.
+            time_step: time step of the simulation [s].
+
+        Returns:
+            The inputs during each step, and those before time zero.
+
+        Raises:
+            InputError: see `payload_inputs`.
+        """
+        rows = self.rows(names)
+        static = self.begins[rows[0]] == STATIC
+        given = {key: torch.from_numpy(self._during(key, rows, time_step)) for key in self.inputs}
+        if any(self.payload):
+            hung = payload_inputs(body, payload_at, self.payload[rows])
+            given |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
+        if static:
+            return Inputs(**given), Inputs(**{key: given[key][-1] for key in self.inputs})  # under the last values
+        moved = self.contact_at(names, body, time_step)
+        given |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
+        if (poses := self.base_at(names, time_step)) is not None:
+            fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
+            given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
+        before = self.resting if self.begins[rows[0]] == UNDER_INPUTS else {}
+        return Inputs(**given), Inputs(**{key: torch.from_numpy(values[rows]) for key, values in before.items()})
+
+
+def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArray) -> dict[str, FloatArray]:
+    """Converts payloads to arguments of `Inputs` [kg].
+
+    On a body with strings the result is (R, 1) `energies.strings.PAYLOAD`; otherwise it is an (R, N) ``attached_mass``,
+    in equal shares on the vertices that carry the payload.
+
+    Args:
+        body: body that carries the payloads.
+        payload_at: place of the carrying vertices; None if there is never a payload.
+        loads: (R,) payloads [kg].
+
+    Raises:
+        InputError: a payload without a place, or a place with fixed vertices only.
+        MeshError: no vertex lies at the place.
+    """
+    if any(isinstance(energy, Strings) for energy in body.energies):
+        return {PAYLOAD.name: loads[:, None].copy()}
+    masses = np.zeros((len(loads), body.n_vertices))
+    if not np.any(loads):
+        return {"attached_mass": masses}
+    if payload_at is None:
+        raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
+    carrying = select_vertices(body.mesh, **payload_at.arguments())
+    if np.isin(carrying, body.fixed_vertices).all():
+        raise InputError("data.payload_at selects fixed vertices only: hang the payload on vertices that can move.")
+    masses[:, carrying] = loads[:, None] / len(carrying)
+    return {"attached_mass": masses}

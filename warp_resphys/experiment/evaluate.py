@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..data.dataset import STATIC, Dataset
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
+from ..data.trials import STATIC, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import ConvergenceError, InputError
@@ -207,7 +207,7 @@ def _by_horizon(settings: StageSettings, test: Mapping[str, FloatArray], observe
 
 
 def _by_phase(
-    dataset: Dataset, names: Sequence[str], test: Mapping[str, FloatArray], observed: FloatArray
+    dataset: Trials, names: Sequence[str], test: Mapping[str, FloatArray], observed: FloatArray
 ) -> dict[str, Any]:
     """Entry ``phases``: errors by phase of the inputs and model; empty without inputs."""
     at = phases_of(dataset, names)

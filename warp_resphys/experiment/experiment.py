@@ -9,9 +9,9 @@ from typing import Any, Final
 import torch
 from numpy.typing import NDArray
 
-from ..data.dataset import Dataset, read_dataset
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import WHOLE_STATE, Observation
+from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
 from ..io.files import read_array, read_hdf5, read_json
@@ -63,12 +63,12 @@ class Experiment:
     on_failure: str = "raise"
 
     @cached_property
-    def dataset(self) -> Dataset:
-        """Dataset of the trials, including trials with scaled inputs if the stage tests them."""
+    def dataset(self) -> Trials:
+        """All trials, including those with scaled inputs if the stage tests them."""
         shared = self.folder / self.settings.shared
-        dataset = read_dataset(shared / DATASET)
+        dataset = Trials.read(shared / DATASET)
         if len(self.settings.groups) > 1:
-            dataset = dataset.joined(read_dataset(shared / SCALED_DATASET))
+            dataset = dataset.joined(Trials.read(shared / SCALED_DATASET))
         return dataset
 
     @cached_property

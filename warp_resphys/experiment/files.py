@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.dataset import STATIC, Dataset
+from ..data.trials import STATIC, Trials
 from ..io.arrays import FloatArray
 from ..io.files import read_json
 from ..learning.intervals import time_since_change
@@ -64,7 +64,7 @@ def read_if_there(path: Path) -> dict[str, Any]:
     return content
 
 
-def driving(dataset: Dataset, names: Sequence[str]) -> dict[str, FloatArray]:
+def driving(dataset: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
     """Returns what acts during each frame, (R, T, C) by input, base and obstacle; a pose has the last values."""
     rows = dataset.rows(names)
     series = {name: values[rows] for name, values in dataset.inputs.items()}
@@ -79,7 +79,7 @@ def driving(dataset: Dataset, names: Sequence[str]) -> dict[str, FloatArray]:
     }
 
 
-def since_change(dataset: Dataset, names: Sequence[str]) -> FloatArray:
+def since_change(dataset: Trials, names: Sequence[str]) -> FloatArray:
     """Returns the times (R, T) since the last change of the inputs [s], see `learning.intervals.time_since_change`."""
     rows = dataset.rows(names)
     acting = [np.moveaxis(values, 0, 1) for values in driving(dataset, names).values()]
@@ -88,13 +88,13 @@ def since_change(dataset: Dataset, names: Sequence[str]) -> FloatArray:
     return since
 
 
-def first_change(dataset: Dataset, name: str) -> float:
+def first_change(dataset: Trials, name: str) -> float:
     """Returns the time at which the inputs of a trial begin to change by more than noise [s]; zero if none does."""
     changes = np.flatnonzero(since_change(dataset, [name])[0] == 0.0)  # The first frame counts as one.
     return float(dataset.times[dataset.rows([name])[0], changes[1]]) if len(changes) > 1 else 0.0
 
 
-def phases_of(dataset: Dataset, names: Sequence[str]) -> NDArray[np.str_]:
+def phases_of(dataset: Trials, names: Sequence[str]) -> NDArray[np.str_]:
     """Returns the phases (R, T) of driven trials, see `learning.metrics.phases`; empty words for others and for poses.
 
     The size of the inputs is their norm, each kind over its largest value.

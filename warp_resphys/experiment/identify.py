@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..data.dataset import RESTING
 from ..data.rigid_bodies import corners_of, independent
+from ..data.trials import RESTING
 from ..io.errors import ConvergenceError
 from ..io.files import resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress

@@ -15,12 +15,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..data.base_motion import in_frame, rigid
-from ..data.dataset import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..data.input_response import draw_inputs, wave_inputs
 from ..data.recordings.recording import ARM, Recording
 from ..data.recordings.recording_files import write_recording
 from ..data.registration import RigidTransform, unit_vector
 from ..data.rigid_bodies import as_markers, corners_of, with_axes
+from ..data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.fan_out import ALONE, Workers

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..data.dataset import Dataset, read_dataset
 from ..data.rigid_bodies import as_markers
+from ..data.trials import Trials
 from ..io.arrays import FloatArray
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
@@ -115,7 +115,7 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
         dataset: path of the dataset.
         folders: folders of the folds, by the trial that a fold leaves out.
     """
-    data, names, models = read_dataset(dataset), list(folders), dict[str, Any]()
+    data, names, models = Trials.read(dataset), list(folders), dict[str, Any]()
     if data.bound is None or len(names) < 3:
         return {}
     for model in (*BASELINES, *INTERVAL_MODELS):
@@ -139,7 +139,7 @@ def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, 
 
 
 def half_widths_of(
-    dataset: Dataset,
+    dataset: Trials,
     names: Sequence[str],
     errors: Mapping[str, Any],
     simulated: Mapping[str, FloatArray],
@@ -163,14 +163,14 @@ def half_widths_of(
     }
 
 
-def _rest(dataset: Dataset) -> FloatArray:
+def _rest(dataset: Trials) -> FloatArray:
     """(M, 3) markers on the undeformed body [m]; a rigid body is one."""
     assert dataset.bound is not None
     return as_markers(dataset.bound, dataset.labels)
 
 
 def _predicted(
-    dataset: Dataset,
+    dataset: Trials,
     names: Sequence[str],
     simulated: Sequence[FloatArray] | FloatArray,
     observed: FloatArray,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..data.dataset import STATIC, Dataset, read_dataset
 from ..data.obstacle_surface import ObstacleSurface
 from ..data.rigid_bodies import as_markers, owners
+from ..data.trials import STATIC, Trials
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.bodies import Body
@@ -73,7 +73,7 @@ def make_report(context: StageContext) -> None:
     law = {} if run.law is None else read_if_there(folder / LAW_FILE)
     film, driven = read_film(folder, run, mesh), read_driven(folder, run)
     channels = () if driven is None else driven.channels
-    dataset = read_dataset(common_folder(folder) / DATASET)
+    dataset = Trials.read(common_folder(folder) / DATASET)
     moved = dataset.contact_at(trials.names, body, dataset.time_step)  # (K + 1, R, O) inputs, by name
     assert run.tip is not None
     names = {name for model in identification.values() for name in model.get("parameters", {})}
@@ -204,7 +204,7 @@ def read_trials(folder: Path, run: RunSettings) -> TrialResults:
         DataFileError: a file is missing or damaged, or the dataset and the roll-outs do not belong together.
     """
     path = common_folder(folder) / DATASET
-    dataset = read_dataset(path)
+    dataset = Trials.read(path)
     bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
     with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
         rolled = tuple(map(str, file.attrs["names"]))
@@ -268,10 +268,10 @@ def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | 
     return {"stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained}, "outside": outside}
 
 
-def _read_scaled(folder: Path) -> Dataset | None:
-    """Dataset of the trials with scaled inputs, if there are any."""
+def _read_scaled(folder: Path) -> Trials | None:
+    """Trials with scaled inputs, if there are any."""
     path = common_folder(folder) / SCALED_DATASET
-    return read_dataset(path) if path.is_file() else None
+    return Trials.read(path) if path.is_file() else None
 
 
 def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
@@ -284,7 +284,7 @@ def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
         shape = (len(steps), None, 3)
         bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
         trial, times = str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps
-    dataset = read_dataset(common_folder(folder) / DATASET)
+    dataset = Trials.read(common_folder(folder) / DATASET)
     if dataset.bound is not None and run.markers is not None:
         view = marker_view_of(run.markers, dataset.labels, dataset.sets)
         if view.own:
@@ -313,7 +313,7 @@ def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
 
 def read_driven(folder: Path, run: RunSettings) -> Driven | None:
     """Driving inputs of all trials of a split; None without actuators."""
-    dataset, scaled = read_dataset(common_folder(folder) / DATASET), _read_scaled(folder)
+    dataset, scaled = Trials.read(common_folder(folder) / DATASET), _read_scaled(folder)
     quantity = driving_quantity(run)
     if quantity is None or quantity.name not in dataset.inputs:
         return None

@@ -20,8 +20,8 @@ import torch
 from numpy.typing import NDArray
 
 from ..data.base_motion import check_steps, contact_inputs, prescribed, prescribed_all, rigid
-from ..data.dataset import GIVEN, Dataset
 from ..data.markers import WHOLE_STATE, MarkerMap, Observation
+from ..data.trials import GIVEN, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
@@ -140,7 +140,7 @@ def simulate(context: StageContext) -> None:
     parts, part = Parts.of(context), TrialPart("part_000", names, frames, partial(_free_motion, settings, names))
     parts.run([part])
     observed = parts.read(part, "observed")
-    Dataset(
+    Trials(
         names,
         labels=(),
         begins=(GIVEN,) * len(names),

@@ -7,12 +7,12 @@ from typing import Final
 import numpy as np
 import torch
 
-from ..data.dataset import GIVEN, RESTING, Dataset
-from ..data.trials import Trials
+from ..data.trials import GIVEN, RESTING, Trials
 from ..io.arrays import BoolArray, FloatArray
 from ..learning.baselines import BASELINES, REST, PlainTrials, at_rest, predictions
 from ..learning.observed_motions import at_steps
 from ..learning.release import least_delays
+from ..learning.trial_batch import TrialBatch
 from ..stepping.rollout import sample
 from .experiment import Experiment
 from .files import driving
@@ -74,7 +74,7 @@ def without_physics(
     return {model: values[model] for model in whole}, {model: settings[model] for model in whole}, missing
 
 
-def _at_steps(dataset: Dataset, learned: Sequence[str], asked: Sequence[str]) -> Dataset:
+def _at_steps(dataset: Trials, learned: Sequence[str], asked: Sequence[str]) -> Trials:
     """A dataset with the observations of some trials at the time steps, as far as these and others last."""
     rows, step = dataset.rows(learned), dataset.time_step
     last = float(dataset.times[[*rows, *dataset.rows(asked)]].max())
@@ -82,7 +82,7 @@ def _at_steps(dataset: Dataset, learned: Sequence[str], asked: Sequence[str]) ->
     observed = np.full((len(dataset.names), len(times), *dataset.observed.shape[2:]), np.nan)
     if rows:
         own_times, seen, held = (torch.from_numpy(x[rows]) for x in (dataset.times, dataset.observed, dataset.held))
-        positions = at_steps(Trials(tuple(learned), own_times, seen, held), step)
+        positions = at_steps(TrialBatch(tuple(learned), own_times, seen, held), step)
         observed[rows, : positions.shape[1]] = positions
     return replace(dataset, times=np.broadcast_to(times, (len(dataset.names), len(times))), observed=observed)
 
@@ -122,7 +122,7 @@ def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> It
 
 
 def _motions(
-    experiment: Experiment, dataset: Dataset, learned: Sequence[str], asked: Sequence[str]
+    experiment: Experiment, dataset: Trials, learned: Sequence[str], asked: Sequence[str]
 ) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
     made = list[PlainTrials]()

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ..data.dataset import GIVEN, Dataset
+from ..data.trials import GIVEN, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError
@@ -248,7 +248,7 @@ class TrialRollout:
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
-def first_frame(dataset: Dataset, names: Sequence[str]) -> int:
+def first_frame(dataset: Trials, names: Sequence[str]) -> int:
     """First frame that counts in errors: 1 if the roll-out starts from the given state, else 0."""
     return int(dataset.begin_of(names[0]) == GIVEN)
 

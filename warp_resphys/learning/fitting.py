@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ..data.dataset import STATIC
+from ..data.trials import STATIC
 from ..dynamics.modes import RestStiffness
 from ..dynamics.simulator import Simulator
 from ..io.progress import Progress

@@ -18,7 +18,6 @@ import torch
 from typing_extensions import override
 
 from ..data.markers import Markers
-from ..data.trials import Trials
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.state import State
@@ -27,6 +26,7 @@ from .nuisance import NuisanceFit, Nuisances
 from .parameters import Bounds, check_names, split_name
 from .placement import Accuracy, DisplacedMarkers
 from .replay import Replay, Start, exact
+from .trial_batch import TrialBatch
 from .uncertainty import LinearMisfit, LinearSystem, LinearTrial, Uncertainty, left_out, uncertainty_of
 
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
@@ -96,7 +96,7 @@ class Misfit(BoundedMisfit):
         self._moves = _moves_of(self.bounds)
         self.forget()
 
-    def _prepared(self, replay: Replay, start: Start, trials: Trials) -> tuple[Replay, Start]:
+    def _prepared(self, replay: Replay, start: Start, trials: TrialBatch) -> tuple[Replay, Start]:
         """The replay with this simulator and, where marker places are uncertain, with displaced markers."""
         if self._accuracy is None:
             return Replay(self.simulator, replay.observe, trials), start
@@ -175,7 +175,7 @@ class Misfit(BoundedMisfit):
         return LinearSystem(trials, nuisances, self.prior_rows(unit), self.prior_weight)
 
     def _slopes(
-        self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: Trials
+        self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: TrialBatch
     ) -> FloatArray:
         """(R, D, P) derivatives, from changes (E, R, D) of trials by `_moves_of` parameters, by steps (P,) of these."""
         slopes, owners = np.zeros((*change.shape[1:], len(steps))), self._owners(trials)
@@ -185,7 +185,7 @@ class Misfit(BoundedMisfit):
                 slopes[mine, :, column] = own[mine] / steps[column]
         return slopes
 
-    def _owners(self, trials: Trials) -> FloatArray:
+    def _owners(self, trials: TrialBatch) -> FloatArray:
         """(S, R, P) one where a motion of `_moves_of` changes a parameter of a trial, else zero."""
         owners = np.zeros((len(self._moves), len(trials.names), len(self.bounds)))
         names = [split_name(name)[1] for name in self.bounds]

@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..data.dataset import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Dataset
 from ..data.input_response import InputResponse, with_means
 from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
-from ..data.trials import Trials
+from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
 from ..dynamics.frames import BaseFrame, base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
@@ -28,6 +27,7 @@ from .parameters import split_name
 from .placement import PlacedMarkers, placement_of
 from .release import begin_inputs, estimate_release
 from .replay import Replay, Start, later
+from .trial_batch import TrialBatch
 
 _STANDS_STILL = 1e-9  # m/s, rad/s
 
@@ -69,7 +69,7 @@ class ObservedMotions:
         train_fraction: share of every trial, from its beginning, that is learned from.
     """
 
-    dataset: Dataset
+    dataset: Trials
     observe: Observation = WHOLE_STATE
     release: ReleaseSettings = field(default_factory=ReleaseSettings)
     payload_at: PlaceSettings | None = None
@@ -113,7 +113,7 @@ class ObservedMotions:
             raise InputError(f"{observed.shape[2]} points were observed, but the body has {len(like)} vertices.")
         points = _array(observed.transpose(0, 1))
         acting, before = ((own or Inputs()).fitted(simulator.counts, like, count) for own in (inputs, resting))
-        trials = Dataset(
+        trials = Trials(
             names=tuple(f"motion {number}" for number in range(count)),
             labels=(),
             begins=(UNDER_INPUTS if start is None else GIVEN,) * count,
@@ -129,10 +129,10 @@ class ObservedMotions:
         )
         return cls(trials, observation.to(like), **more)
 
-    def trials(self, names: Sequence[str], simulator: Simulator) -> Trials:
+    def trials(self, names: Sequence[str], simulator: Simulator) -> TrialBatch:
         """Trials that begin in the same way, on the device of a simulator, with inputs at its steps."""
-        trials = self.dataset.trials(names, simulator.body, self.payload_at, simulator.time_step)
-        return trials.to(simulator.rest_positions)
+        batch = TrialBatch.of(self.dataset, names, simulator.body, self.payload_at, simulator.time_step)
+        return batch.to(simulator.rest_positions)
 
     def replay(self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None) -> Replay:
         """Replay of trials of one batch of the dataset, with the markers where they were identified."""
@@ -266,7 +266,7 @@ class ObservedMotions:
         return torch.cat([*(values.expand(len(at), -1, -1) for values in constant), *series], -1)
 
 
-def at_steps(trials: Trials, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
+def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
     """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
 
     Interpolates with cubic splines through the frames in which a marker was seen, starting from the held position at

@@ -15,7 +15,6 @@ import torch
 
 from ..data.input_response import InputResponse, response_of
 from ..data.markers import Observation
-from ..data.trials import Trials
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError, InputError
@@ -24,6 +23,7 @@ from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .correction import equilibrium_under_feedback
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
+from .trial_batch import TrialBatch
 
 log = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ class Replay:
             ``pressure_slope_1``.
     """
 
-    def __init__(self, simulator: Simulator, observe: Observation, trials: Trials) -> None:
+    def __init__(self, simulator: Simulator, observe: Observation, trials: TrialBatch) -> None:
         self.simulator, self.observe, self.trials = simulator, observe, trials
         self.parameter_names = identifiable_parameters(simulator)
         self._shaped = tuple(name for name, q in simulator.parameters.items() if q.shape and name != "gravity")

@@ -24,12 +24,12 @@ import torch
 
 from ..data.camera import jacobians
 from ..data.markers import WHOLE_STATE
-from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import IntArray
 from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
 from ..learning.replay import Replay, Start
+from ..learning.trial_batch import TrialBatch
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample
 
@@ -97,7 +97,7 @@ class ReleasedForce:
         held = simulator.tensor(np.zeros((len(values), len(near), 3)))
         held[:, self.vertices] = (simulator.tensor(self.force) + simulator.tensor(added))[:, None] / len(self.vertices)
         seconds = simulator.tensor([[max(last - self.at(values[0]), 0.0)]])
-        trials = Trials(("",), seconds, held.new_zeros(1, 1, 1, 1), held.new_zeros(1, 1, 1))
+        trials = TrialBatch(("",), seconds, held.new_zeros(1, 1, 1, 1), held.new_zeros(1, 1, 1))
         replay = Replay(simulator, WHOLE_STATE, trials)
         constants = replay.prepare(parameters)[0]
         state = simulator.static_equilibrium(Inputs(held), constants, start=near.to(held).expand_as(held))

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.base_motion import LARGEST_STEP
-from ..data.dataset import payload_inputs
 from ..data.input_response import InputResponse, response_of, with_means
+from ..data.trials import payload_inputs
 from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy

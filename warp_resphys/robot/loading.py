@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..data.dataset import STATIC
 from ..data.rigid_bodies import as_markers
+from ..data.trials import STATIC
 from ..dynamics.trajectory import Motion
 from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device

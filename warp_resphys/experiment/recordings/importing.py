@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from ...data.base_motion import at_times, check_steps
-from ...data.dataset import RESTING, SLACK, UNDER_INPUTS, Dataset, read_dataset
 from ...data.input_response import NO_INPUT
 from ...data.recordings.marker_quality import quality
 from ...data.recordings.processing import smooth
 from ...data.registration import root_mean_square, unit_vector
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
+from ...data.trials import RESTING, SLACK, UNDER_INPUTS, Trials
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, number_of
 from ...io.files import write_json
@@ -72,7 +72,7 @@ def import_scaled(context: StageContext) -> None:
     Raises:
         DataFileError: a recording cannot be read or used.
     """
-    recorded, dataset = RegisteredTrials(context), read_dataset(context.run_dir / DATASET)
+    recorded, dataset = RegisteredTrials(context), Trials.read(context.run_dir / DATASET)
     assert dataset.bound is not None
     shifts = _shifts(recorded, dataset.bound, _offsets(recorded))
     _dataset(recorded, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
@@ -226,7 +226,7 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, gravity: FloatArray) -> Dataset:
+def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, gravity: FloatArray) -> Trials:
     """Makes the dataset in the frame of the body; trials that end early are padded."""
     trials, settings = recorded.trials, recorded.settings
     begins = ["released" if trial.is_released else trial.begins for trial in trials]
@@ -252,7 +252,7 @@ def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, 
         for name in dict.fromkeys(name for own in recorded.moving for name in own.obstacles)
     }
     sessions = tuple(trial.session or "" for trial in trials)
-    return Dataset(
+    return Trials(
         names=tuple(trial.name for trial in trials),
         labels=tuple(recorded.tracked),
         begins=tuple(begins),

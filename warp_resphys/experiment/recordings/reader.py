@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ...data.dataset import STATIC, payload_inputs
 from ...data.marker_names import assign
 from ...data.marker_view import MarkerView
 from ...data.recordings.processing import obstacle_motion
@@ -15,6 +14,7 @@ from ...data.recordings.recording import Recording
 from ...data.recordings.recording_files import read_recording
 from ...data.registration import axes_rotation, unit_vector
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
+from ...data.trials import STATIC, payload_inputs
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed
 from ...io.stages import StageContext

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...data.dataset import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ...data.input_response import draw_inputs
 from ...data.markers import follow_vertices
 from ...data.registration import axes_rotation
 from ...data.rigid_bodies import owners
+from ...data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ...fem.bodies import Body
 from ...io.errors import InputError, listed, naming, number_of
 from ...mesh.selection import select_vertices

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from ...data.base_motion import followed, in_frame, prescribed, prescribed_all, rigid
-from ...data.dataset import SLACK, STATIC, UNDER_INPUTS
 from ...data.input_response import NO_INPUT, check_inputs
 from ...data.recordings.marker_quality import check_base, check_motion
 from ...data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release, valve_opening
 from ...data.recordings.recording import Recording
 from ...data.registration import Registration, register_markers
 from ...data.rigid_bodies import corners_of, owners
+from ...data.trials import SLACK, STATIC, UNDER_INPUTS
 from ...io.arrays import BoolArray, FloatArray
 from ...io.errors import DataFileError, listed
 from ...io.stages import StageContext

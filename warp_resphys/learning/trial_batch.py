@@ -1,0 +1,104 @@
+"""Batches of trials, as a replay simulates them: the inputs of a body at its steps, and the observation of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import torch
+
+from ..data.trials import STATIC, Trials
+from ..fem.bodies import Body
+from ..io.errors import InputError
+from ..settings.mesh import PlaceSettings
+from ..stepping.inputs import Inputs
+
+
+@dataclass(frozen=True)
+class TrialBatch:
+    """R trials of one body with the same observed points, in the frame of the body.
+
+    The observation is a map of the positions, such as markers or all vertices. A static pose is a trial of one frame.
+    """
+
+    names: tuple[str, ...]
+    times: torch.Tensor  # (R, T) of the frames [s]; trials that end early repeat their last time
+    observed: torch.Tensor  # (R, T, M, D) [unit of the observation], NaN where a point was not seen and after the end
+    held: torch.Tensor  # (R, M, D) observed points before time zero [unit]
+    # of the R environments; inputs that change over time have a value for each step of the simulation
+    inputs: Inputs = field(default_factory=Inputs)
+    # before time zero, for trials that begin at rest; weights are the same as in `inputs`
+    resting: Inputs = field(default_factory=Inputs)
+    session: str = ""  # in which all of them were recorded, if there are several
+
+    @classmethod
+    def of(
+        cls, trials: Trials, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float
+    ) -> Self:
+        """Returns trials that begin in the same way and are of one session, in float64 on the CPU; see `Trials.acting`.
+
+        Raises:
+            InputError: see `data.trials.payload_inputs`.
+        """
+        rows = trials.rows(names)
+        frames = 1 if trials.begins[rows[0]] == STATIC else None
+        times, observed = (torch.from_numpy(x[rows][:, :frames]) for x in (trials.times, trials.observed))
+        inputs, resting = trials.acting(names, body, payload_at, time_step)
+        held, session = torch.from_numpy(trials.held[rows]), trials.session(names[0])
+        return cls(tuple(names), times, observed, held, inputs, resting, session)
+
+    def __post_init__(self) -> None:
+        """Checks that the shapes agree.
+
+        Raises:
+            InputError: they do not agree, or no point of a trial was seen.
+        """
+        r, t, m, d = self.observed.shape
+        batches = [v.shape[i] for inputs in (self.inputs, self.resting) for v, i in inputs.axes().values()]
+        if self.times.shape != (r, t) or self.held.shape != (r, m, d) or set(batches) - {r}:
+            raise InputError("the times, the held points and the inputs do not belong to the same trials.")
+        for name, seen in zip(self.names, self.seen, strict=True):
+            if not bool(seen.any()):
+                raise InputError(f"no marker of the trial {name!r} was seen: leave it out.")
+
+    @property
+    def seen(self) -> torch.Tensor:
+        """Whether a point was seen, (R, T, M) bool."""
+        return torch.isfinite(self.observed).all(-1)
+
+    @property
+    def amplitude(self) -> torch.Tensor:
+        """Root mean square distance of the observed points from the held ones, (R,) [m]."""
+        square = (self.observed - self.held[:, None]).square().sum(-1)
+        return square.nanmean((1, 2)).sqrt()
+
+    @property
+    def loss_weight(self) -> torch.Tensor:
+        """Weights (R,) of sums of squares that give the mean over trials of the mean square over squared amplitude."""
+        return 1.0 / (self.seen.sum((1, 2)) * self.amplitude**2 * len(self.names))
+
+    def select(self, indices: list[int]) -> "TrialBatch":
+        """Returns the trials with these indices."""
+        pick = torch.as_tensor(indices, device=self.times.device)
+        fields = (self.times[pick], self.observed[pick], self.held[pick])
+        names = tuple(self.names[i] for i in indices)
+        return TrialBatch(names, *fields, self.inputs.select(pick), self.resting.select(pick), self.session)
+
+    def first(self, seconds: float) -> "TrialBatch":
+        """Returns the trials with the frames after a time [s] left out or marked as not seen."""
+        inside = self.times <= seconds + 1e-9
+        last = int(inside.any(0).sum())
+        observed = torch.where(inside[..., None, None], self.observed, torch.nan)
+        return replace(self, times=self.times[:, :last], observed=observed[:, :last])
+
+    def joined(self, other: "TrialBatch") -> "TrialBatch":
+        """Returns these trials followed by others, with the same number of frames and the same kinds of inputs."""
+        times, observed, held = (
+            torch.cat([getattr(t, n) for t in (self, other)]) for n in ("times", "observed", "held")
+        )
+        inputs, resting = self.inputs.joined(other.inputs), self.resting.joined(other.resting)
+        return TrialBatch(self.names + other.names, times, observed, held, inputs, resting, self.session)
+
+    def to(self, like: torch.Tensor) -> "TrialBatch":
+        """Returns the trials on the device and in the precision of a tensor."""
+        fields = (self.times.to(like), self.observed.to(like), self.held.to(like))
+        return TrialBatch(self.names, *fields, self.inputs.to(like), self.resting.to(like), self.session)

@@ -1,41 +1,41 @@
 """Differentiable soft-body simulation on NVIDIA Warp, with learned residual physics.
 
-Public names are imported when they are first used, so that importing the package is fast. `__init__.pyi` lists them.
+The public names are in `names`, of which the first use imports all, so that importing the package is fast; further ones
+are in `mesh`, `energies`, `learning` and `pictures`.
 """
 
-import importlib
 import importlib.util
-import re
-import sys
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
-from .io.imports import uncollected
+from .io.imports import collector_paused
 
 # In a copy of the repository without an editable installation, kernels/ and conf/ are next to this folder.
 if importlib.util.find_spec(f"{__name__}.kernels") is None:
     __path__.append(str(Path(__file__).parents[1]))
 
-# The module of each public name, read from the stub for type checkers, which has one name per line.
-_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-_MODULES = {name: module for module, name in re.findall(r"^from \.([\w.]+) import \w+ as (\w+)$", _STUB, re.MULTILINE)}
-
-__all__ = sorted(_MODULES)
+_PARTS: Final = ("energies", "learning", "mesh", "pictures")
 
 
-def __getattr__(name: str) -> Any:
+def _public(name: str) -> Any:
+    """Returns a public name, `__all__` or `__version__`."""
     if name == "__version__":
         return _version()
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if (module := f"{__name__}.{_MODULES[name]}") not in sys.modules:
-        with uncollected():
-            importlib.import_module(module)
-    return getattr(sys.modules[module], name)
+    if name in _PARTS:
+        return import_module(f"{__name__}.{name}")
+    if name == "__all__" or name[:1] != "_":
+        with collector_paused():
+            public = {key: value for key, value in vars(import_module(f"{__name__}.names")).items() if key[:1] != "_"}
+        if name == "__all__":
+            return [*public]
+        if name in public:
+            return public[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*_public("__all__"), *_PARTS, "__version__"]
 
 
 def _version() -> str:
@@ -46,3 +46,15 @@ def _version() -> str:
         return version("warp-resphys")
     except PackageNotFoundError:
         return "0+unknown"
+
+
+if TYPE_CHECKING:
+    from . import energies as energies
+    from . import learning as learning
+    from . import mesh as mesh
+    from . import pictures as pictures
+    from .names import *  # noqa: F403
+
+    __version__: str
+else:
+    __getattr__ = _public

@@ -8,7 +8,7 @@ import sys
 from . import __version__
 from .commands import COMMANDS, USER_ERROR, ends_where_nobody_reads, help_text, parse
 from .io.errors import InputError
-from .io.imports import uncollected
+from .io.imports import collector_paused
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
             raise SystemExit(USER_ERROR) from None
         # Read when NumPy is imported. Its threads cost more than they save where others use the cores as well.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        with uncollected():
+        with collector_paused():
             from .launch import launch
 
         launch(command, COMMANDS[command].function, arguments)

@@ -30,7 +30,7 @@ from yaml import MarkedYAMLError
 from .commands import CONFIG_PACKAGE, OWN_OPTIONS, USER_ERROR, configuration, ends_where_nobody_reads, quote, run_label
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
-from .io.imports import uncollected
+from .io.imports import collector_paused
 from .io.settings import Settings, parse
 from .option_files import names_are_texts, run_schema
 from .overrides import LateOverride, readable
@@ -148,7 +148,7 @@ def _one_sentence_each() -> Iterator[None]:
 def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
     """The function of a command, and the class of its settings."""
     module, _, function = name.partition(":")
-    with uncollected():
+    with collector_paused():
         run = getattr(import_module(f"{__package__}.{module}"), function)
     settings, *_ = get_type_hints(run).values()
     return run, settings

@@ -18,8 +18,6 @@ from sphinx.domains.python import PyAttribute, PyProperty
 from sphinx.pycode import ModuleAnalyzer
 from sphinx.util.typing import stringify_annotation
 
-import warp_resphys
-
 _DTYPES = (Any, np.float64, np.float32, np.int64, np.int32, np.uint8, np.bool_, np.complex128)
 _ALIASES = {NDArray[dtype]: f"NDArray[{getattr(dtype, '__name__', dtype)}]" for dtype in _DTYPES} | {
     ArrayLike: "ArrayLike"
@@ -96,9 +94,9 @@ def hide_numbered_fields(
 def public_first(app: Sphinx) -> None:
     """Puts the public names of a module before its other names, in the order of the index."""
     index = Path(app.srcdir, "api", "index.md").read_text(encoding="utf-8")
-    names = re.findall(r"\{py:obj\}`(\w+) <", index)
-    for place, name in enumerate(names):
-        analyzer = ModuleAnalyzer.for_module(f"warp_resphys.{warp_resphys._MODULES[name]}")
+    names = re.findall(r"<(warp_resphys\.[\w.]+)\.(\w+)>`", index)
+    for place, (module, name) in enumerate(names):
+        analyzer = ModuleAnalyzer.for_module(module)
         analyzer.analyze()
         if name in analyzer.tagorder:
             analyzer.tagorder[name] = place - len(names)

@@ -23,7 +23,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Mesh, Muscle, Muscles, Simulator, box_hexahedra
+from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Mesh, Muscles, Simulator, box_hexahedra
+from warp_resphys.energies import Muscle
 
 wp.config.log_level = wp.LOG_WARNING
 

@@ -68,7 +68,7 @@ bodies = {
     "thin beam": (wr.box_hexahedra((0.1, 0.02, 0.02), (10, 2, 2)), {"x": 0.0}),
     "tapered finger": (wr.rod([[0, 0, 0], [0.12, 0, 0]], [[0.0, 0.014], [0.12, 0.007]], layers=6), {"x": 0.0}),
 }
-truth = wr.MooneyRivlin(30e3, 14e3, 20e6, density=1070.0, stiffness_damping=5e-4, prony=[(0.3, 0.08)])
+truth = wr.energies.MooneyRivlin(30e3, 14e3, 20e6, density=1070.0, stiffness_damping=5e-4, prony=[(0.3, 0.08)])
 robots = {model: wr.load("runs/beam", model=model) for model in ("simulation", "sysid", "law")}
 
 
@@ -87,7 +87,7 @@ for name, (mesh, fixed) in bodies.items():
         motions[name][model] = swing(there.simulator, there.constants)
     errors = {m: 1e3 * np.linalg.norm(q - motions[name]["true"], axis=-1).mean() for m, q in motions[name].items()}
     removed[name] = 100.0 * (1.0 - errors["law"] / errors["simulation"])
-    beyond = wr.share_outside_law("runs/beam/law.json", mesh, motions[name]["law"])
+    beyond = wr.energies.share_outside_law("runs/beam/law.json", mesh, motions[name]["law"])
     print(
         f"{name:15s} uncorrected {errors['simulation']:6.3f} mm, SysID {errors['sysid']:6.3f} mm, "
         f"law {errors['law']:8.2g} mm: {removed[name]:.3f} % removed, extrapolates in {100.0 * beyond:.1f} % of cells"

@@ -22,18 +22,8 @@ import scipy.optimize
 import torch
 import warp as wp
 
-from warp_resphys import (
-    ArmGeometry,
-    Body,
-    Corotated,
-    Fibres,
-    Inputs,
-    Pressure,
-    Simulator,
-    find_chambers,
-    mesh_arm,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, select_vertices
+from warp_resphys.mesh import ArmGeometry, find_chambers, mesh_arm
 
 wp.config.log_level = wp.LOG_WARNING
 

@@ -8,18 +8,8 @@ import pytest
 import torch
 
 from support.slopes import check_slopes
-from warp_resphys import (
-    Body,
-    ConvexMaterial,
-    Corotated,
-    Gent,
-    Inputs,
-    Simulator,
-    SolverSettings,
-    State,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys.energies import ConvexMaterial, Gent
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.integrators import INTEGRATORS

@@ -7,19 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Box,
-    Contact,
-    InputError,
-    Inputs,
-    Simulator,
-    Sphere,
-    Tendons,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Contact, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
 from warp_resphys.data.obstacle_surface import ObstacleSurface
+from warp_resphys.energies import Box, Sphere
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys import Body, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys.energies import MooneyRivlin
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
 from warp_resphys.io.errors import InputError

@@ -24,7 +24,7 @@ def written(folder, **changes):
 
 def test_the_material_of_a_run_has_its_constants_without_the_damping_of_the_robot(tmp_path):
     material = wr.read_material(written(tmp_path))
-    assert isinstance(material, wr.ConvexMaterial)
+    assert isinstance(material, wr.energies.ConvexMaterial)
     assert material.constants["c10"] == 40e3
     assert material.constants["density"] == 1100.0
     assert material.constants["prony_time_1"] == 0.1
@@ -78,9 +78,9 @@ def test_cells_that_are_stretched_further_than_in_the_recordings_are_counted(tmp
     half = mesh.vertices.copy()
     half[:, 0] += np.clip(half[:, 0] - 0.1, 0.0, None)  # The second of two cells is twice as long.
     states = np.stack([mesh.vertices, half])
-    assert wr.share_outside_law("dragon_skin_10", mesh, states) == 0.25
-    assert wr.share_outside_law(written(tmp_path, stretches=[0.5, 2.1]), mesh, states) == 0.0
+    assert wr.energies.share_outside_law("dragon_skin_10", mesh, states) == 0.25
+    assert wr.energies.share_outside_law(written(tmp_path, stretches=[0.5, 2.1]), mesh, states) == 0.0
     with pytest.raises(wr.DataFileError, match=r"law\.json has no stretches: identify the law again"):
-        wr.share_outside_law(written(tmp_path), mesh, states)
+        wr.energies.share_outside_law(written(tmp_path), mesh, states)
     with pytest.raises(wr.InputError, match="no finite state"):
-        wr.share_outside_law("dragon_skin_10", mesh, np.full_like(states, np.nan))
+        wr.energies.share_outside_law("dragon_skin_10", mesh, np.full_like(states, np.nan))

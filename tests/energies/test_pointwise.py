@@ -8,17 +8,8 @@ import pytest
 import torch
 import warp as wp
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Muscle,
-    Muscles,
-    Simulator,
-    SolverSettings,
-    box_hexahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Inputs, Muscles, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys.energies import Muscle
 from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.quantity import Quantity

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Gent, MooneyRivlin, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys import Body, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys.energies import Gent, MooneyRivlin
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import check_gradients
 

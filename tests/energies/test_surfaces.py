@@ -12,7 +12,6 @@ from support.slopes import check_slopes
 from warp_resphys import (
     Body,
     Corotated,
-    FrictionPair,
     Inputs,
     Mesh,
     Rigid,
@@ -26,6 +25,7 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.energies import FrictionPair
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.environments.making import ball_mesh

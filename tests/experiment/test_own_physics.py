@@ -174,7 +174,7 @@ class Wide(nn.Linear):
 MODULE = """
 import numpy as np
 from torch import nn
-from warp_resphys import Energy
+from warp_resphys.energies import Energy
 class Unfinished(Energy):
     pass
 class Arrays(nn.Module):

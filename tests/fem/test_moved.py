@@ -10,17 +10,17 @@ from warp_resphys import (
     Corotated,
     Fibres,
     Inputs,
-    Muscle,
     Muscles,
     Pressure,
     Simulator,
     SymmetryPlane,
     Tendons,
     box_hexahedra,
-    find_chambers,
     select_vertices,
 )
+from warp_resphys.energies import Muscle
 from warp_resphys.io.errors import InputError
+from warp_resphys.mesh import find_chambers
 
 ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 SHIFT = np.array([0.1, -0.2, 0.05])  # m

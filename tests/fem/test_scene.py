@@ -12,11 +12,11 @@ from warp_resphys import (
     Rigid,
     Simulator,
     StableNeoHookean,
-    Strings,
     box_hexahedra,
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.energies import Strings
 from warp_resphys.fem.scene import Scene
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.volume_mesh import join

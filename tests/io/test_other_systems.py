@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from warp_resphys.io import atomic, fan_out, machine
-from warp_resphys.io.imports import uncollected
+from warp_resphys.io.imports import collector_paused
 from warp_resphys.io.machine import available_cores, commit, hardware
 
 REPOSITORY = Path(__file__).parents[2]
@@ -92,7 +92,7 @@ def test_the_commit_is_that_of_the_repository():
 @pytest.mark.parametrize("error", [None, ImportError])
 def test_nothing_is_collected_meanwhile_and_what_was_made_is_not_searched(error):
     gc.unfreeze()
-    with pytest.raises(error) if error else uncollected(), uncollected():
+    with pytest.raises(error) if error else collector_paused(), collector_paused():
         assert not gc.isenabled()
         made = [[] for _ in range(10)]
         if error:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, make_material, select_vertices
+from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys.energies import make_material
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.law import KnownMotion, NormalEquations, WeakForm, _constants, fit_classes
 

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import pyvista
 
-from warp_resphys import ResphysWarning, box_hexahedra, box_tetrahedra, read_mesh, read_surfaces
+from warp_resphys import ResphysWarning, box_hexahedra, box_tetrahedra, read_mesh
 from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh import read_surfaces
 from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.mesh.readers import read_vertices

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from warp_resphys import Mesh, box_hexahedra, box_tetrahedra, read_mesh, read_surfaces, write_mesh
+from warp_resphys import Mesh, box_hexahedra, box_tetrahedra, read_mesh
 from warp_resphys.io.errors import MeshError
+from warp_resphys.mesh import read_surfaces, write_mesh
 from warp_resphys.mesh.volume_mesh import boundary_faces
 
 

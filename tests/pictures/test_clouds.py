@@ -154,7 +154,7 @@ def test_a_turned_scan_with_outliers(beam):
     own = with_cloud(pose, Cloud(turn.apply(points) + shift))
     ranges = {**MODULUS, **bounds_of(*PLACES, prior=Prior(0.0, 0.1))}
     first = {**dict.fromkeys(ranges, 0.0), "youngs_modulus": 3e5}
-    result = wr.ParameterSearch(PictureMisfit([own], ranges)).run([first], 40)
+    result = wr.learning.ParameterSearch(PictureMisfit([own], ranges)).run([first], 40)
     deviation = result.uncertainty.deviation["youngs_modulus"]
     assert deviation < 0.15 * TRUTH["youngs_modulus"]
     assert abs(result.parameters["youngs_modulus"] - TRUTH["youngs_modulus"]) < 3.0 * deviation

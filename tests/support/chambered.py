@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, find_chambers, select_vertices
+from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys.mesh import find_chambers
 from warp_resphys.mesh.volume_mesh import quadratic
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)

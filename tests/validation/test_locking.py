@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, find_chambers
+from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings
+from warp_resphys.mesh import find_chambers
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
 from warp_resphys.mesh.volume_mesh import quadratic
 

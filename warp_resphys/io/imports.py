@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def collector_paused() -> Iterator[None]:
     """Spares the garbage collector the objects of modules that are imported meanwhile."""
     gc.disable()
     try:

@@ -1,5 +1,11 @@
-"""Identification of parameters, reconstruction of residual forces, and networks that predict these forces.
+"""Identification of parameters, reconstruction of residual forces, and networks that predict these forces."""
 
-Entry points: `library` (functions without configuration and run folders), `identification.ParameterSearch`,
-`reconstruction.make_reconstructor`, `networks.build_model`, `correction.CorrectedSimulator`.
-"""
+from .evaluation import evaluate as evaluate
+from .fitting import fit_force as fit_force
+from .identification import Identification as Identification
+from .identification import ParameterSearch as ParameterSearch
+from .library import identify as identify
+from .observed_motions import ObservedMotions as ObservedMotions
+from .parameters import Bounds as Bounds
+from .parameters import Prior as Prior
+from .reconstruction import reconstruct as reconstruct

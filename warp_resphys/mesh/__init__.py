@@ -1,4 +1,8 @@
-"""Rest shapes: meshes, readers, mesh quality, surfaces, chambers, and parametric pneumatic arms.
+"""Rest shapes: meshes, readers, mesh quality, surfaces, chambers, and parametric pneumatic arms."""
 
-Public: `volume_mesh.Mesh`, `boxes`, `readers.read_mesh`, `chambers.find_chambers`, `arm.mesh_arm`.
-"""
+from .arm import ArmGeometry as ArmGeometry
+from .arm import mesh_arm as mesh_arm
+from .chambers import find_chambers as find_chambers
+from .readers import read_surfaces as read_surfaces
+from .readers import write_mesh as write_mesh
+from .tetrahedra import fill_surface as fill_surface

@@ -1,7 +1,5 @@
-# The public names of the package. Type checkers read this file; `__init__.py` imports a name when it is first used.
-from .data.camera import CameraMarkers as CameraMarkers
-from .data.camera import Lens as Lens
-from .data.camera import PlacedCamera as PlacedCamera
+"""The public names of the package, which `warp_resphys` imports when one of them is first used."""
+
 from .data.markers import Markers as Markers
 from .data.markers import Observation as Observation
 from .data.markers import bind_markers as bind_markers
@@ -10,33 +8,15 @@ from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator
 from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Motion as Motion
-from .energies.base import Energy as Energy
-from .energies.catalogue import make_material as make_material
 from .energies.catalogue import read_material as read_material
-from .energies.catalogue import share_outside_law as share_outside_law
 from .energies.contact import Contact as Contact
 from .energies.fibres import Fibres as Fibres
-from .energies.materials import ConvexMaterial as ConvexMaterial
 from .energies.materials import Corotated as Corotated
-from .energies.materials import DensityMaterial as DensityMaterial
-from .energies.materials import FibreFamily as FibreFamily
-from .energies.materials import Gent as Gent
-from .energies.materials import Material as Material
-from .energies.materials import MooneyRivlin as MooneyRivlin
 from .energies.materials import StableNeoHookean as StableNeoHookean
-from .energies.medium import Medium as Medium
-from .energies.muscles import Muscle as Muscle
 from .energies.muscles import Muscles as Muscles
-from .energies.obstacles import Box as Box
-from .energies.obstacles import Capsule as Capsule
 from .energies.obstacles import Cylinder as Cylinder
-from .energies.obstacles import DistanceGrid as DistanceGrid
 from .energies.obstacles import HalfSpace as HalfSpace
-from .energies.obstacles import Sphere as Sphere
-from .energies.pointwise import PointwiseEnergy as PointwiseEnergy
 from .energies.pressure import Pressure as Pressure
-from .energies.strings import Strings as Strings
-from .energies.surfaces import FrictionPair as FrictionPair
 from .energies.surfaces import SurfaceContact as SurfaceContact
 from .energies.tendons import Tendons as Tendons
 from .fem.bodies import Body as Body
@@ -53,43 +33,21 @@ from .io.errors import ResphysError as ResphysError
 from .io.errors import ResphysWarning as ResphysWarning
 from .learning.evaluation import evaluate as evaluate
 from .learning.fitting import fit_force as fit_force
-from .learning.identification import Identification as Identification
-from .learning.identification import ParameterSearch as ParameterSearch
 from .learning.library import identify as identify
 from .learning.observed_motions import ObservedMotions as ObservedMotions
-from .learning.parameters import Bounds as Bounds
-from .learning.parameters import Prior as Prior
 from .learning.reconstruction import reconstruct as reconstruct
-from .mesh.arm import ArmGeometry as ArmGeometry
-from .mesh.arm import mesh_arm as mesh_arm
 from .mesh.boxes import box_hexahedra as box_hexahedra
 from .mesh.boxes import box_tetrahedra as box_tetrahedra
-from .mesh.chambers import find_chambers as find_chambers
 from .mesh.readers import read_mesh as read_mesh
-from .mesh.readers import read_surfaces as read_surfaces
-from .mesh.readers import write_mesh as write_mesh
 from .mesh.rod import rod as rod
 from .mesh.selection import select_vertices as select_vertices
-from .mesh.tetrahedra import fill_surface as fill_surface
 from .mesh.volume_mesh import Mesh as Mesh
 from .mesh.volume_mesh import quadratic as quadratic
-from .pictures.clouds import Cloud as Cloud
-from .pictures.outlines import ClosedSurface as ClosedSurface
-from .pictures.outlines import Outline as Outline
-from .pictures.picture_misfit import PictureMisfit as PictureMisfit
-from .pictures.released_force import ReleasedForce as ReleasedForce
-from .pictures.scene_files import read_scan as read_scan
-from .pictures.seen import Photo as Photo
-from .pictures.seen import SeenPose as SeenPose
 from .robot.loading import load as load
 from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names
 from .robot.robot import Robot as Robot
 from .robot.robot_scene import RobotScene as RobotScene
 from .stepping.inputs import Inputs as Inputs
-from .stepping.quantity import Quantity as Quantity
 from .stepping.state import State as State
 from .twin.twin import Twin as Twin
-
-__all__: list[str]
-__version__: str

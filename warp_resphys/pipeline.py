@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
-from .control.files import BASELINES, plan_table, plans_file, reduced_file
-from .control.stages import drive, fit_baselines, plan_motions, reduce_robot
+from .control.control_files import BASELINES, plan_table, plans_file, reduced_file
+from .control.control_stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
 from .energies.catalogue import law_path
 from .experiment.ablation import ablation_stages, print_ablation

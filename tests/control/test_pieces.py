@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.control.baselines import fit_linear
 from warp_resphys.control.controllers import JacobianFeedback
+from warp_resphys.control.linear_model import fit_linear
 from warp_resphys.control.plan import Planner, solve_program, tracked_of
 from warp_resphys.control.polynomials import Polynomial, powers
 from warp_resphys.control.reduced_force import Evaluator

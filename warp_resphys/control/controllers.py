@@ -13,10 +13,10 @@ import scipy.linalg
 
 from ..io.arrays import FloatArray
 from ..settings.control import LimitsOfInputs
-from .baselines import DELAYS, LinearModel
+from .linear_model import DELAYS, LinearModel
 from .plan import Planner
 from .polynomials import Monomials
-from .reduced import ReducedModel
+from .reduced_model import ReducedModel
 
 _SETTLES = 0.1  # gain per step of the disturbance observer of the linear model
 _AVERAGED = 0.25  # window of the means of points and inputs, which averages vibrations out [s]

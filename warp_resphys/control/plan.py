@@ -19,10 +19,10 @@ from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.robot import Robot
 from ..settings.control import LimitsOfInputs
-from .baselines import LinearModel
-from .files import PlannedMotion
+from .control_files import PlannedMotion
+from .linear_model import LinearModel
 from .polynomials import around
-from .reduced import ReducedModel
+from .reduced_model import ReducedModel
 from .sampling import OnProgress
 
 _TOLERANCE: Final = 1e-5  # of a quadratic program

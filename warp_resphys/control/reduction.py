@@ -21,10 +21,10 @@ from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..stepping.state import State
-from .files import read_reduced, reduced_file, write_reduced
+from .control_files import read_reduced, reduced_file, write_reduced
 from .polynomials import Polynomial, SquaredPolynomial, best_order, solve_ridge
-from .reduced import ReducedModel, ReducedState
 from .reduced_force import ReducedForce
+from .reduced_model import ReducedModel, ReducedState
 from .sampling import Motions, OnProgress, Source, Tangent, check_reducible, driven_input
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from ..energies.viscosity import relaxation
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..learning.correction import Learned
-from ..robot.commands import RobotInput
+from ..robot.actuation import RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..settings.trials import SequenceSettings

@@ -14,10 +14,10 @@ from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.robot import Robot
 from ..settings.control import FigureSettings
-from .baselines import LinearModel
+from .linear_model import LinearModel
 from .plan import Planner, tracked_of
 from .polynomials import around
-from .reduced import ReducedModel
+from .reduced_model import ReducedModel
 from .sampling import driven_input
 
 _POINTS = 40  # number of points of a path whose reach is checked

@@ -26,7 +26,7 @@ from ..robot.robot import Robot
 from ..settings.stages import StageSettings
 from ..settings.trials import MarkerSettings
 from ..stepping.state import State
-from .reduced import ReducedModel
+from .reduced_model import ReducedModel
 
 _FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
 _LEAST: Final = 1e-3  # lower bound of drawn positive parameters, relative to the identified value

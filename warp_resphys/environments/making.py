@@ -24,7 +24,7 @@ from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.boxes import box_hexahedra
 from ..mesh.volume_mesh import Mesh, boundary_triangles
-from ..robot.commands import BASE
+from ..robot.actuation import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene

@@ -18,7 +18,7 @@ from ..experiment.experiment import Experiment
 from ..io.errors import DataFileError, InputError, listed
 from ..learning.parameters import own_name
 from ..stepping.state import State
-from .commands import BASE
+from .actuation import BASE
 from .description import Description, describe, finished_experiment
 from .robot import Robot
 

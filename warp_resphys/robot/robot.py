@@ -31,7 +31,7 @@ from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import rollout
 from ..stepping.state import State
-from .commands import Acting, Commands, Given, InputReader, inputs_of
+from .actuation import Acting, Commands, Given, InputReader, inputs_of
 from .description import Description
 
 SUFFIX: Final = ".safetensors"

@@ -19,7 +19,7 @@ from ..io.errors import InputError
 from ..learning.parameters import constants_of
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .commands import Given
+from .actuation import Given
 from .robot import Robot
 
 _OWNER: Final = "robot_{}"  # of memory variables of a robot, by its name

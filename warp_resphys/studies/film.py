@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..control.stages import driven_settings, replay
+from ..control.control_stages import driven_settings, replay
 from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact import MOTION
 from ..experiment.files import METRICS, OPEN

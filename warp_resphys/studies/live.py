@@ -13,7 +13,7 @@ from ..experiment.build import bound_markers, marker_view_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..mesh.volume_mesh import surface_vertices
-from ..robot.commands import BASE
+from ..robot.actuation import BASE
 from ..robot.loading import RecordedTrial, recorded_trial
 from ..robot.robot import Robot
 from ..stepping.quantity import Quantity

@@ -26,7 +26,7 @@ from ..io.settings import Count, Positive, Settings, Word, setting
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from ..report.layers import MEASURED, OBSTACLE, sharp_edges
 from ..report.wording import TONES
-from ..robot.commands import BASE
+from ..robot.actuation import BASE
 from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
 from .live import LiveRobot, range_of
 from .live_twin import LiveTwin, TwinSettings

@@ -20,7 +20,7 @@ import numpy as np
 from ..control.controllers import conditioned
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
-from ..robot.commands import Given
+from ..robot.actuation import Given
 from ..robot.robot import Robot
 from ..stepping.state import State
 

@@ -16,7 +16,7 @@ import torch
 
 from ..energies.materials import VISCOUS
 from ..io.arrays import FloatArray, IntArray
-from ..robot.commands import FORCE, Given, InputReader
+from ..robot.actuation import FORCE, Given, InputReader
 from ..robot.robot import Robot
 from ..stepping.integrators import make_integrator
 from ..stepping.state import State

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..robot.commands import Given, InputReader
+from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
 from ..stepping.state import State
 from .estimator import Belief, Correction, TwinEstimator
-from .full import FullEstimator
-from .reduced import ReducedEstimator
+from .full_estimator import FullEstimator
+from .reduced_estimator import ReducedEstimator
 from .stream import REMEMBERED, Disagreement, Faults, Forecast, Scores, mean_mm, position_of
 
 Engine = Callable[[Robot, Mapping[str, Given], Mapping[str, float], float], TwinEstimator[Any]]

@@ -23,9 +23,7 @@ from ..report.motions import DrivenBodies
 from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stages import StageSettings
-from .baselines import fit_linear
-from .controllers import Controller, JacobianFeedback, LinearRecedingHorizon, RecedingHorizon
-from .files import (
+from .control_files import (
     BASELINES,
     PLANNED,
     PLAYED,
@@ -42,6 +40,8 @@ from .files import (
     write_motions,
     write_reduced,
 )
+from .controllers import Controller, JacobianFeedback, LinearRecedingHorizon, RecedingHorizon
+from .linear_model import fit_linear
 from .plan import follow, tracked_of
 from .reduction import reduce
 from .sampling import check_plannable, driven_input

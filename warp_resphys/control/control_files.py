@@ -13,10 +13,10 @@ from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from ..learning.correction import Learned
-from .baselines import LinearModel
+from .linear_model import LinearModel
 from .polynomials import Polynomial, SquaredPolynomial
-from .reduced import ReducedModel
 from .reduced_force import ReducedForce
+from .reduced_model import ReducedModel
 
 BASELINES: Final = "baselines.safetensors"
 _REDUCED: Final = "reduced model"

@@ -8,12 +8,12 @@ import torch
 from typing_extensions import override
 
 from ..control.polynomials import Monomials
-from ..control.reduced import ReducedState
+from ..control.reduced_model import ReducedState
 from ..control.reduction import reduced_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.correction import DIVERGENCE_DISTANCE
-from ..robot.commands import Given, InputReader
+from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
 from ..stepping.state import State
 from .estimator import Belief, TwinEstimator

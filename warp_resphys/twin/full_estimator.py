@@ -21,7 +21,7 @@ from ..energies.surfaces import SurfaceContact
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError, listed
 from ..learning.parameters import check_names, identifiable_parameters
-from ..robot.commands import Given
+from ..robot.actuation import Given
 from ..robot.robot import Robot
 from ..stepping.quantity import Quantity
 from ..stepping.state import State

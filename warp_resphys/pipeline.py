@@ -24,7 +24,7 @@ from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.duration import announcement
-from .experiment.evaluate import check_mesh, evaluate, time_models
+from .experiment.evaluate import evaluate
 from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.files import (
     CONTROL,
@@ -53,12 +53,14 @@ from .experiment.identify import identify
 from .experiment.identify_law import identify_law
 from .experiment.laboratory import run_laboratory
 from .experiment.learn import train
+from .experiment.mesh_check import check_mesh
 from .experiment.prediction_intervals import intervals_of_folds
 from .experiment.reconstruct import reconstruct
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
+from .experiment.timing import time_models
 from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest
 from .io.errors import DataFileError

@@ -17,7 +17,6 @@ from warp_resphys import pipeline
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learn
-from warp_resphys.experiment.evaluate import summary
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.errors import ResphysError
@@ -26,8 +25,9 @@ from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
 from warp_resphys.learning import fitting
 from warp_resphys.learning.correction import force_frames
-from warp_resphys.settings.stages import LEARNING, NETWORKS, StageSettings
-from warp_resphys.settings.trials import Split
+from warp_resphys.learning.error_tables import TestedModels
+from warp_resphys.learning.observed_motions import ObservedMotions
+from warp_resphys.settings.stages import StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED)
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
@@ -258,22 +258,17 @@ def test_the_configuration_of_recordings_with_pressures_is_accepted(tmp_path):
         assert (chosen["method"], chosen["regularisation"]) == ("lbfgsb", 1e-4)  # a method is taken as a whole
 
 
-def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported(tmp_path):
+def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
     observed = np.zeros((2, 5, 1, 3))
     good, lost = observed + np.array([3e-3, 0.0, 4e-3]), observed.copy()
     lost[1, 3:] = np.nan
     left = {"resphys": np.array([-1, 3])}
-    run = settings("experiment=sopra", "data.horizons=[0.02,0.04]")
-    split = Split(train=(), validation=(), test=("a", "b"))
-    keys = ("published", "correct_uncorrected", "data.horizons")
-    stage = StageSettings.reading(run, *LEARNING, *NETWORKS, *keys, split=split, shared=".", groups={"1": split.test})
-    experiment = Experiment(stage, tmp_path)
     about = (np.tile(0.01 * np.arange(5), (2, 1)), observed, observed[:, 0], np.zeros(2), np.zeros(3), 0.01)
     pressed = {"pressure": np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 0.0, 0.0]])[..., None]}
     more = {"bound": np.zeros((1, 3)), "inputs": pressed}
-    experiment.__dict__["dataset"] = Trials(("a", "b"), ("m",), ("rest", "rest"), *about, **more)
+    motions = ObservedMotions(Trials(("a", "b"), ("m",), ("rest", "rest"), *about, **more))
     markers = {"sysid": good, "resphys": lost}
-    results = summary(StageContext("evaluate", tmp_path, "", stage), experiment, {"1": ("a", "b")}, markers, left)
+    results = TestedModels(motions, (), {"1": ("a", "b")}, markers, left, horizons=(0.02, 0.04)).errors()
     assert results["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert results["errors_mm"]["resphys"]["diverged"] == 1
     assert results["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}

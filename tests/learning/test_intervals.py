@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from warp_resphys.learning.intervals import Intervals, Predicted, coverage, time_since_change
+from warp_resphys.data.driving import time_since_change
+from warp_resphys.learning.intervals import Intervals, Predicted, coverage
 
 REST = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from warp_resphys.learning.intervals import time_since_change
+from warp_resphys.data.driving import time_since_change
 from warp_resphys.learning.metrics import (
     errors_per_marker,
     marker_errors,

@@ -19,8 +19,8 @@ from ..io.stages import Stage
 from ..learning.reconstruction import make_reconstructor
 from ..report.wording import duration_text
 from ..settings.stages import StageSettings
-from .evaluate import CHECKED_SECONDS
 from .experiment import MODELS, SIMFREE, Experiment
+from .mesh_check import CHECKED_SECONDS
 from .trials import evenly
 
 _LEAST_SECONDS = 60.0  # of the estimates that are shown

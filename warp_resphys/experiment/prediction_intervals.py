@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from ..data.driving import since_change
 from ..data.rigid_bodies import as_markers
 from ..data.trials import Trials
 from ..io.arrays import FloatArray
 from ..io.files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
+from ..learning.error_tables import counted
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage
+from ..learning.without_physics import without_physics
 from .experiment import SIMFREE, Experiment
-from .files import ROLLOUTS, since_change
+from .files import ROLLOUTS
 from .sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
-from .without_physics import without_physics
 
 Linear = Mapping[str, Mapping[str, Sensitivity]]  # derivatives by model and trial
 
@@ -55,7 +57,7 @@ def remaining(
     experiment: Experiment, names: Sequence[str], linear: Linear, simulated: Mapping[str, FloatArray]
 ) -> dict[str, Any]:
     """Entry ``free_fits`` of errors.json, see `free_fits`, by model; empty if nothing could be fitted."""
-    observed = dict(zip(names, counted(experiment, names), strict=True))
+    observed = dict(zip(names, counted(experiment.motions, experiment.settings.split.train, names), strict=True))
     fits = {
         model: free_fits(experiment, observed, dict(zip(names, simulated[model][: len(names)], strict=True)), own)
         for model, own in linear.items()
@@ -77,12 +79,12 @@ def intervals_of(
     """
     settings, dataset = experiment.settings, experiment.dataset
     test, observed = settings.groups["1"], dataset.observed[dataset.rows(names)]
-    target, rest = counted(experiment, test), _rest(dataset)
+    target, rest = counted(experiment.motions, settings.split.train, test), _rest(dataset)
     learned = [row for row, name in enumerate(names) if name in settings.split.train]
     observed[learned, experiment.motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
     linear = linearised(experiment, names, uncertain=True)
     changes = {model: left_out_changes(experiment, model, names, own) for model, own in linear.items()}
-    simulated, *_ = without_physics(experiment, names, left_out=True)
+    simulated, *_ = without_physics(experiment.motions, names, settings.split.train, left_out=True)
     simulated |= {m: x if (change := changes.get(m)) is None else x + change for m, x in calibrating.items()}
     calibrating_spreads = spreads_of(experiment, names, linear, left_out=True)
     models: dict[str, Any] = {}
@@ -97,15 +99,6 @@ def intervals_of(
     without = any(change is not None for change in changes.values())
     split = "left_out" if without else "training" if learned else "validation"
     return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}
-
-
-def counted(experiment: Experiment, names: Sequence[str]) -> FloatArray:
-    """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training."""
-    observed = experiment.dataset.observed[experiment.dataset.rows(names)]
-    for row, name in enumerate(names):
-        if name in experiment.settings.split.train:
-            observed[row, : experiment.motions.learned_steps(observed.shape[1] - 1) + 1] = np.nan
-    return observed
 
 
 def intervals_of_folds(dataset: Path, folders: Mapping[str, Path]) -> dict[str, Any]:

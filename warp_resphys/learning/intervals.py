@@ -23,7 +23,6 @@ from ..io.arrays import BoolArray, FloatArray
 
 LEVEL: Final = 0.9
 TIMES: Final = (0.1, 0.5)  # s after a change of the inputs: between just after, soon after and long after it
-_SAME: Final = 0.02  # change of an input that counts as none, over its largest size
 _QUARTERS: Final = 4  # parts of a single trial
 _LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level to the largest value
 _LEAST: Final = 1e-3  # of the mean variance: part that is always there
@@ -159,29 +158,6 @@ class Intervals:
         with np.errstate(invalid="ignore"):
             inside = (trial.errors <= width[..., None])[seen].mean(-1)
         return inside, width[seen]
-
-
-def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatArray:
-    """Returns the times since the last change of the inputs of B trials [s]; infinite for poses.
-
-    An input changes where it leaves the value that it took at its last change by more than 2 % of its largest size in
-    the trial, so that noise is no change. The first frame counts as one.
-
-    Args:
-        times: (T, B) [s]; a trial of one frame is a pose.
-        inputs: (T, B, C) of each kind; none for bodies that are let go.
-    """
-    if len(times) == 1:
-        return np.full_like(times, np.inf)
-    last = np.broadcast_to(times[0], times.shape).copy()
-    for values in inputs:
-        limit, kept, changed = _SAME * np.abs(values).max(0), values[0].copy(), times[0].copy()
-        for frame in range(1, len(times)):
-            leaves = np.abs(values[frame] - kept) > limit
-            kept = np.where(leaves, values[frame], kept)
-            changed = np.where(leaves.any(-1), times[frame], changed)
-            last[frame] = np.maximum(last[frame], changed)
-    return np.asarray(times - last)
 
 
 def coverage(covered: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, Any]:

@@ -11,8 +11,6 @@ from scipy.special import ndtr, stdtrit
 
 from ..io.errors import InputError
 
-PHASES: Final = ("rise", "hold", "release")  # of driven trials, see `phases`
-_RISE, _NOISE = 0.5, 0.02  # duration of a rise [s]; differences of inputs that are none, over the largest size
 _DRAWS, _TAIL = 10_000, 0.05  # of the bootstrap: samples, and probability outside of its interval at either end
 
 
@@ -242,25 +240,6 @@ def median_filter(values: ArrayLike, time_step: float, window: float = 1.0) -> N
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # Windows of NaN alone.
         return np.asarray(np.nanmedian(windows, axis=-1))
-
-
-def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float = 0.0) -> NDArray[np.str_]:
-    """Returns the phase of each frame of a driven trial: ``rise``, ``hold`` or ``release``; empty before any.
-
-    After its inputs grew, a trial rises for half a second and then holds; after they fell, it is released until they
-    grow again. Differences of up to 2 % of the largest size are noise.
-
-    Args:
-        since: (T,) since the last change of the norm [s], see `intervals.time_since_change`.
-        sizes: (T,) norm of the inputs.
-        before: the norm before the first frame.
-    """
-    changes = np.flatnonzero(since == 0.0)
-    grew = np.diff(sizes[changes], prepend=before)
-    grew[np.abs(grew) <= _NOISE * sizes.max()] = 0.0
-    last = np.searchsorted(changes, np.arange(len(since)), side="right") - 1
-    rests = (last == 0) & (grew[0] == 0.0)
-    return np.select([rests, grew[last] < 0.0, since <= _RISE], ["", "release", "rise"], "hold")
 
 
 def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
+from ..data.driving import time_since_change
 from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.trajectory import Motion
@@ -23,7 +24,6 @@ from ..learning.correction import (
     force_frames,
 )
 from ..learning.evaluation import POSE_STEPS
-from ..learning.intervals import time_since_change
 from ..learning.networks import NextState
 from ..learning.parameters import check_names, constants_of, identifiable_parameters
 from ..mesh.volume_mesh import Mesh

@@ -1,4 +1,4 @@
-"""Predictions without physics of the trials of an experiment."""
+"""Predictions without physics of observed trials."""
 
 from types import SimpleNamespace
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.trials import Trials
-from warp_resphys.experiment.without_physics import without_physics
 from warp_resphys.learning.observed_motions import ObservedMotions
+from warp_resphys.learning.without_physics import without_physics
 from warp_resphys.settings.learning import ReleaseSettings
 
 FRAMES, STEP = 40, 0.01
@@ -36,17 +36,20 @@ def experiment(levels, begins, learned, **changes):
         "inputs": {"pressure": pressure},
     }
     dataset = Trials(**given | changes)
-    settings = SimpleNamespace(split=SimpleNamespace(train=learned), release=ReleaseSettings())
-    return SimpleNamespace(dataset=dataset, settings=settings, motions=ObservedMotions(dataset))
+    return SimpleNamespace(dataset=dataset, train=learned, motions=ObservedMotions(dataset))
+
+
+def predicted(fake, names, **options):
+    return without_physics(fake.motions, names, fake.train, **options)
 
 
 def test_trials_are_predicted_from_training_trials_that_begin_in_the_same_way():
     fake = experiment([1.0, 2.0, 3.0, 1.5, 2.5], ("rest",) * 3 + ("released", "rest"), ["a", "b", "c"])
-    values, _, missing = without_physics(fake, ["e", "d"])  # Nothing was learned of released bodies.
+    values, _, missing = predicted(fake, ["e", "d"])  # Nothing was learned of released bodies.
     assert [*values] == ["rest"]
     assert missing == dict.fromkeys(MODELS[1:], "no other training trial begins like d")
     np.testing.assert_array_equal(values["rest"], np.broadcast_to(fake.dataset.held[[4, 3], None], (2, FRAMES, 2, 3)))
-    values, settings, missing = without_physics(fake, ["e"])
+    values, settings, missing = predicted(fake, ["e"])
     assert (*values,) == (*settings,) == MODELS
     assert not missing
     truth = fake.dataset.observed[[4]]
@@ -60,9 +63,9 @@ def test_the_delay_of_a_trial_is_that_of_its_first_frames_as_for_simulators():
     late = 1.0 - np.exp(-np.maximum(TIMES - 0.013, 0.0) / 0.1)
     fake.dataset.observed[3] = fake.dataset.held[3] + (1.5 * late)[:, None, None] * SHAPE
     fake.dataset.observed[3, 30:] = np.nan
-    before = without_physics(fake, ["e", "d"])[0]["interpolation"]
-    fake.settings.release = ReleaseSettings(delay=0.01, window=0.3, noise=1e-3)
-    after = without_physics(fake, ["e", "d"])[0]["interpolation"]
+    before = predicted(fake, ["e", "d"])[0]["interpolation"]
+    fake.motions = ObservedMotions(fake.dataset, release=ReleaseSettings(delay=0.01, window=0.3, noise=1e-3))
+    after = predicted(fake, ["e", "d"])[0]["interpolation"]
     np.testing.assert_allclose(after[0], before[0], atol=1e-6)
     seen, expected = slice(0, 30), fake.dataset.observed[3, :30]
     assert np.abs(before[1, seen] - expected).max() > 0.1
@@ -74,7 +77,7 @@ def test_nothing_is_learned_from_the_part_of_a_trial_that_is_kept_back():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.motions = ObservedMotions(fake.dataset, train_fraction=(FRAMES // 2 - 1) / (FRAMES - 1))
     fake.dataset.observed[:2, FRAMES // 2 + 1 :] = 1e6
-    values, _, missing = without_physics(fake, ["c"])
+    values, _, missing = predicted(fake, ["c"])
     assert missing == {"regression": "needs three training trials that differ in inputs or loads"}
     assert np.abs(values["linear"]).max() < 10.0
     halfway = values["interpolation"][:, FRAMES // 2 - 1]
@@ -88,7 +91,7 @@ def test_a_pose_is_interpolated_in_its_last_input():
     fake.dataset.inputs["pressure"][:, :-1] = 7.0
     one = {name: getattr(fake.dataset, name)[:, -1:] for name in ("times", "observed")}
     fake = experiment([1.0, 2.0, 1.5], ("static",) * 3, ["a", "b"], inputs=fake.dataset.inputs, **one)
-    values, *_ = without_physics(fake, ["c"])
+    values, *_ = predicted(fake, ["c"])
     np.testing.assert_allclose(values["interpolation"][0], fake.dataset.observed[2], atol=1e-6)
 
 
@@ -104,7 +107,7 @@ def test_released_bodies_come_to_rest_where_the_training_ends_and_are_told_apart
         held=ends + held,
         observed=ends + held[:, None] * decay,
     )
-    values, *_ = without_physics(fake, ["c"])
+    values, *_ = predicted(fake, ["c"])
     np.testing.assert_allclose(values["rest"][0, 0], ends, atol=1e-6)
     np.testing.assert_allclose(values["interpolation"], fake.dataset.observed[2:], atol=1e-3)
 
@@ -116,7 +119,7 @@ def test_released_bodies_are_compared_at_the_same_times_whatever_the_rate_of_the
     held = levels[:, None, None] * SHAPE
     more = {"inputs": {}, "held": held, "observed": waves[..., None, None] * SHAPE, "times": times}
     fake = experiment(levels, ("released",) * 3, ["a", "b"], **more)
-    values, *_ = without_physics(fake, ["c"])
+    values, *_ = predicted(fake, ["c"])
     assert values["interpolation"].shape == (1, FRAMES, 2, 3)
     seen = times[2] <= times[1, -1]  # While both are known; the shape of a motion does not depend on its level.
     np.testing.assert_allclose(values["interpolation"][0, seen], fake.dataset.observed[2, seen], atol=2e-3)
@@ -127,7 +130,7 @@ def test_released_bodies_are_compared_at_the_same_times_whatever_the_rate_of_the
 def test_a_marker_of_other_trials_stays_at_rest():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.dataset.observed[:2, :, 1] = np.nan
-    values, *_ = without_physics(fake, ["c"])
+    values, *_ = predicted(fake, ["c"])
     for model in ("interpolation", "linear"):
         np.testing.assert_allclose(values[model][0, :, 0], fake.dataset.observed[2, :, 0], atol=2e-2)
         np.testing.assert_array_equal(values[model][0, :, 1], values["rest"][0, :, 1])
@@ -136,7 +139,7 @@ def test_a_marker_of_other_trials_stays_at_rest():
 def test_a_training_trial_can_be_predicted_without_itself():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b", "c"])
     fake.dataset.observed[2] += 0.3
-    fitted, left_out = (without_physics(fake, ["c", "a"], left_out=out)[0]["interpolation"] for out in (False, True))
+    fitted, left_out = (predicted(fake, ["c", "a"], left_out=out)[0]["interpolation"] for out in (False, True))
     np.testing.assert_allclose(fitted[0], fake.dataset.observed[2], atol=1e-5)
     np.testing.assert_allclose(left_out[0], fake.dataset.observed[2] - 0.3, atol=1e-5)
 
@@ -147,7 +150,7 @@ def test_a_payload_and_the_motion_of_a_base_are_inputs(driven_by):
     base = np.zeros((4, 2 * FRAMES + 1, 6))
     base[:, :, 0] = levels[:, None]
     more = {"payload": {"payload": 0.05 * levels}, "base": {"base": base}}.get(driven_by, {})
-    values, *_ = without_physics(experiment(levels, ("rest",) * 4, ["a", "b", "c"], inputs={}, **more), ["d"])
+    values, *_ = predicted(experiment(levels, ("rest",) * 4, ["a", "b", "c"], inputs={}, **more), ["d"])
     assert ("regression" in values) == (driven_by is not None)
     if driven_by:
         expected = experiment(levels, ("rest",) * 4, []).dataset.observed[3]

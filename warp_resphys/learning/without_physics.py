@@ -1,4 +1,4 @@
-"""Predictions without physics of the trials of an experiment."""
+"""Predictions without physics of observed trials."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -7,15 +7,14 @@ from typing import Final
 import numpy as np
 import torch
 
+from ..data.driving import driving
 from ..data.trials import GIVEN, RESTING, Trials
 from ..io.arrays import BoolArray, FloatArray
-from ..learning.baselines import BASELINES, REST, PlainTrials, at_rest, predictions
-from ..learning.observed_motions import at_steps
-from ..learning.release import least_delays
-from ..learning.trial_batch import TrialBatch
 from ..stepping.rollout import sample
-from .experiment import Experiment
-from .files import driving
+from .baselines import BASELINES, REST, PlainTrials, at_rest, predictions
+from .observed_motions import ObservedMotions, at_steps
+from .release import least_delays
+from .trial_batch import TrialBatch
 
 _SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest
 
@@ -26,7 +25,7 @@ _LACKING: Final = {  # why a model is missing although trials were learned from
 
 
 def without_physics(
-    experiment: Experiment, names: Sequence[str], *, left_out: bool = False
+    motions: ObservedMotions, names: Sequence[str], train: Sequence[str], *, left_out: bool = False
 ) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
     """Predicts trials with `learning.baselines`, from the training trials that begin in the same way.
 
@@ -35,25 +34,25 @@ def without_physics(
     (`learning.release.begin_inputs`), so do these.
 
     Args:
-        experiment: the experiment.
+        motions: observed motions.
         names: names of the R trials.
+        train: names of the training trials.
         left_out: whether a trial is predicted without itself if it is a training trial.
 
     Returns:
         By model: the observed points (R, T, M, 3) [m], the settings in words, and of models that cannot predict all
         trials, the reason.
     """
-    dataset = experiment.dataset
+    dataset = motions.dataset
     shape = (len(names), *dataset.observed.shape[1:])
     values: dict[str, FloatArray] = {}
     settings: dict[str, str] = {}
     missing: dict[str, str] = {}
-    for batch in _batches(experiment, names, left_out):
-        begins, without = _kind(experiment.dataset.begin_of(batch[0])), batch if left_out else ()
-        train = [name for name in experiment.settings.split.train if name not in without]
-        learned = [name for name in train if _kind(experiment.dataset.begin_of(name)) == begins]
-        shown = _at_steps(dataset, learned, batch) if begins == "released" else dataset
-        trials, asked = _motions(experiment, shown, learned, batch)
+    for batch in _batches(dataset, names, train if left_out else ()):
+        begins, without = _kind(dataset.begin_of(batch[0])), batch if left_out else ()
+        alike = [name for name in train if name not in without and _kind(dataset.begin_of(name)) == begins]
+        shown = _at_steps(dataset, alike, batch) if begins == "released" else dataset
+        trials, asked = _motions(motions, shown, alike, batch)
         trials = trials.select(np.asarray(np.isfinite(trials.values).any((1, 2))))
         made = predictions(trials, asked) if len(trials.values) else {REST: at_rest(asked)}
         rows = [names.index(name) for name in batch]
@@ -63,8 +62,8 @@ def without_physics(
             if begins == "released":
                 times = torch.from_numpy(dataset.times[dataset.rows(batch)])
                 known = sample(torch.from_numpy(known), times, dataset.time_step).numpy()
-            elif begins == RESTING[0] and experiment.settings.release.delay > 0.0:
-                known = _on_time(experiment, batch, known)
+            elif begins == RESTING[0] and motions.release.delay > 0.0:
+                known = _on_time(motions, batch, known)
             values.setdefault(model, np.full(shape, np.nan))[rows] = known
             settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), own.settings))))
         for model in (model for model in BASELINES if model not in made):
@@ -92,9 +91,9 @@ def _kind(begins: str) -> str:
     return RESTING[0] if begins in RESTING else begins
 
 
-def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray) -> FloatArray:
+def _on_time(motions: ObservedMotions, names: Sequence[str], predicted: FloatArray) -> FloatArray:
     """(R, T, M, 3) predicted motions with the delay that the first frames of each trial show [m]."""
-    dataset, settings = experiment.dataset, experiment.settings.release
+    dataset, settings = motions.dataset, motions.release
     rows = dataset.rows(names)
     shown: BoolArray = np.asarray(np.isfinite(predicted).all(axis=(2, 3)))
     last = np.maximum.accumulate(np.where(shown, np.arange(shown.shape[1]), 0), axis=1)  # held after the prediction
@@ -112,17 +111,16 @@ def _on_time(experiment: Experiment, names: Sequence[str], predicted: FloatArray
     return np.where(shown[..., None, None], moved, np.nan)
 
 
-def _batches(experiment: Experiment, names: Sequence[str], left_out: bool) -> Iterator[Sequence[str]]:
-    """Trials that begin in the same way; training trials by themselves if they are left out."""
-    alone = set(experiment.settings.split.train) if left_out else set()
-    for batch in experiment.dataset.batches(names):
+def _batches(dataset: Trials, names: Sequence[str], alone: Sequence[str]) -> Iterator[Sequence[str]]:
+    """Trials that begin in the same way; some by themselves."""
+    for batch in dataset.batches(names):
         yield from ([name] for name in batch if name in alone)
         if others := [name for name in batch if name not in alone]:
             yield others
 
 
 def _motions(
-    experiment: Experiment, dataset: Trials, learned: Sequence[str], asked: Sequence[str]
+    motions: ObservedMotions, dataset: Trials, learned: Sequence[str], asked: Sequence[str]
 ) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
     made = list[PlainTrials]()
@@ -133,11 +131,11 @@ def _motions(
         )
         acting, loads = driving(dataset, names), dataset.payload[rows][:, None]
         if not made:
-            values[:, experiment.motions.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
+            values[:, motions.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
             sizes, load = {name: _size(own) for name, own in acting.items()}, _size(loads)
             ends = np.array([_end(own) for own in values]).reshape(-1, first.shape[1])
             rest = np.array([_mean(column) for column in ends.T])
-        settles = experiment.dataset.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
+        settles = dataset.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
         frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
         origin = np.where(np.isfinite(rest), rest, first) if settles else first
         made.append(PlainTrials(values, origin, first, np.concatenate(frames, 2), loads / load))

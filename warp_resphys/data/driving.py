@@ -1,0 +1,106 @@
+"""What acts on bodies during the trials of a dataset, and the phases of driven trials."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..io.arrays import FloatArray
+from .dataset import STATIC
+
+PHASES: Final = ("rise", "hold", "release")  # of driven trials, see `phases`
+_SAME: Final = 0.02  # change of an input that counts as none, over its largest size
+_RISE: Final = 0.5  # s after inputs grew
+
+
+def time_since_change(times: FloatArray, inputs: Sequence[FloatArray]) -> FloatArray:
+    """Returns the times since the last change of the inputs of B trials [s]; infinite for poses.
+
+    An input changes where it leaves the value that it took at its last change by more than 2 % of its largest size in
+    the trial, so that noise is no change. The first frame counts as one.
+
+    Args:
+        times: (T, B) [s]; a trial of one frame is a pose.
+        inputs: (T, B, C) of each kind; none for bodies that are let go.
+    """
+    if len(times) == 1:
+        return np.full_like(times, np.inf)
+    last = np.broadcast_to(times[0], times.shape).copy()
+    for values in inputs:
+        limit, kept, changed = _SAME * np.abs(values).max(0), values[0].copy(), times[0].copy()
+        for frame in range(1, len(times)):
+            leaves = np.abs(values[frame] - kept) > limit
+            kept = np.where(leaves, values[frame], kept)
+            changed = np.where(leaves.any(-1), times[frame], changed)
+            last[frame] = np.maximum(last[frame], changed)
+    return np.asarray(times - last)
+
+
+def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float = 0.0) -> NDArray[np.str_]:
+    """Returns the phase of each frame of a driven trial: ``rise``, ``hold`` or ``release``; empty before any.
+
+    After its inputs grew, a trial rises for half a second and then holds; after they fell, it is released until they
+    grow again. Differences of up to 2 % of the largest size are noise.
+
+    Args:
+        since: (T,) since the last change of the norm [s], see `time_since_change`.
+        sizes: (T,) norm of the inputs.
+        before: the norm before the first frame.
+    """
+    changes = np.flatnonzero(since == 0.0)
+    grew = np.diff(sizes[changes], prepend=before)
+    grew[np.abs(grew) <= _SAME * sizes.max()] = 0.0
+    last = np.searchsorted(changes, np.arange(len(since)), side="right") - 1
+    rests = (last == 0) & (grew[0] == 0.0)
+    return np.select([rests, grew[last] < 0.0, since <= _RISE], ["", "release", "rise"], "hold")
+
+
+def driving(dataset: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
+    """Returns what acts during each frame, (R, T, C) by input, base and obstacle; a pose has the last values."""
+    rows = dataset.rows(names)
+    series = {name: values[rows] for name, values in dataset.inputs.items()}
+    series |= {} if dataset.base is None else {"base": dataset.base[rows]}
+    series |= {f"obstacle {name}": poses[rows] for name, poses in dataset.obstacles.items()}
+    steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
+    posed = np.array([dataset.begins[row] == STATIC for row in rows], dtype=bool)
+    steps[posed] = np.iinfo(np.int64).max
+    return {
+        name: np.take_along_axis(values, np.minimum(steps, values.shape[1] - 1)[..., None], 1)
+        for name, values in series.items()
+    }
+
+
+def since_change(dataset: Trials, names: Sequence[str]) -> FloatArray:
+    """Returns the times (R, T) since the last change of the inputs [s], see `learning.intervals.time_since_change`."""
+    rows = dataset.rows(names)
+    acting = [np.moveaxis(values, 0, 1) for values in driving(dataset, names).values()]
+    since = time_since_change(dataset.times[rows].T, acting).T
+    since[[dataset.begins[row] == STATIC for row in rows]] = np.inf
+    return since
+
+
+def first_change(dataset: Trials, name: str) -> float:
+    """Returns the time at which the inputs of a trial begin to change by more than noise [s]; zero if none does."""
+    changes = np.flatnonzero(since_change(dataset, [name])[0] == 0.0)  # The first frame counts as one.
+    return float(dataset.times[dataset.rows([name])[0], changes[1]]) if len(changes) > 1 else 0.0
+
+
+def phases_of(dataset: Trials, names: Sequence[str]) -> NDArray[np.str_]:
+    """Returns the phases (R, T) of driven trials, see `learning.metrics.phases`; empty words for others and for poses.
+
+    The size of the inputs is their norm, each kind over its largest value.
+    """
+    rows, acting = dataset.rows(names), driving(dataset, names)
+    largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in dataset.inputs.items()}
+    kinds = {name: acting[name] / size for name, size in largest.items() if size}
+    found = np.full(dataset.times[rows].shape, "", dtype="<U7")
+    if not kinds:
+        return found
+    sizes = np.linalg.norm(np.concatenate([*kinds.values()], 2), axis=2)  # (R, T)
+    since = time_since_change(dataset.times[rows].T, [sizes.T[..., None]]).T
+    for k, row in enumerate(rows):
+        if dataset.begins[row] != STATIC:
+            before = [dataset.resting[name][row] / largest[name] for name in kinds if name in dataset.resting]
+            found[k] = phases(since[k], sizes[k], float(np.linalg.norm(np.concatenate([[0.0], *before]))))
+    return found

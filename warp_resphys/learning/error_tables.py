@@ -1,0 +1,157 @@
+"""Errors of models on tested trials: in tables, by trial, marker, phase, horizon and scale of the inputs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..data.driving import PHASES, phases_of
+from ..data.rigid_bodies import angles, as_markers, corners_of, owners
+from ..data.trials import STATIC, Trials
+from ..io.arrays import FloatArray, IntArray
+from .evaluation import first_frame
+from .metrics import errors_per_marker, marker_errors, summarise, summarise_trajectories
+from .observed_motions import ObservedMotions
+
+
+@dataclass(frozen=True)
+class TestedModels:
+    """Roll-outs of the tested trials by several models; a rigid body counts as one marker.
+
+    Attributes:
+        motions: observed trials.
+        train: names of the trials that were learned from, of which only the rest is tested.
+        groups: names of the R tested trials by input scale; ``1``, the original inputs, is first.
+        simulated: (R, T, M, 3) observed points of the roll-outs by model [m], NaN where a roll-out diverged.
+        left: (R,) steps at which trials left the training range, or -1, by model with a network.
+        reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m]; None without any.
+        horizons: durations of whose errors there is a table [s].
+    """
+
+    motions: ObservedMotions
+    train: Sequence[str]
+    groups: Mapping[str, Sequence[str]]
+    simulated: Mapping[str, FloatArray]
+    left: Mapping[str, IntArray] = field(default_factory=dict)
+    reconstructed: FloatArray | None = None
+    horizons: Sequence[float] = ()
+
+    def errors(self) -> dict[str, Any]:
+        """Returns all tables, as in errors.json."""
+        dataset, names = self.motions.dataset, self.groups["1"]
+        every, count = [name for group in self.groups.values() for name in group], len(names)
+        points = counted(self.motions, self.train, every)
+        observed = as_markers(points, dataset.labels)
+        first = [first_frame(dataset, [name]) for name in every]
+        models = {model: as_markers(values, dataset.labels) for model, values in self.simulated.items()}
+        test = {model: values[:count] for model, values in models.items()}
+        if self.reconstructed is not None:
+            test["reconstruction"] = self.reconstructed
+        errors = {model: _errors(x, observed, first) for model, x in test.items()}
+        sizes = {name: 1e3 * size for name, size in amplitudes(dataset, names).items()}
+        content: dict[str, Any] = {
+            "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
+            "per_trajectory": [
+                {**row, "amplitude_mm": sizes[row["name"]]} for row in summarise_trajectories(tuple(names), errors)
+            ],
+        }
+        if self.reconstructed is not None:
+            against = {m: _errors(x, self.reconstructed, first) for m, x in test.items() if m != "reconstruction"}
+            content["errors_vs_reconstruction_mm"] = {model: summarise(rows) for model, rows in against.items()}
+        if dataset.bound is not None:
+            labels = owners(dataset.labels)
+            seen = observed[:count]
+            content["per_marker"] = {model: errors_per_marker(x, seen, labels) for model, x in test.items()}
+        if bodies := corners_of(dataset.labels):
+            content["orientations_deg"] = {
+                model: {name: _mean_angle(x[:count, :, own], points[:count, :, own]) for name, own in bodies.items()}
+                for model, x in self.simulated.items()
+            }
+        by_time = self._by_horizon(test, observed) | self._by_phase(test, observed)
+        return content | by_time | self._by_scale(models, observed)
+
+    def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
+        """Entry ``horizons``: errors of the first seconds, by duration and model; empty without any."""
+        found = {}
+        for seconds in self.horizons:
+            frames = slice(round(seconds / self.motions.dataset.time_step) + 1)
+            errors = {m: _errors(x[:, frames], observed[:, frames], [0] * len(observed)) for m, x in test.items()}
+            found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
+        return {"horizons": found} if found else {}
+
+    def _by_phase(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
+        """Entry ``phases``: errors by phase of the inputs and model; empty without inputs."""
+        names = self.groups["1"]
+        at, seen = phases_of(self.motions.dataset, names), np.isfinite(observed[: len(names)]).all(-1).any(-1)
+        frames = {phase: (at == phase) & seen for phase in PHASES}
+        found = {
+            phase: {
+                model: summarise(marker_errors(x[k, own], observed[k, own]) for k, own in enumerate(rows) if own.any())
+                for model, x in test.items()
+            }
+            for phase, rows in frames.items()
+            if rows.any()
+        }
+        return {"phases": found} if found else {}
+
+    def _by_scale(self, models: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
+        """Entries of trials that left the training range, and of scaled inputs."""
+        dataset, count, content = self.motions.dataset, len(self.groups["1"]), dict[str, Any]()
+        at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(self.groups)}
+        ranges = {
+            scale: {m: _range(steps[rows], self.groups[scale], dataset.time_step) for m, steps in self.left.items()}
+            for scale, rows in at.items()
+        }
+        if self.left:
+            content["range"] = ranges["1"]
+        if len(self.groups) > 1:
+            first = [first_frame(dataset, [name]) for name in self.groups["1"]]
+            content["scales"] = {
+                scale: {m: summarise(_errors(x[rows], observed[rows], first)) for m, x in models.items()}
+                for scale, rows in at.items()
+            }
+            content |= {"scales_range": ranges} if self.left else {}
+        return content
+
+
+def counted(motions: ObservedMotions, train: Sequence[str], names: Sequence[str]) -> FloatArray:
+    """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training."""
+    observed = motions.dataset.observed[motions.dataset.rows(names)]
+    for row, name in enumerate(names):
+        if name in train:
+            observed[row, : motions.learned_steps(observed.shape[1] - 1) + 1] = np.nan
+    return observed
+
+
+def amplitudes(dataset: Trials, names: Sequence[str]) -> dict[str, float]:
+    """Root mean square displacement of the observed points [m], by trial."""
+    sizes = dict[str, float]()
+    for name, row in zip(names, dataset.rows(names), strict=True):
+        frames = slice(1 if dataset.begin_of(name) == STATIC else None)
+        shown, held = (as_markers(own, dataset.labels) for own in (dataset.observed[row, frames], dataset.held[row]))
+        sizes[name] = float(np.sqrt(np.nanmean(np.square(shown - held).sum(-1))))
+    return sizes
+
+
+def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
+    """Mean over trials of the error of a rigid body's orientation, where seen [degrees]; None if a roll-out diverged.
+
+    Args:
+        simulated: (R, T, 4, 3) its points [m].
+        observed: (R, T, 4, 3) [m], NaN where it was not seen.
+    """
+    seen = np.asarray(np.isfinite(observed).all(axis=(-2, -1)))
+    off = np.degrees(angles(observed, simulated))
+    means = [own[at].mean() for own, at in zip(off, seen, strict=True) if at.any()]
+    return float(np.mean(means)) if means and np.isfinite(means).all() else None
+
+
+def _errors(simulated: FloatArray, observed: FloatArray, first: Sequence[int]) -> list[FloatArray]:
+    trials = zip(simulated, observed, first, strict=False)
+    return [marker_errors(x[start:], y[start:]) for x, y, start in trials]
+
+
+def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
+    gone = {name: float(step * at) for name, at in zip(names, left, strict=True) if at >= 0}
+    return {"left": len(gone), "first_s": gone}

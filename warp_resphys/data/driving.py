@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..io.arrays import FloatArray
-from .dataset import STATIC
+from .trials import STATIC, Trials
 
 PHASES: Final = ("rise", "hold", "release")  # of driven trials, see `phases`
 _SAME: Final = 0.02  # change of an input that counts as none, over its largest size

@@ -72,7 +72,7 @@ def test_a_step_of_newtons_method_gives_the_derivative_of_an_equilibrium(case):
 
 def test_forces_that_follow_the_pose_are_refused():
     simulator = beam(Corotated(2e5, 0.45), Tendons([TENDON], friction=0.3))
-    assert simulator.follows_pose
+    assert simulator.energies.follow_pose
     with pytest.raises(InputError, match="solve its equilibria"):
         simulator.linearise_equilibrium(driven(tendon_tension=[3.0]))
 

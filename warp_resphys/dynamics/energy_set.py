@@ -198,7 +198,7 @@ class EnergySet:
 
     @property
     def follow_pose(self) -> bool:
-        """Whether values of a static equilibrium depend on its positions."""
+        """Whether forces in a static equilibrium depend on its pose without a potential, as friction of tendons."""
         return bool(self._posing)
 
     def end_step(self, step: SimulatorStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -222,7 +222,12 @@ class EnergySet:
         return out
 
     def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
-        """Returns the motions of all obstacles in successive states, with the prefixes of their energies."""
+        """Returns the motions of all obstacles, with the prefixes of their energies.
+
+        Args:
+            states: successive states of a roll-out, whose memory has the poses of obstacles that move.
+            constants: constants of the simulator.
+        """
         motions: list[ObstacleMotion] = []
         for item, bound, values in zip(self.placed, self._bound, constants.values, strict=True):
             if isinstance(bound, BoundContact):
@@ -232,7 +237,17 @@ class EnergySet:
         return tuple(motions)
 
     def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
-        """Returns positions (B, N, 3) [m] out of obstacles, see `Simulator.outside`."""
+        """Returns positions (B, N, 3) [m] pushed out of obstacles that stand still, for a step from there.
+
+        Args:
+            q: positions, of which some may be within an obstacle.
+            state: nearby, out of all obstacles: vertices are pushed to their gap in it, or to half of the distance at
+                which contact begins, whichever is less.
+            constants: constants of the simulator.
+
+        Raises:
+            InputError: the obstacles leave no place.
+        """
         for bound, values in zip(self._bound, constants.values, strict=True):
             if isinstance(bound, BoundContact):
                 q = bound.outside(q, state, values)

@@ -1,134 +1,29 @@
 """Differentiable minimisation of an incremental potential, with an implicit adjoint."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
-import warp as wp
 from torch.autograd import forward_ad
 from typing_extensions import override
 
-from ..energies.body_energies import PlacedEnergy
-from ..energies.launcher import BLOCK, lasting
 from ..energies.potential import IncrementalPotential, StepTerms
-from ..energies.solid import Solid
-from ..fem.coordinates import Coordinates
 from ..io.errors import ConvergenceError
-from ..io.kernel_cache import start_quietly
-from ..kernels import hessian_blocks, line_search, minimisation, points, reductions
-from ..kernels.lbfgs import lbfgs_kernels
-from ..kernels.modules import compile_together
-from ..linalg.choice import make_linear_solver
-from ..linalg.linear_solver import LinearSolver
 from ..linalg.threads import in_threads, threads_for
 from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.state import SolveReport
-from .assembly import BlockPattern
 from .hessian import ExactHessian
 from .nonlinear_solver import NonlinearSolver, SolverSettings
+from .workspace import Workspace
 
+P = TypeVar("P")
 T = TypeVar("T")
-Shard = tuple[slice, "Workspace"]
 Names = tuple[tuple[int, str], ...]  # number of an energy, and name of a value of its term
 
 _REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
 _LEAST_WAY, _MOST_PARTS = 1e-2, 32  # of the way of fixed vertices that bodies bar: a part of it, and their number
 _REFINED, _ACCEPTED = 1e-12, 1e-9  # relative residuals: target, and limit if rounding prevents the target
-
-
-def _kernels(energies: Sequence[PlacedEnergy], device: torch.device, dtype: torch.dtype) -> list[Any]:
-    """Returns a kernel of every module that a solve launches, but those of energies that are not materials."""
-    scalar = wp.float64 if dtype == torch.float64 else wp.float32
-    solids = [placed.energy for placed in energies if isinstance(placed.energy, Solid)]
-    return [
-        *(points.gather_cells, points.gather_kernels(3).gather, reductions.masked_norm),
-        *(solid.kernel(device) for solid in solids),
-        *(
-            hessian_blocks.cell_blocks,
-            hessian_blocks.scatter_kernel(scalar),
-            minimisation.begin,
-            lbfgs_kernels(scalar).project,
-        ),
-        *(line_search.perturb, line_search.accept_kernel(scalar)),
-    ]
-
-
-class Workspace:
-    """Buffers, launches and factors for one batch size of a body.
-
-    Args:
-        energies: energies of the body.
-        coordinates: map from control vertices to all vertices.
-        fixed: (D,) fixed vertices, on the device.
-        pattern: block structure of the Hessian.
-        batch: number of environments.
-        device: device of every buffer.
-        dtype: dtype of states and factors; the potential is evaluated in float64.
-
-    Attributes:
-        shards: slices of the batch with a workspace each, if several threads share it, else empty.
-    """
-
-    def __init__(
-        self,
-        energies: Sequence[PlacedEnergy],
-        coordinates: Coordinates,
-        fixed: torch.Tensor,
-        pattern: BlockPattern,
-        batch: int,
-        device: torch.device,
-        dtype: torch.dtype,
-    ) -> None:
-        self.fixed = fixed
-        eliminated = torch.as_tensor(np.setdiff1d(np.arange(coordinates.n_vertices), pattern.free), device=device)
-        start_quietly()
-        compile_together(_kernels(energies, device, dtype), device, BLOCK)
-        self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
-        self.pattern, self.dtype = pattern, dtype
-        self._cache: dict[Any, Any] = {}
-        self.shards: list[Shard] = []
-        self._last: torch.Tensor | None = None
-
-    @property
-    def parts(self) -> "list[Shard]":
-        """The shards, or the whole batch."""
-        return self.shards or [(slice(None), self)]
-
-    def record_positions(self, q: torch.Tensor) -> None:
-        """Stores the positions (B, N, 3) at the end of a time step, for `follows`."""
-        self._last = q.detach()
-
-    def follows(self, q: torch.Tensor) -> torch.Tensor | None:
-        """Returns (B,) whether positions are those at the end of the last time step; None before the first step."""
-        return None if self._last is None else (q.detach() == self._last).flatten(1).all(1)
-
-    def cached(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Returns an object of this batch, made at the first use of its key, for use outside of inference mode too."""
-        if key not in self._cache:
-            with lasting():
-                self._cache[key] = make()
-        value: T = self._cache[key]
-        return value
-
-    def solver(self, purpose: str, settings: SolverSettings) -> NonlinearSolver:
-        """Returns the nonlinear solver for a purpose (dynamics, statics), with its own factor."""
-        return self.cached(
-            (purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
-        )
-
-    def hessian(self, linear_solver: str, dtype: torch.dtype = torch.float64) -> ExactHessian:
-        """Returns the exact Hessian, for adjoint solves."""
-        return self.cached(
-            (linear_solver, dtype),
-            lambda: ExactHessian(self.potential, self.pattern, self.linear_solver(linear_solver, dtype)),
-        )
-
-    def linear_solver(self, name: str, dtype: torch.dtype = torch.float64) -> LinearSolver:
-        """Returns a new linear solver for the Hessian."""
-        p, k = self.potential, self.pattern
-        return make_linear_solver(name, k.rows, k.cols, len(k.free), 3, p.device, dtype)
 
 
 def equilibrium(
@@ -154,21 +49,20 @@ def equilibrium(
     Returns:
         The last iterate, and the solver's report, which says whether it converged (`check_converged`).
     """
-    solve = _Solve(workspace, purpose, settings, follows, workspace.potential.value_names)
-    values = (terms.values[energy][name] for energy, name in solve.names)
+    problem = _Minimisation(workspace, purpose, settings, follows, workspace.potential.value_names)
+    values = (terms.values[energy][name] for energy, name in problem.names)
     tensors = (start, fixed_positions, terms.target, terms.inertia, terms.force, *values)
     needs_grad = torch.is_grad_enabled() and any(x is not None and x.requires_grad for x in tensors[1:])
     # Forward-mode differentiation also calls the function, which raises an error for it.
-    if needs_grad or forward_ad._current_level >= 0:
-        x: torch.Tensor = _Equilibrium.apply(solve, *tensors)
-        assert solve.report is not None
-        return x, solve.report
-    return solve(tensors)
+    through_graph = needs_grad or forward_ad._current_level >= 0
+    x: torch.Tensor = _Equilibrium.apply(problem, *tensors) if through_graph else problem.minimise(tensors)
+    assert problem.report is not None
+    return x, problem.report
 
 
 @dataclass
-class _Solve:
-    """A solve of a batch, with one thread per shard."""
+class _Minimisation:
+    """The minimisation of a step's potential for a batch, and its adjoint, with one thread per shard."""
 
     workspace: Workspace
     purpose: str
@@ -177,23 +71,51 @@ class _Solve:
     names: Names  # of the values
     report: SolveReport | None = None
 
-    def __call__(self, inputs: Sequence[torch.Tensor | None]) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the minimiser and the report for a start, fixed positions and terms."""
-        tensors = [None if tensor is None else tensor.detach() for tensor in inputs]
+    def minimise(self, tensors: Sequence[torch.Tensor | None]) -> torch.Tensor:
+        """Returns the minimiser for a start, fixed positions and terms, and sets the report."""
+        start, *others = (None if tensor is None else tensor.detach() for tensor in tensors)
+        assert start is not None
 
-        def solve(part: tuple[slice, Workspace, NonlinearSolver]) -> tuple[torch.Tensor, SolveReport]:
-            rows, own, solver = part
-            own_follows = None if self.follows is None else self.follows[rows]
-            return _solve(own, solver, own_follows, self.names, *(_rows(tensor, rows) for tensor in tensors))
+        def work(rows: slice, own: Workspace, solver: NonlinearSolver) -> tuple[torch.Tensor, SolveReport]:
+            follows = None if self.follows is None else self.follows[rows]
+            return _minimise(own, solver, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others)))
 
-        assert tensors[0] is not None
-        with self.workspace.potential.lock:
-            parts = [(rows, own, own.solver(self.purpose, self.settings)) for rows, own in self.workspace.parts]
-            with threads_for(tensors[0][0].numel(), len(parts)):
-                results = in_threads(solve, parts)
-        x = results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
+        results = self._in_shards(lambda own: own.solver(self.purpose, self.settings), work, start[0].numel())
         self.report = _joined([report for _, report in results])
-        return x, self.report
+        return results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
+
+    def differentiate(
+        self, gradient: torch.Tensor, x: torch.Tensor, terms: Sequence[torch.Tensor | None], needed: Sequence[bool]
+    ) -> list[torch.Tensor | None]:
+        """Returns the gradients by fixed positions and terms, from that by the minimiser x.
+
+        Raises:
+            ConvergenceError: the Hessian is singular at x.
+        """
+        single = self.settings.factors == "single"
+        types = (torch.float32, torch.float64) if single else (torch.float64,)
+
+        def prepare(own: Workspace) -> list[ExactHessian]:
+            own.potential.prepare_adjoint()
+            return [own.hessian(self.settings.linear_solver, dtype) for dtype in types]
+
+        def work(rows: slice, own: Workspace, hessians: list[ExactHessian]) -> tuple[torch.Tensor | None, ...]:
+            return _adjoint(own, hessians, self.names, needed, *(_rows(t, rows) for t in (gradient, x, *terms)))
+
+        try:
+            gradients = self._in_shards(prepare, work, gradient[0].numel())
+        except ConvergenceError as error:
+            raise ConvergenceError(str(error), x.clone(), None) from None
+        return [_join_gradients(*pair) for pair in zip((None, *terms), zip(*gradients, strict=True), strict=True)]
+
+    def _in_shards(
+        self, prepare: Callable[[Workspace], P], work: Callable[[slice, Workspace, P], T], unknowns: int
+    ) -> list[T]:
+        """Returns the results of work in all shards, each with what was prepared for it in this thread."""
+        with self.workspace.potential.lock:
+            parts = [(rows, own, prepare(own)) for rows, own in self.workspace.parts]
+            with threads_for(unknowns, len(parts)):
+                return in_threads(lambda part: work(*part), parts)
 
 
 class _Equilibrium(AdjointFunction):
@@ -210,9 +132,9 @@ class _Equilibrium(AdjointFunction):
 
     @override
     @staticmethod
-    def forward(ctx: Any, solve: _Solve, *tensors: torch.Tensor | None) -> torch.Tensor:
-        x, _ = solve(tensors)
-        ctx.solve = solve
+    def forward(ctx: Any, problem: _Minimisation, *tensors: torch.Tensor | None) -> torch.Tensor:
+        x = problem.minimise(tensors)
+        ctx.problem = problem
         ctx.save_for_backward(x, *tensors[2:])
         return x
 
@@ -220,29 +142,8 @@ class _Equilibrium(AdjointFunction):
     @staticmethod
     @first_derivatives
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        x, *saved = ctx.saved_tensors
-        x, saved = x.detach(), [None if tensor is None else tensor.detach() for tensor in saved]
-        needed, solve = ctx.needs_input_grad[2:], ctx.solve
-
-        types = (torch.float32, torch.float64) if solve.settings.factors == "single" else (torch.float64,)
-
-        def differentiate(part: tuple[slice, Workspace, list[ExactHessian]]) -> tuple[torch.Tensor | None, ...]:
-            rows, own, hessians = part
-            return _adjoint(own, hessians, solve.names, needed, *(_rows(t, rows) for t in (gradient, x, *saved)))
-
-        try:
-            with solve.workspace.potential.lock:
-                parts = [
-                    (rows, own, [own.hessian(solve.settings.linear_solver, dtype) for dtype in types])
-                    for rows, own in solve.workspace.parts
-                ]
-                for _, own, _ in parts:
-                    own.potential.prepare_adjoint()
-                with threads_for(gradient[0].numel(), len(parts)):
-                    gradients = in_threads(differentiate, parts)
-        except ConvergenceError as error:
-            raise ConvergenceError(str(error), x.detach().clone(), None) from None
-        return (None, None, *map(_join_gradients, (None, *saved), zip(*gradients, strict=True)))
+        x, *terms = (None if tensor is None else tensor.detach() for tensor in ctx.saved_tensors)
+        return None, None, *ctx.problem.differentiate(gradient, x, terms, ctx.needs_input_grad[2:])
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
@@ -252,6 +153,8 @@ def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
 
 def _joined(reports: Sequence[SolveReport]) -> SolveReport:
     """Returns the report of a batch from those of its shards."""
+    if len(reports) == 1:
+        return reports[0]
     names = [item.name for item in fields(SolveReport)]
     return SolveReport(*(torch.cat([getattr(report, name) for report in reports]) for name in names))
 
@@ -272,7 +175,7 @@ def _terms(names: Names, tensors: Sequence[Any]) -> StepTerms:
     return StepTerms(target, inertia, force, by_energy)
 
 
-def _solve(
+def _minimise(
     workspace: Workspace,
     solver: NonlinearSolver,
     follows: torch.Tensor | None,

@@ -1,7 +1,6 @@
 """Residual of a step and its exact derivative at any positions, for other methods than the simulator's solvers."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +8,11 @@ import scipy.sparse
 import torch
 from numpy.typing import NDArray
 
-from ..energies.potential import StepTerms
-from ..fem.coordinates import DeviceCoordinates
 from ..linalg.linear_solver import Factor
 from ..linalg.threads import threads_for
-from ..stepping.state import ImplicitStage, State
 from .assembly import HessianAssembly
-from .equilibrium import Workspace
+from .time_step import TimeStep
+from .workspace import Workspace
 
 _MOST_COLUMNS = 4  # right-hand sides up to which a factor of another state may be cheaper
 
@@ -26,13 +23,7 @@ class Linearisation:
     It uses the buffers of a batch, and is valid until the simulator is used again for a batch of that size.
 
     Args:
-        workspace: workspace of the batch.
-        terms: terms of the step.
-        stage: stage of the integrator.
-        fixed_positions: (B, D, 3) positions of the fixed vertices at the stage [m].
-        coordinates: coordinates of the body, which eliminate the dependent vertices.
-        finish: maps a solution x to the new state.
-        linear_solver: name of the linear solver.
+        problem: a time step or a static equilibrium.
 
     Attributes:
         stage: stage of the integrator.
@@ -41,22 +32,14 @@ class Linearisation:
         free: (F,) free vertices.
     """
 
-    def __init__(
-        self,
-        workspace: Workspace,
-        terms: StepTerms,
-        stage: ImplicitStage,
-        fixed_positions: torch.Tensor,
-        coordinates: DeviceCoordinates,
-        finish: Callable[[torch.Tensor], State],
-        linear_solver: str,
-    ) -> None:
-        self.stage, self.finish, self._workspace, self._name = stage, finish, workspace, linear_solver
-        self._fixed_positions, self._coordinates, self._terms = fixed_positions, coordinates, terms
-        self.start = self.hold(stage.target)
-        self._potential = workspace.potential
-        self._potential.set_terms(terms)
-        self.free = torch.as_tensor(workspace.pattern.free, device=self._potential.device)
+    def __init__(self, problem: TimeStep) -> None:
+        equations, self._workspace, self._terms = problem.equations, problem.workspace, problem.terms()
+        self.stage, self.finish, self._name = problem.step.stage, problem.finish, equations.settings.linear_solver
+        self._fixed_positions, self._coordinates = problem.fixed_positions(), equations.coordinates
+        self.start = self.hold(self.stage.target)
+        self._potential = self._workspace.potential
+        self._potential.set_terms(self._terms)
+        self.free = torch.as_tensor(self._workspace.pattern.free, device=self._potential.device)
         self._unknowns = 3 * self._potential.n_vertices
         self._at, self._has_factor = self.start, True
 

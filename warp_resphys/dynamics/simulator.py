@@ -2,53 +2,34 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
-from threading import get_ident
 from typing import Any
 
-import numpy as np
 import torch
 
-from ..energies.body_energies import Materials, joined_names, place_energies
+from ..energies.body_energies import Materials, joined_names
 from ..energies.contact import ContactForces
-from ..energies.launcher import lasting
 from ..energies.materials import Corotated, Material
-from ..energies.obstacles import ObstacleMotion
 from ..fem.bodies import Body
-from ..fem.coordinates import DeviceCoordinates
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import InputError
 from ..io.machine import find_device
-from ..linalg.threads import shards_of
-from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs, check_tensor
-from ..stepping.integrators import make_integrator
-from ..stepping.quantity import Quantity
 from ..stepping.rollout import rollout
-from ..stepping.state import Constants, SolveReport, State
-from .assembly import BlockPattern
-from .energy_set import EnergySet, SimulatorStep
-from .equilibrium import Workspace, equilibrium
+from ..stepping.state import Constants, State
+from .equations import EquationsOfMotion, check_count
 from .linearisation import Linearisation
 from .mesh_error import CHECKED, warn_of_cells
 from .nonlinear_solver import SolverSettings, check_converged
 from .plausibility import warn_of_implausible
-from .statics import MOST_ITERATIONS, find_equilibrium, progress_of, settle
+from .statics import SHIFT, StaticEquilibrium, friction_holds
+from .time_step import TimeStep
 from .trajectory import Motion
+from .workspace import Workspace
 
 GRAVITY = (0.0, 0.0, -9.80709)
-_NO_INPUTS = Inputs()
 # Steps of a roll-out on a GPU after which the host checks their convergence: it waits for the GPU only then.
 _STEPS_TO_CHECK = 32
-_SHIFT = 1e-6  # m, along every axis, against which friction acts
-_HELD_BY = 3  # vertices with friction, against all displacements and turns
-_GRAVITY = Quantity("gravity", "m/s^2", per="axis")
 
 Parameters = Mapping[str, Any]
-
-
-def _check_count(name: str, value: object) -> None:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-        raise InputError(f"{name} is {value!r}: it must be a whole number, one or more.")
 
 
 @dataclass
@@ -86,6 +67,7 @@ class Simulator:
         counts: number of values of an input or a parameter per environment, by name.
         parts: names of the parts, such as tendons, for which a parameter may have values, by the parameter's name.
         constants: default values of the parameters.
+        energies: all energies.
     """
 
     body: Body
@@ -113,53 +95,17 @@ class Simulator:
         self._build()
 
     def _build(self) -> None:
-        if not (np.isfinite(self.time_step) and self.time_step > 0.0):
-            raise InputError(f"time_step is {self.time_step:g}: it must be positive, in seconds.")
-        if self.dtype not in (torch.float64, torch.float32):
-            raise InputError(f"dtype is {self.dtype}: choose torch.float64 or torch.float32.")
-        if np.shape(self.gravity) != (3,) or not np.isfinite(self.gravity).all():
-            raise InputError(f"gravity is {self.gravity}: it must be three finite accelerations, in m/s^2.")
         self.device = find_device(self.device)
         settings = SolverSettings(name=self.solver) if isinstance(self.solver, str) else self.solver
         tolerance = self.relative_tolerance
         self.settings = settings if tolerance is None else replace(settings, relative_tolerance=tolerance)
-        self.method = make_integrator(self.integrator)
-        body = self.body
-        self.rest_positions = self.tensor(body.vertices)  # (N, 3) [m]
-        self.fixed = torch.as_tensor(body.fixed_vertices, device=self.device)
-        if len(self.fixed) == body.n_vertices:
-            raise InputError("every vertex is fixed: leave some free to move.")
-        if settings.name == "projective_dynamics" and len(body.coordinates.sliding):
-            raise InputError("solver is projective_dynamics, which knows no symmetry planes: choose quasi_newton.")
-        if self.integrator == "midpoint" and any(own.controls for _, own, _ in body.members):
-            raise InputError("integrator is midpoint, by which rigid parts ring: choose implicit_euler or bdf2.")
-        self._coordinates = DeviceCoordinates(body.coordinates, self.rest_positions)
-        placed = place_energies(body, self.material)
-        barriers = any(item.energy.is_barrier for item in placed)  # through which states must not pass
-        if barriers and self.integrator == "midpoint":
-            raise InputError(
-                "integrator is midpoint, which extrapolates from the middle of a step and may penetrate: with contact, "
-                "choose implicit_euler or bdf2."
-            )
-        if barriers and settings.name == "projective_dynamics":
-            raise InputError(
-                "solver is projective_dynamics, whose constant matrix knows no contact: choose quasi_newton."
-            )
-        where = (body, self._coordinates, self.rest_positions, self.method, self.time_step)
-        self._energies = energies = EnergySet(placed, *where)
-        eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
-        sets = [points for item in placed for points in item.points]
-        pattern = BlockPattern(body.vertices, eliminated, sets, body.coordinates.sliding)
-        self._make_workspace = partial(
-            Workspace, placed, body.coordinates, self.fixed, pattern, device=self.device, dtype=self.dtype
-        )
-        self.parameters: dict[str, Quantity] = {**energies.parameters, "gravity": _GRAVITY}
-        self.constants: dict[str, Any] = {**energies.constants, "gravity": [list(self.gravity)]}
-        self.counts = {**energies.counts, "gravity": 3}
-        self.inputs, self.parts = energies.inputs, energies.parts
-        self._workspaces: dict[tuple[int, int], Workspace] = {}
+        where = (self.gravity, self.time_step, self.integrator, self.settings, self.device, self.dtype)
+        self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
+        self.method, self.rest_positions, self.fixed = equations.method, equations.rest_positions, equations.fixed
+        self.parameters, self.constants, self.counts = equations.parameters, equations.constants, equations.counts
+        self.energies = equations.energies
+        self.inputs, self.parts = self.energies.inputs, self.energies.parts
         self._checked_cells: list[bool] = []  # whether they are too coarse in the first equilibria
-        self._attached_mass = self.tensor(body.attached_mass)
         self._built = True
 
     def __repr__(self) -> str:
@@ -183,8 +129,7 @@ class Simulator:
 
     def tensor(self, values: object) -> torch.Tensor:
         """Returns values with the simulator's device and dtype."""
-        refuse_transforms(values)
-        return torch.as_tensor(values, device=self.device, dtype=self.dtype)
+        return self._equations.tensor(values)
 
     def prepare(self, parameters: Parameters | Constants | None = None) -> Constants:
         """Computes stiffness, mass and weight from parameters; pass the result to `step` to do so only once.
@@ -198,33 +143,15 @@ class Simulator:
         """
         if isinstance(parameters, Constants):
             return parameters
-        for name, value in (parameters or {}).items():
-            if name not in self.parameters:
-                raise InputError(f"{name!r} is not a parameter of this simulator: it has {', '.join(self.parameters)}.")
-            self.parameters[name].check(value)
-        given = {**self.constants, **(parameters or {})}
-        tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
-        values, mass = self._energies.prepare(tensors)
-        inertia, weight = mass.inertia + self._attached_mass, mass.weight + self._attached_mass
-        return Constants(inertia, weight, tensors["gravity"], mass.damping, values)
+        return self._equations.prepare(parameters or {})
 
     def workspace(self, batch: int) -> Workspace:
-        """Returns the calling thread's buffers for a batch size, made at their first use, also in inference mode.
-
-        Threads that have ended leave theirs to new ones, whose identifiers are the same.
-        """
-        key = get_ident(), batch
-        if key not in self._workspaces:
-            with lasting():
-                workspace = self._make_workspace(batch=batch)
-                shards = shards_of(batch, workspace.potential.device)
-                workspace.shards += [(rows, self._make_workspace(batch=rows.stop - rows.start)) for rows in shards]
-            self._workspaces[key] = workspace
-        return self._workspaces[key]
+        """Returns the calling thread's buffers for a batch size (`EquationsOfMotion.workspace`)."""
+        return self._equations.workspace(batch)
 
     def rest_state(self, batch: int = 1) -> State:
         """Returns the undeformed body at rest, for a batch of one or more environments."""
-        _check_count("batch", batch)
+        check_count("batch", batch)
         q = self.rest_positions.expand(batch, -1, -1).clone()
         return State(q, torch.zeros_like(q))
 
@@ -271,44 +198,15 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: the solver failed, if `SolverSettings.on_failure` is ``raise``.
         """
-        inputs, constants = self._checked(state, inputs, parameters)
         if near is not None:
             check_tensor("near", near, tuple(state.q.shape), "m", "vertex", state.q)
-        new = self._advance(state, inputs, constants, near)
+        new = self._time_step(state, inputs, parameters).solve(near)
         check_converged(self.settings, new.report, new.q)
         return new
 
-    def _advance(self, state: State, inputs: Inputs, constants: Constants, near: torch.Tensor | None = None) -> State:
-        """Returns the next state, whose solve may have failed."""
-        step, workspace = self._step(state, inputs, constants), self.workspace(state.batch)
-        terms, clamped, follows = self._energies.step_terms(step), self._fixed_at(step), workspace.follows(state.q)
-        start = step.stage.target if near is None else self.method.solution_for(state, near).detach()
-        x, report = equilibrium(workspace, "dynamics", self.settings, terms, start, clamped, follows)
-        x = self._coordinates.expand(x)
-        new = replace(self._finish(step, x), report=report)
-        workspace.record_positions(new.q)
-        return new
-
-    def _step(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
-        """Returns a time step from a state."""
-        terms = self.workspace(state.batch).potential.energies
-        return SimulatorStep(state, self.method.stage(state, self.time_step), inputs, constants, terms)
-
-    def _fixed_at(self, step: SimulatorStep) -> torch.Tensor:
-        """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
-        now, fixed = step.state.q[:, self.fixed], step.inputs.fixed_positions
-        return now if fixed is None else now + step.stage.end * (fixed - now)
-
-    def _finish(self, step: SimulatorStep, x: torch.Tensor) -> State:
-        """Returns the new state from the solution x of the stage."""
-        new = self.method.finish(step.state, x, self.time_step)
-        new = replace(new, memory=self._energies.end_step(step, x, new.q))
-        if step.stage.end == 1.0 or not len(self.fixed):
-            return new
-        # Prescribed motions have a known velocity; extrapolation from mid-step would oscillate.
-        now, fixed = step.state.q[:, self.fixed], step.inputs.fixed_positions
-        moved = torch.zeros_like(now) if fixed is None else fixed - now
-        return replace(new, v=new.v.index_copy(1, self.fixed, moved / self.time_step))
+    def _time_step(self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None) -> TimeStep:
+        """Returns a time step, or raises InputError if state, inputs or parameters do not fit."""
+        return TimeStep(self._equations, state, *self._checked(state, inputs, parameters))
 
     def remember(self, state: State, q: torch.Tensor, constants: Constants, inputs: Inputs | None = None) -> State:
         """Returns a state at given positions, with the memory variables after a step to these positions.
@@ -319,22 +217,8 @@ class Simulator:
             constants: constants from `prepare`.
             inputs: inputs during the step.
         """
-        step = self._step(state, inputs or _NO_INPUTS, constants)
-        return State(q, state.v, memory=self._energies.end_step(step, self.method.solution_for(state, q), q))
-
-    def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
-        """Returns positions (B, N, 3) [m] pushed out of obstacles that stand still, for a step from there.
-
-        Args:
-            q: positions, of which some may be within an obstacle.
-            state: nearby, out of all obstacles: vertices are pushed to their gap in it, or to half of the distance at
-                which contact begins, whichever is less.
-            constants: constants from `prepare`.
-
-        Raises:
-            InputError: the obstacles leave no place.
-        """
-        return self._energies.outside(q, state, constants)
+        step = TimeStep(self._equations, state, inputs or Inputs(), constants).step
+        return State(q, state.v, memory=self.energies.end_step(step, self.method.solution_for(state, q), q))
 
     def contacts(
         self, state: State, after: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -354,9 +238,9 @@ class Simulator:
         Raises:
             InputError: wrong shapes, or values that are not finite.
         """
-        inputs, constants = self._checked(state, inputs, parameters)
-        with self.workspace(state.batch).potential.lock:
-            return self._energies.contacts(self._step(state, inputs, constants), after.q)
+        problem = self._time_step(state, inputs, parameters)
+        with problem.workspace.potential.lock:
+            return self.energies.contacts(problem.step, after.q)
 
     def is_held(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -371,21 +255,8 @@ class Simulator:
         if len(self.fixed) or len(self.body.coordinates.sliding):
             return True
         with torch.no_grad():
-            moved = replace(state, q=state.q + _SHIFT)
-            contacts = self.contacts(state, moved, inputs, parameters).values()
-            rubbing = [own.friction for own in contacts if own.obstacles]
-            return any(bool(((own != 0.0).any(-1).any(-1).sum(-1) >= _HELD_BY).all()) for own in rubbing)
-
-    def obstacle_motions(
-        self, states: Sequence[State], parameters: Parameters | Constants | None = None
-    ) -> tuple[ObstacleMotion, ...]:
-        """Returns the motions of obstacles, if there are any, in successive states of a roll-out.
-
-        Args:
-            states: states, whose memory has the poses of obstacles that move.
-            parameters: parameters or prepared constants (`prepare`).
-        """
-        return self._energies.obstacles(states, self.prepare(parameters))
+            moved = replace(state, q=state.q + SHIFT)
+            return friction_holds(self.contacts(state, moved, inputs, parameters).values())
 
     def linearise(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -400,11 +271,7 @@ class Simulator:
         Raises:
             InputError: wrong shapes, or values that are not finite.
         """
-        inputs, constants = self._checked(state, inputs, parameters)
-        step, workspace = self._step(state, inputs, constants), self.workspace(state.batch)
-        terms, clamped, finish = self._energies.step_terms(step), self._fixed_at(step), partial(self._finish, step)
-        name = self.settings.linear_solver
-        return Linearisation(workspace, terms, step.stage, clamped, self._coordinates, finish, name)
+        return Linearisation(self._time_step(state, inputs, parameters))
 
     def static_equilibrium(
         self,
@@ -437,11 +304,10 @@ class Simulator:
         Warns:
             ResphysWarning: linear cells that are too coarse for one of the first equilibria (`dynamics.mesh_error`).
         """
-        inputs = self._fitted(inputs)
-        constants = self.prepare(parameters)
+        inputs, constants = self._equations.fitted(inputs), self.prepare(parameters)
         if batch is None:
-            given = [*inputs.fields.values(), *([] if start is None else [start])]
-            batch = max([len(t) for t in given] + [constants.batch] + ([] if after is None else [after.batch]))
+            sizes = [len(value) for value in inputs.fields.values()] + ([] if start is None else [len(start)])
+            batch = max(*sizes, constants.batch, 1 if after is None else after.batch)
         state = self.rest_state(batch) if after is None else after
         if state.batch == 1 < batch:
             state = state.map(lambda value: torch.cat([value] * batch))
@@ -453,23 +319,11 @@ class Simulator:
                 "a body without fixed vertices has no static equilibrium: fix some vertices, or lay it on an obstacle "
                 "with friction, within the distance of contact."
             )
-        step = SimulatorStep.endless(state, inputs, constants, self.workspace(batch).potential.energies)
-        solve = partial(self._balance, step)
-        limited = self.settings.max_iterations < MOST_ITERATIONS
-        rest = self.rest_positions.expand_as(state.q)
-        guess = state.q.detach() if start is None else start.detach()
-        if self._energies.follow_pose:
-            try:
-                x = find_equilibrium(partial(solve, near=guess), rest, guess, limited)
-            except ConvergenceError:  # The guess is far away.
-                x = find_equilibrium(solve, rest, guess, limited)
-            x = settle(lambda near: solve(1.0, near.detach(), near)[0], x)
-        else:
-            x = find_equilibrium(solve, rest, guess, limited)
+        balanced = StaticEquilibrium(self._equations, state, inputs, constants).solve(start)
         if len(self._checked_cells) < CHECKED and True not in self._checked_cells:
-            at = x[0].detach().double().cpu().numpy()
-            self._checked_cells.append(warn_of_cells(self.body, self._energies.placed, at, constants.values))
-        return self._resting(step, x)
+            at = balanced.q[0].detach().double().cpu().numpy()
+            self._checked_cells.append(warn_of_cells(self.body, self.energies.placed, at, constants.values))
+        return balanced
 
     def linearise_equilibrium(
         self, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None, batch: int = 1
@@ -483,43 +337,13 @@ class Simulator:
 
         Raises:
             InputError: wrong shapes, values that are not finite, or forces that depend on the pose without a potential
-                (`follows_pose`), whose derivative this is not.
+                (`EnergySet.follow_pose`), whose derivative this is not.
         """
-        if self.follows_pose:
+        if self.energies.follow_pose:
             raise InputError("forces of this body depend on its pose without a potential: solve its equilibria.")
         state = self.rest_state(batch)
         inputs, constants = self._checked(state, inputs, parameters)
-        workspace, stage = self.workspace(batch), self.method.stage(state, self.time_step)
-        step = SimulatorStep.endless(state, inputs, constants, workspace.potential.energies)
-        terms, clamp, finish = self._energies.rest_terms(step, 1.0), self._fixed_at(step), partial(self._resting, step)
-        return Linearisation(workspace, terms, stage, clamp, self._coordinates, finish, self.settings.linear_solver)
-
-    @property
-    def follows_pose(self) -> bool:
-        """Whether forces in a static equilibrium depend on its pose without a potential, as friction of tendons."""
-        return self._energies.follow_pose
-
-    def _resting(self, step: SimulatorStep, x: torch.Tensor) -> State:
-        """Returns the state in an equilibrium (B, N, 3) after a state [m]."""
-        return State(x, torch.zeros_like(x), memory=self._energies.end_step(step, x, x))
-
-    def _balance(
-        self, step: SimulatorStep, share: float, start: torch.Tensor, near: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, SolveReport]:
-        """Returns the equilibrium (B, N, 3) [m] after a state, under a share of loads, inputs and the clamp's motion.
-
-        Forces that depend on the pose without a potential are those ``near`` (B, N, 3); without, they are left out.
-        """
-        batch, fixed = step.state.batch, step.inputs.fixed_positions
-        workspace, clamp = self.workspace(batch), self.rest_positions[self.fixed].expand(batch, -1, -1)
-        most = min(self.settings.max_iterations, MOST_ITERATIONS)
-        settings = replace(self.settings, name="newton", on_failure="raise", max_iterations=most)
-        at = clamp if fixed is None else torch.lerp(clamp, fixed, share)
-        terms = self._energies.rest_terms(step, share, near)
-        with progress_of(workspace.parts[0][1].potential, share, most):
-            x, report = equilibrium(workspace, "statics", settings, terms, start, at)
-        check_converged(settings, report, x)
-        return self._coordinates.expand(x), report
+        return Linearisation(StaticEquilibrium(self._equations, state, inputs, constants))
 
     def rollout(
         self, state: State, steps: int, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -539,8 +363,8 @@ class Simulator:
             InputError: wrong shapes, or values that are not finite.
             ConvergenceError: as in `step`.
         """
-        _check_count("steps", steps)
-        inputs = self._fitted(inputs, state.batch)
+        check_count("steps", steps)
+        inputs = self._equations.fitted(inputs, state.batch)
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
         self._checked(state, inputs.at(0), constants)
@@ -553,8 +377,8 @@ class Simulator:
 
         def step(before: State, now: Inputs) -> State:
             if now is not inputs:
-                self._check_inputs(now, before.batch)
-            unchecked.append(self._advance(before, now, constants))
+                self._equations.check_inputs(now, before.batch)
+            unchecked.append(TimeStep(self._equations, before, now, constants).solve())
             after = unchecked[-1]
             if len(unchecked) == together:
                 check()
@@ -562,29 +386,12 @@ class Simulator:
 
         states = rollout(step, state, inputs.by_step(steps), lambda reached: reached)
         check()
-        return Motion.of(states, self.body, self.time_step, obstacles=self.obstacle_motions(states, constants))
+        return Motion.of(states, self.body, self.time_step, obstacles=self.energies.obstacles(states, constants))
 
     def _checked(
         self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None
     ) -> tuple[Inputs, Constants]:
         """Returns inputs and constants, or raises InputError if these or the state do not fit."""
-        inputs, constants = self._fitted(inputs, state.batch), self.prepare(parameters)
-        state.check(self.body.n_vertices, self.rest_positions)
-        self._check_inputs(inputs, state.batch)
-        constants.check_batch(state.batch)
-        self._energies.check_memory(state.memory, state.batch, self.rest_positions)
+        inputs, constants = self._equations.fitted(inputs, state.batch), self.prepare(parameters)
+        self._equations.check(state, inputs, constants)
         return inputs, constants
-
-    def _fitted(self, inputs: Inputs | None, batch: int | None = None) -> Inputs:
-        """Returns inputs with the simulator's device and dtype where they are numbers (`Inputs.fitted`)."""
-        refuse_transforms()
-        if inputs is None:
-            return _NO_INPUTS
-        if not isinstance(inputs, Inputs):
-            raise InputError(f"the inputs are a {type(inputs).__name__}: give Inputs(external_force=...), say.")
-        return inputs.fitted(self.counts, self.rest_positions, batch)
-
-    def _check_inputs(self, inputs: Inputs, batch: int) -> None:
-        """Raises InputError for inputs that do not fit."""
-        accepted = {name: (quantity, self.counts[name]) for name, quantity in self.inputs.items()}
-        inputs.check(accepted, batch, self.body.n_vertices, len(self.fixed), self.rest_positions)

@@ -1,20 +1,30 @@
 """Static equilibria, under gradually increasing loads where Newton's method does not converge under all of them."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 import torch
+from typing_extensions import override
 
-from ..energies.potential import IncrementalPotential
+from ..energies.contact import ContactForces
+from ..energies.potential import IncrementalPotential, StepTerms
 from ..io.errors import ConvergenceError
 from ..io.progress import QUIET_SECONDS, Progress
-from ..stepping.state import SolveReport
+from ..stepping.inputs import Inputs
+from ..stepping.state import Constants, SolveReport, State
+from .energy_set import SimulatorStep
+from .equilibrium import equilibrium
+from .nonlinear_solver import check_converged
+from .time_step import TimeStep
 
 log = logging.getLogger(__name__)
 
-MOST_ITERATIONS = 100  # of Newton's method; a few suffice from a good start
+_MOST_ITERATIONS = 100  # of Newton's method; a few suffice from a good start
+SHIFT = 1e-6  # m, along every axis, against which friction acts that is to hold a body
+_HELD_BY = 3  # vertices with friction, against all displacements and turns
 _MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
 _LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
 _MOST_SETTLINGS = 100
@@ -23,8 +33,77 @@ _SETTLED = 1e-10  # change of the positions, or of the gradient, relative to the
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 
 
+class StaticEquilibrium(TimeStep):
+    """A static equilibrium under constant inputs after a state: a step without end, in which inertia has no part."""
+
+    @override
+    def _begin(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
+        return SimulatorStep.endless(state, inputs, constants, self.workspace.potential.energies)
+
+    @override
+    def terms(self, share: float = 1.0, near: torch.Tensor | None = None) -> StepTerms:
+        """Returns the terms of the potential under a share of the loads.
+
+        Args:
+            share: of the loads and the inputs.
+            near: (B, N, 3) positions of the forces that depend on the pose without a potential; None: without them [m].
+        """
+        return self.equations.energies.rest_terms(self.step, share, near)
+
+    @override
+    def fixed_positions(self, share: float = 1.0) -> torch.Tensor:
+        """Returns the positions (B, D, 3) of the fixed vertices after a share of their motion from the rest shape."""
+        equations, moved = self.equations, self.step.inputs.fixed_positions
+        clamp = equations.rest_positions[equations.fixed].expand(self.step.state.batch, -1, -1)
+        return clamp if moved is None else torch.lerp(clamp, moved, share)
+
+    @override
+    def finish(self, x: torch.Tensor) -> State:
+        return State(x, torch.zeros_like(x), memory=self.equations.energies.end_step(self.step, x, x))
+
+    @override
+    def solve(self, near: torch.Tensor | None = None) -> State:
+        """Returns the state in equilibrium, differentiable.
+
+        Args:
+            near: (B, N, 3) initial guess [m]; None: the state before.
+
+        Raises:
+            ConvergenceError: no equilibrium was found, or the body grows without bound.
+        """
+        equations, state = self.equations, self.step.state
+        limited = equations.settings.max_iterations < _MOST_ITERATIONS
+        rest, guess = equations.rest_positions.expand_as(state.q), (state.q if near is None else near).detach()
+        if not equations.energies.follow_pose:
+            return self.finish(find_equilibrium(self._balance, rest, guess, limited))
+        try:
+            x = find_equilibrium(partial(self._balance, near=guess), rest, guess, limited)
+        except ConvergenceError:  # The guess is far away.
+            x = find_equilibrium(self._balance, rest, guess, limited)
+        return self.finish(settle(lambda at: self._balance(1.0, at.detach(), at)[0], x))
+
+    def _balance(
+        self, share: float, start: torch.Tensor, near: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, SolveReport]:
+        """Returns the equilibrium (B, N, 3) [m] under a share of loads, inputs and the motion of the fixed vertices."""
+        equations, workspace = self.equations, self.workspace
+        most = min(equations.settings.max_iterations, _MOST_ITERATIONS)
+        settings = replace(equations.settings, name="newton", on_failure="raise", max_iterations=most)
+        terms, fixed = self.terms(share, near), self.fixed_positions(share)
+        with _progress_of(workspace.parts[0][1].potential, share, most):
+            x, report = equilibrium(workspace, "statics", settings, terms, start, fixed)
+        check_converged(settings, report, x)
+        return equations.coordinates.expand(x), report
+
+
+def friction_holds(contacts: Iterable[ContactForces]) -> bool:
+    """Returns whether friction with obstacles holds three vertices or more in every environment, after a `SHIFT`."""
+    rubbing = [contact.friction != 0.0 for contact in contacts if contact.obstacles]
+    return any(bool((vertices.any(-1).any(-1).sum(-1) >= _HELD_BY).all()) for vertices in rubbing)
+
+
 @contextmanager
-def progress_of(potential: IncrementalPotential, share: float, most: int) -> Iterator[None]:
+def _progress_of(potential: IncrementalPotential, share: float, most: int) -> Iterator[None]:
     """Shows the iterations of a solve that takes longer than two seconds, with the residual over balancing forces.
 
     Args:

@@ -129,11 +129,11 @@ class Misfit(BoundedMisfit):
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
         """Uncertainty of (P,) parameters, see `left_out`; None if a simulation close by fails.
 
-        Equilibria that are solved again with other parameters (`Simulator.follows_pose`) are solved exactly if that
+        Equilibria that are solved again with other parameters (`EnergySet.follow_pose`) are solved exactly if that
         converges.
         """
         system = None
-        if self.simulator.follows_pose:
+        if self.simulator.energies.follow_pose:
             accurate = copy(self)
             accurate.simulator = exact(self.simulator)
             accurate._replays = [(Replay(accurate.simulator, r.observe, r.trials), start) for r, start in self._replays]

@@ -335,7 +335,7 @@ class Replay:
         if not start.at_rest:
             whole = self.initial_state(start, own, resting, 1 + sets)
             varied = whole.map(lambda t: t[state.batch :])
-        elif self.simulator.follows_pose:
+        elif self.simulator.energies.follow_pose:
             varied = self.initial_state(start.near(state.q), their, their_resting, sets)
         else:
             here = self._beside[0].linearise_equilibrium(resting, own, state.batch)

@@ -385,7 +385,7 @@ class Robot:
             states,
             self.simulator.body,
             self.time_step,
-            obstacles=self.simulator.obstacle_motions(states, self.constants),
+            obstacles=self.simulator.energies.obstacles(states, self.constants),
             name=f"{self.description.name}, {self.description.model}",
             markers=markers,
             labels=self.labels,

@@ -129,7 +129,7 @@ def shifted(robot: Robot, state: State, moved: torch.Tensor, faster: torch.Tenso
             had always been there.
     """
     memory = dict(state.memory)
-    q, v = robot.simulator.outside(state.q + moved, state, robot.constants), state.v + faster
+    q, v = robot.simulator.energies.outside(state.q + moved, state, robot.constants), state.v + faster
     moved = q - state.q
     if at_once and any("." not in name for name in memory):
         after, before = (robot.simulator.remember(state, x, robot.constants).memory for x in (q, state.q))

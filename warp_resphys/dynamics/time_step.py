@@ -1,0 +1,70 @@
+"""The implicit solve of a time step, and the state that follows from its solution."""
+
+from dataclasses import replace
+
+import torch
+
+from ..energies.potential import StepTerms
+from ..stepping.inputs import Inputs
+from ..stepping.state import Constants, State
+from .energy_set import SimulatorStep
+from .equations import EquationsOfMotion
+from .equilibrium import equilibrium
+
+
+class TimeStep:
+    """A time step from a state.
+
+    Args:
+        equations: the equations of motion.
+        state: state at the start.
+        inputs: inputs during the step.
+        constants: constants of the energies.
+
+    Attributes:
+        workspace: the calling thread's buffers for the batch.
+        step: the step as the energies see it.
+    """
+
+    def __init__(self, equations: EquationsOfMotion, state: State, inputs: Inputs, constants: Constants) -> None:
+        self.equations, self.workspace = equations, equations.workspace(state.batch)
+        self.step = self._begin(state, inputs, constants)
+
+    def _begin(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
+        stage = self.equations.method.stage(state, self.equations.time_step)
+        return SimulatorStep(state, stage, inputs, constants, self.workspace.potential.energies)
+
+    def terms(self) -> StepTerms:
+        """Returns the terms of the incremental potential, differentiable."""
+        return self.equations.energies.step_terms(self.step)
+
+    def fixed_positions(self) -> torch.Tensor:
+        """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
+        now, fixed = self.step.state.q[:, self.equations.fixed], self.step.inputs.fixed_positions
+        return now if fixed is None else now + self.step.stage.end * (fixed - now)
+
+    def finish(self, x: torch.Tensor) -> State:
+        """Returns the new state from the solution x (B, N, 3) of the stage."""
+        step, equations, h = self.step, self.equations, self.equations.time_step
+        new = equations.method.finish(step.state, x, h)
+        new = replace(new, memory=equations.energies.end_step(step, x, new.q))
+        if step.stage.end == 1.0 or not len(equations.fixed):
+            return new
+        # Prescribed motions have a known velocity; extrapolation from mid-step would oscillate.
+        now, fixed = step.state.q[:, equations.fixed], step.inputs.fixed_positions
+        moved = torch.zeros_like(now) if fixed is None else fixed - now
+        return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
+
+    def solve(self, near: torch.Tensor | None = None) -> State:
+        """Returns the new state, differentiable, whose report says whether the solve has converged.
+
+        Args:
+            near: (B, N, 3) predicted positions at the end of the step [m]; None: an extrapolation of the last steps.
+        """
+        equations, workspace, state = self.equations, self.workspace, self.step.state
+        start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
+        terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
+        x, report = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
+        new = replace(self.finish(equations.coordinates.expand(x)), report=report)
+        workspace.record_positions(new.q)
+        return new

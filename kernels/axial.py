@@ -1,28 +1,26 @@
-"""Energies that are functions of a length: stress, tangent and derivatives by values, for any tension law.
+"""Laws that are functions of a length: fibres, strings and muscles.
 
-The vector at a point, sum_a g_a x_a - o, has the length l and the unit vector u. With the point's weight w and its
-values v, a law gives
+The vector x at a point less an origin o has the length l and the unit vector u. With the values v, a tension gives
 
-    e(l, v),   tension t = de/dl,   slope dt/dl,   and dt/dv,
+    e(l, v),   t = de/dl,   slope dt/dl,   and dt/dv,
 
-so that the stress is w t u and the tangent w (slope u u^T + t / l (1 - u u^T)), which has a negative eigenvalue only
-for a negative tension. The origin o is zero, or for a string the first three values.
+so that the stress is t u and the tangent slope u u^T + t / l (1 - u u^T), which has a negative eigenvalue only for a
+negative tension. The origin is zero, or for a string the first three values. The last value, the elongation over which
+fibres become taut, is a constant.
 """
 
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from .modules import generated, named_module
-from .points import PartValues, VectorPoints, value_reader, vector_at
+from .laws import Law
+from .modules import named_module
 
 ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
 SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
 QUARTER, TENTH, FORTIETH = wp.float64(0.25), wp.float64(0.1), wp.float64(0.025)
 
-thread_values = wp.types.vector(1, wp.float64)  # k
-string_values = wp.types.vector(5, wp.float64)  # position of the point that it is tied to [m], k [N/m], L [m]
-muscle_values = wp.types.vector(3, wp.float64)  # sigma, c, k
+string_values = wp.types.vector(6, wp.float64)  # position of the point that it is tied to [m], k [N/m], L [m], toe
 
 
 @wp.func
@@ -65,38 +63,30 @@ def muscle_pull(strain: wp.float64, toe: wp.float64):
 
 
 @wp.func
-def thread_tension(length: wp.float64, toe: wp.float64, v: thread_values):
-    """Tension-only thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a short toe."""
-    energy, force, slope = thread_pull(length - ONE, toe)
-    return v[0] * energy, v[0] * force, v[0] * slope, thread_values(force)
+def thread_tension(length: wp.float64, v: wp.vec2d):
+    """Tension-only thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a short toe; v = (k, toe)."""
+    energy, force, slope = thread_pull(length - ONE, v[1])
+    return v[0] * energy, v[0] * force, v[0] * slope, wp.vec2d(force, ZERO)
 
 
 @wp.func
-def string_tension(length: wp.float64, toe: wp.float64, v: string_values):
-    """Tension-only spring from a given point, ``k s(l - L)``."""
-    energy, force, slope = thread_pull(length - v[4], toe)
-    by_values = string_values(ZERO, ZERO, ZERO, force, -v[3] * slope)
+def string_tension(length: wp.float64, v: string_values):
+    """Tension-only spring from a point, ``k s(l - L)``."""
+    energy, force, slope = thread_pull(length - v[4], v[5])
+    by_values = string_values(ZERO, ZERO, ZERO, force, -v[3] * slope, ZERO)
     return v[3] * energy, v[3] * force, v[3] * slope, by_values
 
 
 @wp.func
-def muscle_tension(length: wp.float64, toe: wp.float64, v: muscle_values):
-    """Contractile fibre, ``sigma l + k s(l - 1 + c)``: active stress, and a spring shortened by a contraction."""
-    energy, force, slope = muscle_pull(length - ONE + v[1], toe)
-    by_values = muscle_values(ONE, v[2] * slope, force)
+def muscle_tension(length: wp.float64, v: wp.vec4d):
+    """Contractile fibre, ``sigma l + k s(l - 1 + c)``: active stress and a spring; v = (sigma, c, k, toe)."""
+    energy, force, slope = muscle_pull(length - ONE + v[1], v[3])
+    by_values = wp.vec4d(ONE, v[2] * slope, force, ZERO)
     return v[0] * length + v[2] * energy, v[0] + v[2] * force, v[2] * slope, by_values
 
 
-LAWS = {"thread": thread_tension, "string": string_tension, "muscle": muscle_tension}  # e, t, dt/dl and dt/dv
-
-
-@generated
-def axial_kernels(law: str) -> SimpleNamespace:
-    """Returns the kernels of one of `LAWS`."""
-    module = named_module(f"axial.{law}")
-    tension, tied = LAWS[law], law == "string"
-    vector = tension.input_types["v"]
-    read_values = value_reader(vector)
+def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
+    vector, module = tension.input_types["v"], named_module(name)
 
     @wp.func(module=module)
     def stretched(x: wp.vec3d, v: vector):
@@ -108,76 +98,44 @@ def axial_kernels(law: str) -> SimpleNamespace:
             x = x / length
         return x, length
 
-    @wp.kernel(module=module)
-    def local_step(
-        active: wp.array[int],  # (B) zero: skip the environment
-        points: VectorPoints,
-        values: PartValues,
-        toe: wp.float64,  # elongation at which the law reaches its full stiffness
-        positions: wp.array2d[wp.vec3d],
-        stress_out: wp.array2d[wp.vec3d],
-        energy_out: wp.array2d[wp.float64],  # (B, P) [J]
-    ):
-        b, p = wp.tid()
-        if active[b] == 0:
-            return
-        v = read_values(values, b, p)
-        u, length = stretched(vector_at(points, positions, b, p), v)
-        energy, pull, _slope, _by_values = tension(length, toe, v)
-        stress_out[b, p] = (values.weights[p] * pull) * u
-        energy_out[b, p] = values.weights[p] * energy
+    @wp.func(module=module)
+    def response(f: wp.vec3d, v: vector):
+        u, length = stretched(f, v)
+        energy, pull, _slope, _by_values = tension(length, v)
+        return energy, pull * u
 
-    @wp.kernel(module=module)
-    def tangent(
-        active: wp.array[int],
-        clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        points: VectorPoints,
-        values: PartValues,
-        toe: wp.float64,
-        positions: wp.array2d[wp.vec3d],
-        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
-    ):
-        b, p = wp.tid()
-        if active[b] == 0:
-            return
-        v = read_values(values, b, p)
-        u, length = stretched(vector_at(points, positions, b, p), v)
-        _energy, pull, slope, _by_values = tension(length, toe, v)
-        across, along = ZERO, values.weights[p] * slope
+    # The origin moves the vector the other way: its derivative is minus the tangent times df.
+    @wp.func(module=module)
+    def slopes(f: wp.vec3d, df: wp.vec3d, v: vector, carried: vector) -> vector:
+        u, length = stretched(f, v)
+        _energy, pull, slope, by_values = tension(length, v)
+        along = wp.dot(u, df)
+        result = along * by_values
+        if wp.static(tied):
+            moved = (slope * along) * u
+            if length > ZERO:
+                moved += (pull / length) * (df - along * u)
+            for i in range(3):
+                result[i] = -moved[i]
+        return result
+
+    @wp.func(module=module)
+    def tangent(f: wp.vec3d, v: vector, clamp: bool, out: wp.array[wp.mat33d]):
+        u, length = stretched(f, v)
+        _energy, pull, slope, _by_values = tension(length, v)
+        across = ZERO
         if length > ZERO:
-            across = values.weights[p] * pull / length
-        if clamp[b] != 0:
+            across = pull / length
+        if clamp:
             across = wp.max(across, ZERO)
-        block = (along - across) * wp.outer(u, u)
+        block = (slope - across) * wp.outer(u, u)
         block[0, 0] += across
         block[1, 1] += across
         block[2, 2] += across
-        tangent_out[b, p, 0] = block
+        out[0] = block
 
-    # The residual is w t u, so that -z . d residual/dv is -w dt/dv u . dz, with dz = sum_a g_a z_a. The origin moves
-    # the vector the other way: its derivative is the tangent times dz.
-    @wp.kernel(module=module)
-    def adjoint(
-        points: VectorPoints,
-        values: PartValues,
-        toe: wp.float64,
-        positions: wp.array2d[wp.vec3d],
-        direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-        values_out: wp.array2d[vector],  # (B, P) this point's part of dL/dv
-    ):
-        b, p = wp.tid()
-        v = read_values(values, b, p)
-        u, length = stretched(vector_at(points, positions, b, p), v)
-        dz = vector_at(points, direction, b, p)
-        _energy, pull, slope, by_values = tension(length, toe, v)
-        axial = wp.dot(u, dz)
-        result = (-values.weights[p] * axial) * by_values
-        if wp.static(tied):
-            moved = (slope * axial) * u
-            if length > ZERO:
-                moved += (pull / length) * (dz - axial * u)
-            for i in range(3):
-                result[i] = values.weights[p] * moved[i]
-        values_out[b, p] = result
+    return Law(name, vector, response, slopes, tangent)
 
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)
+
+THREAD, MUSCLE = _axial_law("axial.thread", thread_tension), _axial_law("axial.muscle", muscle_tension)
+STRING = _axial_law("axial.string", string_tension, tied=True)

@@ -1,27 +1,25 @@
-"""Kernels of an energy given as one Warp function of the kinematic variable at a point and of its values.
+"""The law of an energy given as one Warp function of the kinematic variable at a point and of its values.
 
 The function e(f, v) returns the energy of a point of weight one; f is a vector or a matrix (`points`), v the vector of
 values. From it follow
 
-- the stress w de/df, exact, by Warp's differentiation of the function;
-- the tangent w d2e/df2, by fourth-order differences of the exact stress with the step h = 3e-4 times the size of f that
+- the stress de/df, exact, by Warp's differentiation of the function;
+- the tangent d2e/df2, by fourth-order differences of the exact stress with the step h = 3e-4 times the size of f that
   the energy declares. The error is about h^4/30 times a fifth derivative, plus 1e-12 of the stress over the size of f
   from rounding: 1e-9 of the tangent or better, where e is smooth over h (tests/energies/test_pointwise.py);
-- the derivatives by the values, -z . d residual/dv = -w d/ds de/dv(f + s dz) with dz = sum_a g_a z_a, by the same
-  differences of the exact de/dv along dz.
+- the derivatives by the values, d/ds de/dv(f + s df), by the same differences of the exact de/dv along df.
 
 A clamped tangent is the nearest one without negative eigenvalues.
 """
 
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from .laws import Law
 from .modules import generated, named_module
-from .points import MatrixPoints, PartValues, VectorPoints, matrix_at, value_reader, vector_at
 
-STEP = wp.constant(wp.float64(3e-4))  # of differences, over the size of f
+STEP = 3e-4  # of differences, over the size of f
 OFFSETS, SHARES = wp.constant(wp.vec4d(1.0, -1.0, 2.0, -2.0)), wp.constant(wp.vec4d(8.0, -8.0, -1.0, 1.0))
 TWELVE, ZERO, HALF, ONE = wp.float64(12.0), wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 SWEEPS = wp.constant(30)
@@ -87,58 +85,39 @@ def write_blocks(hessian: mat99, columns: int, clamp: bool, out: wp.array[wp.mat
 
 
 @generated
-def pointwise_kernels(density: Any) -> SimpleNamespace:
-    """Returns the kernels of an energy function, and the vector type of its values."""
-    shape, vector = density.input_types.values()
-    module = named_module(f"pointwise.{density.module.name}.{density.key}")
+def derived_law(name: str, energy: Any, size: float = 1.0, lame: tuple[tuple[float, float], ...] = ()) -> Law:
+    """Returns the law of an energy function.
+
+    Args:
+        name: name of the law's Warp module.
+        energy: e(f, v).
+        size: typical size of f.
+        lame: see `Law`.
+    """
+    shape, vector = energy.input_types.values()
+    module = named_module(name)
     # Unrolled, the loops below would take minutes to compile.
     wp.set_module_options({"max_unroll": 1}, module)
-    line = shape is wp.vec3d
-    columns = wp.constant(1 if line else 3)
-    see, points_type, inner = (vector_at, VectorPoints, wp.dot) if line else (matrix_at, MatrixPoints, wp.ddot)
-    read_values = value_reader(vector)
+    line, step = shape is wp.vec3d, wp.constant(wp.float64(size * STEP))
+    columns, inner = wp.constant(1 if line else 3), wp.dot if line else wp.ddot
 
-    @wp.kernel(module=module)
-    def local_step(
-        active: wp.array[int],  # (B) zero: skip the environment
-        points: points_type,
-        values: PartValues,
-        size: wp.float64,  # of f
-        positions: wp.array2d[wp.vec3d],
-        stress_out: wp.array2d[shape],
-        energy_out: wp.array2d[wp.float64],  # (B, P) [J]
-    ):
-        b, p = wp.tid()
-        if active[b] == 0:
-            return
-        v = read_values(values, b, p)
-        f = see(points, positions, b, p)
-        stress, _by_values = wp.grad(density)(f, v)
-        stress_out[b, p] = values.weights[p] * stress
-        energy_out[b, p] = values.weights[p] * density(f, v)
+    # Warp emits functions that use wp.grad after all others, so only kernels can call them.
+    @wp.func(module=module)
+    def response(f: shape, v: vector):
+        stress, _by_values = wp.grad(energy)(f, v)
+        return energy(f, v), stress
 
-    @wp.kernel(module=module)
-    def adjoint(
-        points: points_type,
-        values: PartValues,
-        size: wp.float64,
-        positions: wp.array2d[wp.vec3d],
-        direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-        values_out: wp.array2d[vector],  # (B, P) this point's part of dL/dv
-    ):
-        b, p = wp.tid()
-        v = read_values(values, b, p)
-        f = see(points, positions, b, p)
-        dz = see(points, direction, b, p)
-        length = wp.sqrt(inner(dz, dz))
+    @wp.func(module=module)
+    def slopes(f: shape, df: shape, v: vector, carried: vector) -> vector:
+        length = wp.sqrt(inner(df, df))
         result = vector()
         if length > ZERO:
-            h = STEP * size / length
+            h = step / length
             for k in range(4):
-                _stress, by_values = wp.grad(density)(f + (OFFSETS[k] * h) * dz, v)
+                _stress, by_values = wp.grad(energy)(f + (OFFSETS[k] * h) * df, v)
                 result += SHARES[k] * by_values
-            result = (-values.weights[p] / (TWELVE * h)) * result
-        values_out[b, p] = result
+            result = result / (TWELVE * h)
+        return result
 
     @wp.func(module=module)
     def moved(f: shape, j: int, n: int, by: wp.float64) -> shape:
@@ -158,32 +137,18 @@ def pointwise_kernels(density: Any) -> SimpleNamespace:
             value = stress[j, n]
         return value
 
-    @wp.kernel(module=module)
-    def tangent(
-        active: wp.array[int],
-        clamp: wp.array[int],  # (B) not zero where eigenvalues are clamped at zero
-        points: points_type,
-        values: PartValues,
-        size: wp.float64,
-        positions: wp.array2d[wp.vec3d],
-        tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6), or (B, P, 1) for a vector
-    ):
-        b, p = wp.tid()
-        if active[b] == 0:
-            return
-        v = read_values(values, b, p)
-        f = see(points, positions, b, p)
-        scale = values.weights[p] / (TWELVE * STEP * size)
+    @wp.func(module=module)
+    def tangent(f: shape, v: vector, clamp: bool, out: wp.array[wp.mat33d]):
         hessian = mat99()
         for n in range(columns):
             for j in range(3):
                 slope = shape()
                 for k in range(4):
-                    stress, _by_values = wp.grad(density)(moved(f, j, n, OFFSETS[k] * STEP * size), v)
+                    stress, _by_values = wp.grad(energy)(moved(f, j, n, OFFSETS[k] * step), v)
                     slope += SHARES[k] * stress
                 for m in range(columns):
                     for i in range(3):
-                        hessian[3 * n + j, 3 * m + i] = scale * entry(slope, i, m)
-        write_blocks(hessian, columns, clamp[b] != 0, tangent_out[b, p])
+                        hessian[3 * n + j, 3 * m + i] = entry(slope, i, m) / (TWELVE * step)
+        write_blocks(hessian, columns, clamp, out)
 
-    return SimpleNamespace(local_step=local_step, tangent=tangent, adjoint=adjoint, values=vector)
+    return Law(name, vector, response, slopes, tangent, lame)

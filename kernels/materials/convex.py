@@ -26,10 +26,10 @@ viscosities and moduli of branches, not ratios to the elastic ones.
 import warp as wp
 
 from ..axial import muscle_pull
+from ..laws import Law
 from ..matrices import SMALLEST_STRETCH_SUM, cofactor, polar_rotation, signed_svd, spectral_blocks
 from ..modules import generated, named_module
 from . import corotated, mooney_rivlin
-from .density import Law
 
 POWERS_OF_A, POWERS_OF_B = 3, 2
 _B, _J = POWERS_OF_A, POWERS_OF_A + POWERS_OF_B
@@ -402,4 +402,4 @@ def convex_law(ogden: tuple[int, ...], fibres: int) -> Law:
 
     # Viscosity has moduli of its own, so that the elastic ones contribute nothing to it.
     lame = ((0.0, 0.0),) * ISOTROPIC + ((1.0, 0.0), (0.0, 1.0)) + ((0.0, 0.0),) * (count - _OGDEN)
-    return Law(name, lame, moduli, response, slopes, tangent)
+    return Law(f"solid.{name}", moduli, response, slopes, tangent, lame)

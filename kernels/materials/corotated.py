@@ -20,6 +20,7 @@ U follows from C as in `kernels.lanes`.
 
 import warp as wp
 
+from ..laws import Law
 from ..matrices import (
     HALLEY_ITERATIONS,
     HALLEY_TOLERANCE,
@@ -33,16 +34,12 @@ from ..matrices import (
     spectral_blocks,
 )
 
-NAME, LAME = "corotated", ((1.0, 0.0), (0.0, 1.0 / 3.0))
-LANES = True  # `kernels.lanes` has the shape term
 UPDATE_TOLERANCE = wp.float64(1.0e-30)  # squared norm of the last projection's update, which converges linearly
 NEARLY_A_LINE = wp.float64(1.0e-3)
 LARGEST_GROWTH = wp.float64(0.4)  # |J - 1| up to which Newton's iteration converges, and to the nearest D
 NEWTON_ITERATIONS, PROJECTIONS = 8, 60
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR, EIGHT, TWELVE = wp.float64(3.0), wp.float64(4.0), wp.float64(8.0), wp.float64(12.0)
-
-moduli = wp.types.vector(2, wp.float64)  # (mu, lambda)
 
 
 @wp.func
@@ -143,7 +140,7 @@ def unimodular_offset(f: wp.mat33d) -> wp.mat33d:
 
 
 @wp.func
-def response(f: wp.mat33d, m: moduli):
+def response(f: wp.mat33d, m: wp.vec2d):
     """Returns energy and stress; both terms are w/2 dist^2(F, manifold), so that P = w (F - projection of F)."""
     energy = ZERO
     stress = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
@@ -159,9 +156,9 @@ def response(f: wp.mat33d, m: moduli):
 
 
 @wp.func
-def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
-    """Implements ``kernels.materials``."""
-    result = moduli(ZERO, ZERO)
+def slopes(f: wp.mat33d, df: wp.mat33d, m: wp.vec2d, carried: wp.vec2d) -> wp.vec2d:
+    """Implements `Law`."""
+    result = wp.vec2d()
     if carried[0] != ZERO:
         result[0] = TWO * wp.ddot(f - polar_rotation(f), df)
     if carried[1] != ZERO:
@@ -217,7 +214,7 @@ def rotation_blocks(r: wp.mat33d, scaled: wp.mat33d, shape: wp.float64, out: wp.
 
 
 @wp.func
-def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
+def tangent(f: wp.mat33d, m: wp.vec2d, clamp: bool, out: wp.array[wp.mat33d]):
     """Writes the blocks of dP/dF, by singular values unless the rotation suffices."""
     if clamp or m[1] != ZERO or wp.determinant(f) < SMALLEST_STRETCH_SUM:
         u, s, v = signed_svd(f)
@@ -229,3 +226,8 @@ def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
     else:
         r = polar_rotation(f)  # of the shape term, 2 mu (dF - dR)
         rotation_blocks(r, TWO * m[0] * turning(f, r), m[0], out)
+
+
+LAW = Law(
+    "solid.corotated", wp.vec2d, response, slopes, tangent, lame=((1.0, 0.0), (0.0, 1.0 / 3.0)), has_lanes=True
+)  # of the values mu and lambda

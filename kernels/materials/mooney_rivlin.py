@@ -9,23 +9,21 @@ logarithm, and with lambda shifted by mu so that small strains give exactly line
 
 import warp as wp
 
+from ..laws import Law
 from ..matrices import cofactor, signed_svd, spectral_blocks
 
-NAME, LAME = "mooney_rivlin", ((2.0, 0.0), (2.0, 0.0), (0.0, 1.0))
 ZERO, HALF, ONE, TWO = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0)
 THREE, FOUR = wp.float64(3.0), wp.float64(4.0)
 
-moduli = wp.types.vector(3, wp.float64)  # (c10, c01, lambda)
-
 
 @wp.func
-def volume_slope(m: moduli, jac: wp.float64) -> wp.float64:
+def volume_slope(m: wp.vec3d, jac: wp.float64) -> wp.float64:
     """Derivative of the terms in J by J."""
     return TWO * m[0] * (jac - TWO) - FOUR * m[1] + m[2] * (jac - ONE)
 
 
 @wp.func
-def response(f: wp.mat33d, m: moduli):
+def response(f: wp.mat33d, m: wp.vec3d):
     """Returns the energy above and its derivative."""
     first = wp.ddot(f, f)
     cof = cofactor(f)
@@ -40,12 +38,12 @@ def response(f: wp.mat33d, m: moduli):
 
 
 @wp.func
-def slopes(f: wp.mat33d, df: wp.mat33d, m: moduli, carried: moduli) -> moduli:
-    """Implements ``kernels.materials``."""
+def slopes(f: wp.mat33d, df: wp.mat33d, m: wp.vec3d, carried: wp.vec3d) -> wp.vec3d:
+    """Implements `Law`."""
     jac = wp.determinant(f)
     along = wp.ddot(cofactor(f), df)
     second = wp.ddot(f, f) * wp.ddot(f, df) - wp.ddot(f * (wp.transpose(f) * f), df)
-    return moduli(TWO * wp.ddot(f, df) + TWO * (jac - TWO) * along, TWO * second - FOUR * along, (jac - ONE) * along)
+    return wp.vec3d(TWO * wp.ddot(f, df) + TWO * (jac - TWO) * along, TWO * second - FOUR * along, (jac - ONE) * along)
 
 
 # With the principal stresses sigma_i of I2, 2 s_i (s_j^2 + s_k^2), and of a function g of J, g' s_j s_k:
@@ -119,7 +117,7 @@ def write_tangent(
 
 
 @wp.func
-def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
+def tangent(f: wp.mat33d, m: wp.vec3d, clamp: bool, out: wp.array[wp.mat33d]):
     """Writes the blocks of dP/dF, with `clamp` those of the nearest tangent without negative eigenvalues."""
     curvature = TWO * m[0] + m[2]
     if clamp:
@@ -129,3 +127,7 @@ def tangent(f: wp.mat33d, m: moduli, clamp: bool, out: wp.array[wp.mat33d]):
         spectral_blocks(u, v, normal, flip, twist, True, out)
         return
     write_tangent(f, m[0], m[1], volume_slope(m, wp.determinant(f)), curvature, out)
+
+
+# Of the values c10, c01 and lambda.
+LAW = Law("solid.mooney_rivlin", wp.vec3d, response, slopes, tangent, lame=((2.0, 0.0), (2.0, 0.0), (0.0, 1.0)))

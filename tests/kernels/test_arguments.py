@@ -14,15 +14,14 @@ import pytest
 import warp as wp
 
 import warp_resphys.kernels
-from warp_resphys.kernels.axial import LAWS, axial_kernels
+from warp_resphys.kernels.axial import MUSCLE
 from warp_resphys.kernels.elasticity import solid_kernels
-from warp_resphys.kernels.energy_functions import pointwise_kernels
 from warp_resphys.kernels.hessian_blocks import projection_kernel, scatter_kernel
-from warp_resphys.kernels.lanes import cell_kernels
+from warp_resphys.kernels.lanes import cell_step, cell_tangent
+from warp_resphys.kernels.laws import point_kernels
 from warp_resphys.kernels.lbfgs import lbfgs_kernels
 from warp_resphys.kernels.line_search import accept_kernel
 from warp_resphys.kernels.materials import corotated
-from warp_resphys.kernels.materials.convex import convex_law
 from warp_resphys.kernels.points import gather_kernels
 from warp_resphys.kernels.tiled_cholesky import tiled_kernels
 
@@ -30,25 +29,16 @@ wp.set_module_options({"enable_backward": False})
 FOLDER = Path(warp_resphys.kernels.__file__).parent
 
 
-@wp.func
-def square(x: wp.vec3d, v: wp.vec2d) -> wp.float64:
-    return v[0] * wp.dot(x, x)
-
-
-def kernels_in(holder):
-    return [value for value in vars(holder).values() if isinstance(value, wp.Kernel)]
-
-
 @functools.cache
 def kernels():
     """One of every kernel of the package, by file and name."""
     names = [info.name for info in pkgutil.walk_packages([str(FOLDER)], "warp_resphys.kernels.")]
-    made = [*map(importlib.import_module, names), *map(axial_kernels, LAWS), *map(gather_kernels, (1, 3))]
+    made = [*map(importlib.import_module, names), point_kernels(MUSCLE), *map(gather_kernels, (1, 3))]
     made += [make(wp.float64) for make in (lbfgs_kernels, tiled_kernels)]
-    made += [solid_kernels(corotated), solid_kernels(convex_law((3,), 1)), cell_kernels(corotated)]
-    made += [pointwise_kernels(square)]
-    made += [SimpleNamespace(kernel=make(wp.float64)) for make in (accept_kernel, projection_kernel, scatter_kernel)]
-    found = [kernel for holder in made for kernel in kernels_in(holder)]
+    made += [solid_kernels(corotated.LAW)]
+    found = [kernel for holder in made for kernel in vars(holder).values() if isinstance(kernel, wp.Kernel)]
+    found += [make(wp.float64) for make in (accept_kernel, projection_kernel, scatter_kernel)]
+    found += [make(corotated.LAW) for make in (cell_step, cell_tangent)]
     return {(Path(inspect.getsourcefile(kernel.func)).name, kernel.func.__name__): kernel for kernel in found}
 
 
@@ -113,11 +103,18 @@ class Reader(ast.NodeVisitor):
             self.written |= {self.place(arguments[name])[0] for name in written_by(called)}
 
 
+def writes(statement, name):
+    """Whether a statement of C++ assigns to an array, or gives a name to its memory that is not constant."""
+    target, _, value = re.sub(r"[=!<>]=", "", statement).partition("=")
+    named = value.strip() == f"{name}.data" and "const S*" not in target
+    return named or (bool(value) and f"{name}.data[" in target)
+
+
 @functools.cache
 def written_by(function):
     """Names of the arguments that a kernel or a Warp function writes."""
     if code := getattr(function, "native_snippet", None):
-        return set(re.findall(r"(?<!const )S\* const \w+ = (\w+)\.data", code))
+        return {name for name in function.input_types if any(writes(part, name) for part in re.split("[;{}]", code))}
     tree, names = definition(function.func)
     reader = Reader({arg.label: arg.type for arg in function.adj.args}, names)
     for _ in range(2):  # A row may have its name in a loop.

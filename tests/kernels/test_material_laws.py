@@ -15,9 +15,9 @@ MU, BULK = 3.0, 7.0
 # The law, its moduli, and the Lame constants of small strains.
 GENT = density_law("gent", gent.energy_density, gent.volume_energy)
 LAWS = {
-    "corotated": (corotated, (MU, BULK), (MU, BULK / 3.0)),
-    "stable_neo_hookean": (mooney_rivlin, (0.5 * MU, 0.0, BULK), (MU, BULK)),
-    "mooney_rivlin": (mooney_rivlin, (MU, 2.0, BULK), (2.0 * MU + 4.0, BULK)),
+    "corotated": (corotated.LAW, (MU, BULK), (MU, BULK / 3.0)),
+    "stable_neo_hookean": (mooney_rivlin.LAW, (0.5 * MU, 0.0, BULK), (MU, BULK)),
+    "mooney_rivlin": (mooney_rivlin.LAW, (MU, 2.0, BULK), (2.0 * MU + 4.0, BULK)),
     "gent": (GENT, (1.0, 1.0, MU, BULK, MU, 60.0, BULK), (MU, BULK - 2.0 / 3.0 * MU)),
 }
 TERMS = (3.0, 2.0, 1.5, 1.0, 0.7, 0.4, BULK, 3.0, 1.0, 1.0)
@@ -47,8 +47,8 @@ def kernel_of(name):
 
     @wp.kernel(module=module)
     def evaluate(
-        f: wp.array[wp.mat33d], df: wp.array[wp.mat33d], m: law.moduli, clamp: bool, energy_out: wp.array[wp.float64],
-        stress_out: wp.array[wp.mat33d], slopes_out: wp.array[law.moduli], tangent_out: wp.array2d[wp.mat33d],
+        f: wp.array[wp.mat33d], df: wp.array[wp.mat33d], m: law.values, clamp: bool, energy_out: wp.array[wp.float64],
+        stress_out: wp.array[wp.mat33d], slopes_out: wp.array[law.values], tangent_out: wp.array2d[wp.mat33d],
     ):  # fmt: skip
         i = wp.tid()
         energy, stress = law.response(f[i], m)
@@ -63,10 +63,10 @@ def kernel_of(name):
 def response(name, f=GRADIENTS, moduli=None, clamp=False):
     """Energies (B), stresses (B, 3, 3), slopes (B, n) and tangents (B, 9, 9)."""
     law, own, _ = LAWS[name]
-    sizes = [(len(f), wp.float64), (len(f), wp.mat33d), (len(f), law.moduli), ((len(f), 6), wp.mat33d)]
+    sizes = [(len(f), wp.float64), (len(f), wp.mat33d), (len(f), law.values), ((len(f), 6), wp.mat33d)]
     out = [wp.zeros(size, dtype=kind, device="cpu") for size, kind in sizes]
     fields = [wp.array(field, dtype=wp.mat33d, device="cpu") for field in (f, DIRECTION)]
-    wp.launch(kernel_of(name), len(f), [*fields, law.moduli(*(moduli or own)), clamp, *out], device="cpu")
+    wp.launch(kernel_of(name), len(f), [*fields, law.values(*(moduli or own)), clamp, *out], device="cpu")
     energy, stress, slopes, blocks = (array.numpy() for array in out)
     tangent = np.zeros((len(f), 3, 3, 3, 3))  # column and row of the stress, column and row of F
     for number, (k, n) in enumerate([(0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)]):

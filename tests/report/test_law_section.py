@@ -127,11 +127,11 @@ def test_stress_is_that_of_the_simulated_law(direction):
     constants = {**TERMS, **({} if direction is None else {**FIBRES, "fibre_azimuth_1": azimuth})}
     material = ConvexMaterial.from_constants(constants)
     own = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in material.constants.items()}
-    law_of, module = material.law, wp.get_module(f"test_law.{material.law.NAME}")
-    moduli = law_of.moduli(*(float(modulus) for modulus in material.moduli(own)))
+    law_of, module = material.law, wp.get_module(f"test_law.{material.law.name}")
+    moduli = law_of.values(*(float(modulus) for modulus in material.moduli(own)))
 
     @wp.kernel(module=module, enable_backward=False)
-    def stress_of(f: wp.array[wp.mat33d], m: law_of.moduli, stress_out: wp.array[wp.mat33d]):
+    def stress_of(f: wp.array[wp.mat33d], m: law_of.values, stress_out: wp.array[wp.mat33d]):
         _energy, stress = law_of.response(f[wp.tid()], m)
         stress_out[wp.tid()] = stress
 

@@ -10,12 +10,11 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError, MeshError
-from ..kernels.axial import axial_kernels
+from ..kernels.axial import THREAD
 from ..mesh.chambers import Chamber, face_rule
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
@@ -118,7 +117,7 @@ class Fibres(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "FibreTerm":
         shapes = {"fibre_stiffness": (self.count,)}
-        return FibreTerm(launcher, sets, axial_kernels("thread"), shapes, self.count, extra=[wp.float64(self.toe)])
+        return FibreTerm(launcher, sets, THREAD, shapes, self.count, constants=[self.toe])
 
 
 class FibreTerm(ReadingTerm):

@@ -90,7 +90,7 @@ class BoundHysteresis(BoundEnergy):
         solid = hysteresis.solid
         self._material, self._moduli = solid.material, PointModuli(solid, site)
         law, like = solid.material.law, site.rest_positions
-        self._shear = like.new_tensor([shear for shear, _ in law.LAME])  # (T,) contribution of each modulus to mu
+        self._shear = like.new_tensor([shear for shear, _ in law.lame])  # (T,) contribution of each modulus to mu
         points = sum(s.n_points for s in solid.discretisation.point_sets)
         self._shape = (len(solid.material.hysteresis), points, 3, 3)
         self.memory = (Memory(PLASTIC_STRAIN, "strain", self._shape, "slider"),)

@@ -26,6 +26,7 @@ import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
+from ..kernels.laws import Law
 from ..kernels.materials import corotated, gent, mooney_rivlin
 from ..kernels.materials.convex import ISOTROPIC, convex_law
 from ..kernels.materials.density import density_law
@@ -59,7 +60,7 @@ class Material(ABC):
     """
 
     model: ClassVar[str] = ""  # name in configurations, if it has one
-    law: ClassVar[Any]  # module of ``kernels.materials``, or an object with the same attributes
+    law: ClassVar[Law]  # energy of a point and its derivatives
     # integration of each modulus of the law: ``shape`` or ``volume`` rule, or ``mean`` over the volume of a point
     rules: ClassVar[tuple[str, ...]]
     # upper bound of each modulus' contribution to the tangent's eigenvalues at small strains
@@ -190,7 +191,7 @@ class Corotated(_Hookean):
     """
 
     model = "corotated"
-    law = corotated
+    law = corotated.LAW
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ class StableNeoHookean(_Hookean):
     """A neo-Hookean material, finite for inverted elements, and linear elasticity at small strains."""
 
     model = "stable_neo_hookean"
-    law = mooney_rivlin
+    law = mooney_rivlin.LAW
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
 
@@ -214,7 +215,7 @@ class MooneyRivlin(Material):
     """Rubber with two elastic constants and a bulk modulus; at small strains mu is 2 (c10 + c01)."""
 
     model = "mooney_rivlin"
-    law = mooney_rivlin
+    law = mooney_rivlin.LAW
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
 
@@ -250,7 +251,7 @@ class DensityMaterial(Material):
         cls.law = density_law(
             f"{cls.__module__}.{cls.__name__}", cls.energy_density, cls.volume_energy or cls.energy_density
         )
-        count = len(cls.law.LAME) - 4
+        count = len(cls.law.lame) - 4
         cls.rules = ("shape", "volume", "shape", "volume", *("mean",) * count)
         cls.curvature = (0.0, 0.0, 2.0, 1.0, *(0.0,) * count)
 

@@ -16,13 +16,12 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..fem.integration_points import physical_gradients
 from ..io.errors import InputError
-from ..kernels.axial import axial_kernels
+from ..kernels.axial import MUSCLE
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from .base import Energy
@@ -156,7 +155,7 @@ class Muscles(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MuscleTerm":
         shapes = dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
-        return MuscleTerm(launcher, sets, axial_kernels("muscle"), shapes, self.count, extra=[wp.float64(self.toe)])
+        return MuscleTerm(launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe])
 
 
 class MuscleTerm(ReadingTerm):

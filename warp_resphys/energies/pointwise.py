@@ -26,7 +26,8 @@ from typing_extensions import override
 
 from ..fem.integration_points import physical_gradients
 from ..io.errors import InputError
-from ..kernels.energy_functions import pointwise_kernels
+from ..kernels.energy_functions import derived_law
+from ..kernels.laws import Law, point_kernels
 from ..kernels.points import PartValues
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter
@@ -41,30 +42,36 @@ class ReadingTerm(PartTerm):
     Args:
         launcher: launcher of the potential.
         sets: one set of points.
-        kernels: ``local_step``, ``tangent`` and ``adjoint``, and the vector type ``values``.
+        law: energy of a point as a function of the values.
         shapes: shapes of the values in the order of the vector: (count,) or (count, n) for one or n values per part.
         count: number of parts.
         arrays: names of arrays, of any shape, that every point reads completely.
-        extra: arguments of the kernels after the values.
+        constants: numbers that are the last values at every point.
     """
 
     def __init__(
         self,
         launcher: Launcher,
         sets: Sequence[PointSet],
-        kernels: Any,
+        law: Law,
         shapes: Mapping[str, tuple[int, ...]],
         count: int,
         arrays: Sequence[str] = (),
-        extra: Sequence[Any] = (),
+        constants: Sequence[float] = (),
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
-        self._kernels, self._extra, self._shapes = kernels, extra, dict(shapes)
+        self._kernels, self._law, self._shapes = point_kernels(law), law, dict(shapes)
         self._arrays = frozenset(arrays)
+        self._constants = launcher.zeros(len(constants)) + torch.tensor(
+            constants, device=launcher.device, dtype=torch.float64
+        )
         part = self.part_of.cpu().numpy()
         self._columns = {name: self._columns_of(name, part) for name in self._shapes}
-        self._column = launcher.upload(np.concatenate(list(self._columns.values())).astype(np.int32), int)
+        of_constants = np.tile(np.arange(len(constants))[:, None], len(part))
+        columns = np.concatenate([*self._columns.values(), of_constants])
+        self._column = launcher.upload(columns.astype(np.int32), int)
         sizes = [int(np.prod(shape)) for name, shape in self._shapes.items() for _ in self._columns[name]]
+        sizes += [len(constants)] * len(constants)
         self._sizes = launcher.upload(np.array(sizes, dtype=np.int32), int)
 
     def _columns_of(self, name: str, part: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -77,13 +84,19 @@ class ReadingTerm(PartTerm):
     @override
     def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
         pointers = [self.values[name].data_ptr() for name in self._shapes for _ in self._columns[name]]
+        pointers += [self._constants.data_ptr()] * self._constants.shape[1]
         addresses = self.launcher.upload(np.array(pointers, dtype=np.uint64), wp.uint64)
         where = {"addresses": addresses, "sizes": self._sizes, "places": self._column}
-        return [s.points, struct_of(PartValues, weights=self.weights, **where), *self._extra, positions]
+        return [s.points, struct_of(PartValues, weights=self.weights, **where), positions]
+
+    @override
+    def curvature(self) -> torch.Tensor:
+        """Returns zero: the constant matrix of projective dynamics does not contain these energies."""
+        return torch.zeros_like(self.weight)[None]
 
     @override
     def _slopes(self) -> list[Slope]:
-        return [Slope("", (self.n_points, self._kernels.values._length_), self._kernels.values)]
+        return [Slope("", (self.n_points, self._law.values._length_), self._law.values)]
 
     @override
     def _by_values(self, out: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -129,22 +142,18 @@ class PointwiseTerm(ReadingTerm):
     """Kernels of a pointwise energy."""
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], energy: PointwiseEnergy) -> None:
-        kernels = pointwise_kernels(energy.density)
+        density = energy.density
+        law = derived_law(f"pointwise.{density.module.name}.{density.key}.{energy.size:g}", density, energy.size)
         names = [quantity.name for quantity in (*energy.parameters, *energy.inputs)]
         arrays = {q.name: q.shape for q in energy.parameters if q.shape}
         values = len(names) - len(arrays) + sum(int(np.prod(shape)) for shape in arrays.values())
-        if kernels.values._length_ != values:
+        if law.values._length_ != values:
             raise InputError(
-                f"the density of {type(energy).__name__} takes {kernels.values._length_} values, but the energy has "
+                f"the density of {type(energy).__name__} takes {law.values._length_} values, but the energy has "
                 f"{values}: {', '.join(names)}."
             )
         shapes: dict[str, tuple[int, ...]] = {name: arrays.get(name, (energy.count,)) for name in names}
-        super().__init__(launcher, sets, kernels, shapes, energy.count, list(arrays), [wp.float64(energy.size)])
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        """Returns zero: the constant matrix of projective dynamics does not contain these energies."""
-        return torch.zeros_like(self.weight)[None]
+        super().__init__(launcher, sets, law, shapes, energy.count, list(arrays))
 
 
 def at_vertices(vertices: ArrayLike, part: ArrayLike = 0) -> PartPoints:

@@ -8,20 +8,21 @@ pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels import follower_pressure as kernels
+from ..kernels.follower_pressure import PRESSURE as PRESSURE_LAW
 from ..mesh.chambers import Chamber, check_chambers, face_rule
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import Energy
 from .launcher import Launcher
-from .term import PartPoints, PartTerm, PointSet, Slope
+from .pointwise import ReadingTerm
+from .term import PartPoints, PointSet
 
 PRESSURE = Quantity(
     *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
@@ -84,27 +85,5 @@ class Pressure(Energy):
         return parts.new_zeros(len(parts), self.count).index_add(1, torch.as_tensor(points.part).to(f.device), parts)
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PressureTerm":
-        return PressureTerm(launcher, sets, {"pressure": (self.count,)}, self.count)
-
-
-class PressureTerm(PartTerm):
-    """Kernels of pressure."""
-
-    _kernels = kernels
-
-    @override
-    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
-        return [s.points, self.weights, self.part, self.view("pressure"), positions]
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        return torch.zeros_like(self.weight)[None]
-
-    @override
-    def _slopes(self) -> list[Slope]:
-        return [Slope("pressure", (self.n_points,))]
-
-    @override
-    def _adjoint_inputs(self, s: PointSet, positions: Any, direction: Any) -> list[Any]:
-        return [s.points, self.weights, positions, direction]
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
+        return ReadingTerm(launcher, sets, PRESSURE_LAW, {"pressure": (self.count,)}, self.count)

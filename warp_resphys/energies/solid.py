@@ -109,8 +109,8 @@ class Solid(Energy):
     def kernel(self, device: torch.device) -> Any:
         """Returns a kernel of the module that evaluates the material on a device."""
         law, several = self.material.law, any(own.points_per_cell > 1 for own in self.discretisation.point_sets)
-        if device.type == "cpu" and several and getattr(law, "LANES", False):
-            return lanes.cell_kernels(law).step
+        if device.type == "cpu" and several and law.has_lanes:
+            return lanes.cell_step(law)
         return kernels.solid_kernels(law).local_step
 
 
@@ -246,7 +246,7 @@ class SolidTerm(StrainTerm):
         shapes = ((points, moduli), (2,), (points, 3, 3), (points,))
         super().__init__(launcher, sets, dict(zip(("stiffness", *VISCOUS), shapes, strict=True)))
         self._law = law = material.law
-        self._kernels, self._vector, self._moduli = kernels.solid_kernels(law), law.moduli, moduli
+        self._kernels, self._moduli = kernels.solid_kernels(law), moduli
         self._carried = carried
         self._lanes = dict[PointSet, Any]()
         self._curvature = torch.as_tensor(material.curvature, device=launcher.device, dtype=torch.float64)
@@ -263,17 +263,17 @@ class SolidTerm(StrainTerm):
     def step(self, s: PointSet, positions: Any) -> Kernel:
         if (cells := self.lane_cells(s)) is None:
             return super().step(s, positions)
-        return Kernel(lanes.cell_kernels(self._law).step, [*self._arguments(s, positions), cells], by_cells=True)
+        return Kernel(lanes.cell_step(self._law), [*self._arguments(s, positions), cells], by_cells=True)
 
     @override
     def tangent(self, s: PointSet, positions: Any) -> Kernel:
         if (cells := self.lane_cells(s)) is None:
             return super().tangent(s, positions)
-        return Kernel(lanes.cell_kernels(self._law).tangent, [*self._arguments(s, positions), cells], by_cells=True)
+        return Kernel(lanes.cell_tangent(self._law), [*self._arguments(s, positions), cells], by_cells=True)
 
     def lane_cells(self, s: PointSet) -> Any:
         """Returns the `kernels.lanes.LaneCells` of a set for kernels with one thread per cell, or None without."""
-        if self.launcher.by_cells or not getattr(self._law, "LANES", False):
+        if self.launcher.by_cells or not self._law.has_lanes:
             return None
         if s not in self._lanes:
             self._lanes[s] = self._lane_arrays(s)
@@ -314,10 +314,10 @@ class SolidTerm(StrainTerm):
             "strain_offset": (n, 3, 3),
             "dilation_offset": (n,),
         }
-        kinds = (self._vector, wp.vec2d, wp.mat33d, wp.float64)
+        kinds = (self._law.values, wp.vec2d, wp.mat33d, wp.float64)
         return [Slope(*item, kind) for item, kind in zip(shapes.items(), kinds, strict=True)]
 
     @override
     def _adjoint_inputs(self, s: PointSet, positions: Any, direction: Any) -> list[Any]:
-        carried = self.launcher.upload(self._carried[s.in_energy], self._vector)
+        carried = self.launcher.upload(self._carried[s.in_energy], self._law.values)
         return [*self._arguments(s, positions), carried, direction]

@@ -22,12 +22,11 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..io.errors import InputError
-from ..kernels.axial import axial_kernels
+from ..kernels.axial import STRING
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity
 from ..stepping.state import ImplicitStage, State
@@ -111,7 +110,7 @@ class Strings(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "StringTerm":
         shapes = {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
-        return StringTerm(launcher, sets, axial_kernels("string"), shapes, self.count, extra=[wp.float64(self.toe)])
+        return StringTerm(launcher, sets, STRING, shapes, self.count, constants=[self.toe])
 
     @override
     def bind(self, site: EnergySite) -> "BoundStrings":

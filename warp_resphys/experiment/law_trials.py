@@ -214,7 +214,7 @@ class LawTrials:
         known = {name: float(torch.as_tensor(value)) for name, value in material.constants.items()}
         known |= {name: value for name, value in self.sysid.items() if name in known}
         tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
-        lame = np.asarray(material.law.LAME).T @ [float(m) for m in material.moduli(tensors)]
+        lame = np.asarray(material.law.lame).T @ [float(m) for m in material.moduli(tensors)]
         mu, volume = float(lame[0]), max(float(lame[1]), LEAST * float(lame[0]))
         time = known.get("stiffness_damping", 0.0)
         guess = {

@@ -310,7 +310,7 @@ def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
     if material.model == "law":
         return small_strain({name: float(torch.as_tensor(value)) for name, value in own.constants.items()})
     tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in own.constants.items()}
-    mu, lame = np.asarray(own.law.LAME).T @ [float(modulus) for modulus in own.moduli(tensors)]
+    mu, lame = np.asarray(own.law.lame).T @ [float(modulus) for modulus in own.moduli(tensors)]
     return SmallStrain(float(mu), float(lame))
 
 

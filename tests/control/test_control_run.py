@@ -132,7 +132,7 @@ class TestReducedModel:
         model = reduce(robot, ReductionSettings(modes=(4,), equilibria=20, tangents=20, motions=2, seconds=0.4))
         assert model.times == (0.05,)
         start, speed = robot.begin(), 1e-2 * model.basis[:, 0].reshape(1, -1, 3)
-        pushed = replace(start, body=replace(start.body, v=robot.simulator.tensor(speed)))
+        pushed = replace(start, v=robot.simulator.tensor(speed))
         q = robot.rollout(pushed, 30).q[:, 0].double().numpy()
         mass, shape = robot.constants.mass[0].double().numpy(), model.basis[:, 0].reshape(-1, 3)
         true = np.einsum("tni,n,ni->t", q[1:] - q[0], mass, shape)

@@ -3,6 +3,7 @@
 import json
 import socket
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from warp_resphys.control.controllers import conditioned
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.loading import load
-from warp_resphys.twin.estimator import distances
+from warp_resphys.twin.estimator import adapted, distances
 from warp_resphys.twin.stream import Listener, recorded_packets
 from warp_resphys.twin.tangent import StepTangent, shifted
 from warp_resphys.twin.twin import Twin
@@ -63,6 +64,33 @@ def test_conditioning_is_that_of_normal_variables():
     away = distances(covariance, slopes[:6].reshape(2, 3, 5), residual[:6].reshape(2, 3), 0.3)
     whole = np.sqrt(residual[:3] @ np.linalg.solve(spread[:3, :3], residual[:3]))
     assert away[0] == pytest.approx(whole)
+
+
+def test_what_is_not_seen_is_forgotten(robot):
+    """The force fades in a second, and parameters drift in ten, but never by more than was known before."""
+    stiff = float(robot.simulator.constants["youngs_modulus"])
+    estimator = Twin(robot, refine={"youngs_modulus": 0.1 * stiff}).estimator
+    belief, count, h = estimator.begin({}), len(estimator.tangent.frequencies), robot.time_step
+    belief = replace(belief, bias=np.ones(count), covariance=0.0 * belief.covariance)
+    transition, variances = np.eye(2 * count, 3 * count), []
+    for _ in range(round(10.0 / h)):
+        belief = estimator._propagated(belief, transition)
+        variances.append(belief.covariance[3 * count, 3 * count] / (0.1 * stiff) ** 2)
+        if len(variances) == round(1.0 / h):
+            np.testing.assert_allclose(belief.bias, np.exp(-1.0))
+    assert variances[round(1.0 / h) - 1] == pytest.approx(0.1)
+    assert 0.6 < variances[-1] <= 1.0
+
+
+def test_the_variance_of_steps_adapts_to_the_distances_of_frames():
+    usual = np.sqrt(2.366)  # the median, of three coordinates
+    assert adapted(3.0, np.array([np.nan, usual, 1.1 * usual, 0.9 * usual])) == pytest.approx(3.0, rel=1e-3)
+    assert adapted(3.0, np.full(4, np.nan)) == 3.0
+    far, near = 1.0, 1.0
+    for _ in range(5):  # frames after which the factor follows the squared distances
+        far, near = adapted(far, np.full(4, 10.0 * usual)), adapted(near, np.full(4, 0.1 * usual))
+    assert far == pytest.approx(100.0, rel=1e-3)
+    assert near == 0.03
 
 
 def test_a_step_is_linear_in_its_vibrations(robot):

@@ -15,8 +15,10 @@ from ..io.errors import ConvergenceError, InputError, ResphysError, listed
 from ..io.settings import Positive, Settings, setting
 from ..robot.loading import recorded_trial, trial_names
 from ..robot.robot import Robot
-from ..twin.stream import Alignment, Forecast, Listener, Packet, recorded_packets
-from ..twin.twin import JUMPS, Estimate, Twin
+from ..twin.belief import JUMPS
+from ..twin.forecasts import Estimate, Forecast
+from ..twin.stream import Alignment, Listener, Packet, recorded_packets
+from ..twin.twin import Twin
 
 _REMEMBERED: Final = 2000  # computing times
 _SHARE: Final = 4.0  # time between two predictions, over what one takes

@@ -12,10 +12,11 @@ of (z, w, b, theta, o): an extended Kalman filter of reduced rank (Pham, Verron 
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar, Final, Generic, TypeVar
 
 import numpy as np
+import scipy.special
 
 from ..control.controllers import conditioned
 from ..io.arrays import BoolArray, FloatArray
@@ -23,74 +24,23 @@ from ..io.errors import InputError
 from ..robot.actuation import Given
 from ..robot.robot import Robot
 from ..stepping.state import State
+from .belief import Belief, Correction
 
-_UNKNOWN: Final = 0.1  # deviation of the first shape, and of that after a jump, over the size of the body
-_SIMULATOR: Final = 0.02  # of a simulator whose errors are not known, over the size of the body
-_WANDER: Final = 1.0  # time after which the force on the body is another [s]
-_TRIED: Final = 0.2  # time over which errors are compared with those of the simulator without markers [s]
+# Errors over the size of the body: of a first shape, which may be anything, and so the most that one frame corrects;
+# and of a simulator whose errors are not known, so that a marker further off has jumped or the body is elsewhere.
+_UNKNOWN, _SIMULATOR = 0.1, 0.02
+# Times [s]: after which the force on the body, such as a touch, is another; over which it is judged whether markers
+# stay away or the simulator without markers is better, which is longer than a period of most soft bodies; and after
+# which a refined parameter, such as a stiffness that depends on the temperature, is another.
+_WANDER, _JUDGED, _FORGET = 1.0, 0.2, 10.0
 _WORSE: Final = 1.5  # errors over those of the simulator without markers, above which this takes over
-_MEDIAN: Final = 2.366  # of the squared distance of a marker, chi-squared with three degrees of freedom
-_ADAPTED: Final = 0.2  # share of a frame in the variance of steps, as a power
-_FURTHER: Final = (0.1, 100.0)  # range of a frame's squared distance
-_SHAKEN: Final = (0.03, 1000.0)  # range of the factor
-_EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the body may leave
-_LARGEST: Final = 0.1  # correction of a vertex in one frame, over the size of the body
-_DOUBLINGS: Final = 40  # of the noise of a frame, after which it is left out
-_PLACED: Final = 1e-3  # deviation of markers on the body from where they are bound [m]
-_FORGET: Final = 10.0  # time after which a refined parameter may be another [s]
-# A marker that jumps away from where it is expected is left out until it has stayed away for a time.
-_GATE: Final = 6.0  # distance from where it is expected, in deviations
-_JUMP: Final = 0.02  # least distance that counts as a jump, over the size of the body
-_GRACE: Final = 0.1  # [s]
-
-
-@dataclass(frozen=True)
-class Correction:
-    """The result of a frame of M markers.
-
-    Attributes:
-        seen: (M,) markers in the frame.
-        refused: (M,) markers that were left out, since they jumped.
-        moved: (M,) markers that have moved on the body, to where they are looked for from now on.
-        restarted: whether the body has moved to where markers stayed, so that its state was unknown.
-        off: (M,) distances from where the corrected simulator expected them [m], NaN where not seen.
-        free: (M, 3) offsets from the simulator that sees no markers [m], NaN where not seen.
-        worse: whether these have been much smaller for a while, so that it went on from there.
-    """
-
-    seen: BoolArray
-    refused: BoolArray
-    moved: BoolArray
-    restarted: bool
-    off: FloatArray
-    free: FloatArray
-    worse: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class Belief:
-    """Estimate of a robot's state after a step, with its covariance.
-
-    Attributes:
-        parameters: (P,) refined values.
-        bias: (r,) shift of the equilibrium.
-        places: (M, 3) markers from where they are bound [m].
-        covariance: (n, n) of the errors of z, w, b, parameters and places.
-        since: (M,) for how long markers have been left out [s].
-        left: (M, 3) what was left of the distance of markers when they were last believed [m]; NaN for never.
-        squares: (2,) mean squared distances of markers from where they were expected, and from the simulator without
-            markers, over the last frames [m^2].
-        shaken: factor of the variance that a step adds, by which past frames would have been as far off as expected.
-    """
-
-    parameters: FloatArray
-    bias: FloatArray
-    places: FloatArray
-    covariance: FloatArray
-    since: FloatArray
-    left: FloatArray
-    squares: FloatArray
-    shaken: float = 1.0
+_GATE: Final = 6.0  # distance of a marker that has jumped, in deviations; fewer would refuse true errors of the model
+_EXPLAINED: Final = 0.3  # of the distance of markers that jumped, what a motion of the whole body may leave
+_PLACED: Final = 1e-3  # deviation of markers on the body from where they are bound, as measured with a ruler [m]
+_MEDIAN: Final = 2.0 * scipy.special.gammaincinv(1.5, 0.5)  # of chi-squared with three degrees of freedom
+_ADAPTED: Final = 0.2  # power of a frame's share in the variance of steps, so that about five frames count
+_SHAKEN: Final = (0.03, 1000.0)  # range of the factor of that variance: never zero, as no simulator is exact
+_DOUBLINGS: Final = 40  # of the noise of a frame, after which a correction is nothing
 
 
 B = TypeVar("B", bound=Belief)
@@ -286,7 +236,7 @@ class TwinEstimator(ABC, Generic[B]):
                 since = np.where(moved, 0.0, since)
         squares, worse = self._compared(belief.squares, off, apart, passed)
         correction = Correction(seen, refused, moved, restarted, off, markers - free, worse)
-        belief = replace(belief, since=since, squares=squares, shaken=_shaken(belief.shaken, away))
+        belief = replace(belief, since=since, squares=squares, shaken=adapted(belief.shaken, away))
         if worse:
             return self.without_markers(belief), correction
         use = seen & ~refused
@@ -307,9 +257,9 @@ class TwinEstimator(ABC, Generic[B]):
             since: (M,) how long each has been left out [s].
             passed: time since the last frame [s].
         """
-        out = (away > _GATE) & (jump > _JUMP * self.size)
+        out = (away > _GATE) & (jump > _SIMULATOR * self.size)
         later = np.where(out, since + passed, np.where(np.isnan(away), since, 0.0))
-        return out, out & (since > 0.0) & (later >= _GRACE), later
+        return out, out & (since > 0.0) & (later >= _JUDGED), later
 
     def _compared(
         self, squares: FloatArray, off: FloatArray, apart: FloatArray, passed: float
@@ -319,7 +269,7 @@ class TwinEstimator(ABC, Generic[B]):
         if not seen.any():
             return squares, False
         now = np.array([np.mean(x[seen] ** 2) for x in (off, apart)])
-        squares = now + np.exp(-passed / _TRIED) * (squares - now)
+        squares = now + np.exp(-passed / _JUDGED) * (squares - now)
         own, other = squares
         return squares, bool(own > _WORSE**2 * (other + 3.0 * self.noise**2))
 
@@ -328,7 +278,7 @@ class TwinEstimator(ABC, Generic[B]):
         deviation, rows = self.noise, slopes.reshape(-1, slopes.shape[2])
         for _ in range(_DOUBLINGS):
             change, covariance = conditioned(belief.covariance, rows, residual.ravel(), deviation)
-            if self._furthest(belief, *self._parts(change)[::3]) <= _LARGEST * self.size:  # Vibrations are small.
+            if self._furthest(belief, *self._parts(change)[::3]) <= _UNKNOWN * self.size:  # Vibrations are small.
                 return change, covariance
             deviation *= 2.0
         return np.zeros(len(belief.covariance)), belief.covariance
@@ -386,12 +336,12 @@ class TwinEstimator(ABC, Generic[B]):
         }
 
 
-def _shaken(before: float, away: FloatArray) -> float:
+def adapted(before: float, away: FloatArray) -> float:
     """Adapts `Belief.shaken` to a frame with markers (M,) at some distances from where they were expected, or NaN."""
     if np.isnan(away).all():
         return before
     far = float(np.nanmedian(away)) ** 2 / _MEDIAN
-    return float(np.clip(before * np.clip(far, *_FURTHER) ** _ADAPTED, *_SHAKEN))
+    return float(np.clip(before * far**_ADAPTED, *_SHAKEN))
 
 
 def distances(covariance: FloatArray, slopes: FloatArray, residual: FloatArray, deviation: float) -> FloatArray:

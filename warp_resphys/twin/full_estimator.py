@@ -25,7 +25,8 @@ from ..robot.actuation import Given
 from ..robot.robot import Robot
 from ..stepping.quantity import Quantity
 from ..stepping.state import State
-from .estimator import Belief, TwinEstimator
+from .belief import Belief
+from .estimator import TwinEstimator
 from .tangent import StepTangent, pulled_by, shifted
 
 _MODES: Final = 8  # vibrations in which the state is corrected

@@ -16,7 +16,8 @@ from ..learning.correction import DIVERGENCE_DISTANCE
 from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
 from ..stepping.state import State
-from .estimator import Belief, TwinEstimator
+from .belief import Belief
+from .estimator import TwinEstimator
 
 _SLOWEST = 1.0  # least frequency of a coordinate, for the scale of its errors [rad/s]
 

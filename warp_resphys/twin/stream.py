@@ -1,8 +1,9 @@
-"""Packets of markers and commands, from a recording or over UDP; predictions, compared with the markers that come."""
+"""Packets of markers and commands, from a recording or over UDP."""
 
 import json
 import socket
-from collections import Counter, deque
+from bisect import insort
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,20 +15,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..data.recordings.recording_files import read_recording
 from ..data.registration import RigidTransform, register_markers
-from ..data.rigid_bodies import as_markers, with_corners
+from ..data.rigid_bodies import with_corners
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError, listed
+from ..robot.actuation import Given
 from ..robot.robot import Robot
-from ..stepping.state import State
 
 _LARGEST: Final = 65_535  # bytes of a packet
 _FIELDS: Final = ("time", "markers", "inputs", "plan")
 _LONGEST: Final = 1000  # packets that wait for the registration
+ROUNDING: Final = 1e-3  # of times, in steps: clocks that count from 1970 resolve microseconds
 _KINDS: Final = 30  # of faults that are counted apart
 _FIRST: Final = 20  # frames whose median is registered
-REMEMBERED: Final = 400  # predictions
-_ENOUGH: Final = 20  # predictions from which intervals are scaled
-_NINETY: Final = 1.645  # half-width of an interval of 90 %, in deviations
 
 
 @dataclass(frozen=True)
@@ -111,6 +110,68 @@ def recorded_packets(robot: Robot, path: str | Path) -> Iterator[Packet]:
         commands = ({driven[0]: row} for row in recording.actuation)
     for time, frame, inputs in zip(recording.time, recording.positions, commands, strict=True):
         yield Packet(float(time), dict(zip(recording.labels, frame, strict=True)), inputs)
+
+
+def frame_of(markers: Mapping[str, ArrayLike] | ArrayLike, numbers: Mapping[str, int], faults: "Faults") -> FloatArray:
+    """Returns the positions (M, 3) of a frame [m], with NaN for markers that are not seen.
+
+    Args:
+        markers: positions by name, or (M, 3).
+        numbers: of the M markers, by name.
+        faults: counts names of other markers.
+
+    Raises:
+        InputError: no positions, or another number of markers.
+    """
+    shape = (len(numbers), 3)
+    if isinstance(markers, Mapping):
+        frame = np.full(shape, np.nan)
+        for label, place in markers.items():
+            if label in numbers:
+                frame[numbers[label]] = position_of(place, label)
+            else:
+                faults.add(f"unknown marker {label!r}")
+        return frame
+    frame = np.asarray(markers, dtype=np.float64)
+    if frame.shape != shape:
+        raise InputError(f"a packet has markers of shape {frame.shape}: give {shape}, or positions by name.")
+    return np.where(np.isfinite(frame).all(axis=1)[:, None], frame, np.nan)
+
+
+class CommandSeries:
+    """Commands by name, with the times from which they hold; of equal times, the later added ones.
+
+    Args:
+        first: commands that hold from the beginning.
+        time_step: h [s].
+    """
+
+    def __init__(self, first: Mapping[str, Given], time_step: float) -> None:
+        self._entries: list[tuple[float, Mapping[str, Given]]] = [(-np.inf, first)]
+        self._rounding = ROUNDING * time_step
+
+    def add(self, time: float, commands: Mapping[str, Given]) -> None:
+        """Adds commands that hold from a time on [s]."""
+        insort(self._entries, (time, commands), key=lambda entry: entry[0])
+
+    def at(self, time: float, after: float | None = None) -> dict[str, Given]:
+        """Returns the commands that hold at a time [s], of those that were given after another one."""
+        held = dict[str, Given]()
+        for since, commands in self._entries:
+            if since <= time + self._rounding and (after is None or since > after):
+                held |= commands
+        return held
+
+    def drop_last(self, time: float) -> bool:
+        """Removes the commands that were given last before a time; returns whether there were any."""
+        held = sum(since <= time + self._rounding for since, _ in self._entries)
+        del self._entries[max(held - 1, 0) : held]
+        return bool(held)
+
+    def forget(self, oldest: float) -> None:
+        """Removes commands that others had followed before a time [s]."""
+        later = [entry for entry in self._entries if entry[0] > oldest]
+        self._entries = [(-np.inf, self.at(oldest - self._rounding)), *later]
 
 
 class Faults(Counter[str]):
@@ -243,100 +304,3 @@ class Alignment:
             if label not in self._reference
         }
         return replace(packet, markers=places)
-
-
-@dataclass(frozen=True)
-class Forecast:
-    """A robot in the T steps to come, under constant commands.
-
-    Attributes:
-        times: (T + 1,) from the last step on [s].
-        markers: (T + 1, M, 3) [m].
-        deviations: (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions.
-        state: at the end, one environment.
-    """
-
-    times: FloatArray
-    markers: FloatArray
-    deviations: FloatArray
-    state: State
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """Mean distances of markers from those measured later, over the last predictions; rigid bodies by position [mm].
-
-    Attributes:
-        predictions: their number.
-        twin: of the predicted markers.
-        held: of the markers as they were measured when the prediction was made.
-        simulator: of the simulator that sees no markers, at the last frames.
-        covered: share of the coordinates within 1.645 deviations, 90 % for right ones.
-    """
-
-    predictions: int
-    twin: float
-    held: float
-    simulator: float
-    covered: float
-
-    @property
-    def best(self) -> str:
-        """The best of them: ``twin``, ``held`` or ``simulator``."""
-        errors = {"twin": self.twin, "held": self.held, "simulator": self.simulator}
-        return min(errors, key=lambda name: np.nan_to_num(errors[name], nan=np.inf))
-
-
-def mean_mm(off: FloatArray, labels: Sequence[str]) -> float:
-    """Mean length of the offsets (M, 3) [m] of markers and of the positions of rigid bodies [mm]; NaN without one."""
-    distances = np.linalg.norm(as_markers(off, labels), axis=1)
-    seen = np.isfinite(distances)
-    return 1e3 * float(distances[seen].mean()) if seen.any() else float("nan")
-
-
-class Scores:
-    """Errors of the last predictions.
-
-    Args:
-        noise: standard deviation of a coordinate of a marker [m].
-        labels: of the M markers; empty where every vertex is observed.
-    """
-
-    def __init__(self, noise: float, labels: Sequence[str]) -> None:
-        self._noise, self._labels = noise, labels
-        self._errors: deque[tuple[float, float, float]] = deque(maxlen=REMEMBERED)
-        self._ratios: deque[FloatArray] = deque(maxlen=REMEMBERED)
-
-    @property
-    def scale(self) -> float:
-        """Factor of the deviations of predictions by which past ones would have been right."""
-        if len(self._ratios) < _ENOUGH:
-            return 1.0
-        return float(np.sqrt(np.mean(np.concatenate(list(self._ratios)) ** 2)))
-
-    def add(self, forecast: Forecast, seen: FloatArray, time: float, frame: FloatArray) -> None:
-        """Compares a forecast with the last frame in the step at its end.
-
-        Args:
-            forecast: with unscaled deviations.
-            seen: markers (M, 3) as they were last seen when it was made [m].
-            time: of the frame [s].
-            frame: (M, 3) [m].
-        """
-        before, end = forecast.times[-2:]
-        share = (end - time) / (end - before)
-        off = frame - ((1.0 - share) * forecast.markers[-1] + share * forecast.markers[-2])
-        usable = np.isfinite(off).all(axis=1) & np.isfinite(seen).all(axis=1)
-        twin, held = (mean_mm(np.where(usable[:, None], x, np.nan), self._labels) for x in (off, frame - seen))
-        if np.isnan(twin):
-            return
-        ratio = off[usable] / np.hypot(forecast.deviations[usable], self._noise)
-        self._errors.append((twin, held, float((np.abs(ratio) < _NINETY * self.scale).mean())))
-        self._ratios.append(ratio.ravel())
-
-    def disagreement(self, simulator: float) -> Disagreement | None:
-        """Returns mean errors, beside that of the simulator without markers [mm]; None without predictions."""
-        if not self._errors:
-            return None
-        twin, held, covered = np.mean(self._errors, axis=0)
-        return Disagreement(len(self._errors), float(twin), float(held), simulator, float(covered))

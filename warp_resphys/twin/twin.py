@@ -15,49 +15,30 @@ from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
-from ..stepping.state import State
-from .estimator import Belief, Correction, TwinEstimator
+from ..stepping.rollout import rollout
+from .belief import Belief, Correction
+from .estimator import TwinEstimator
+from .forecasts import REMEMBERED, Disagreement, Estimate, Forecast, Scores, mean_mm
 from .full_estimator import FullEstimator
 from .reduced_estimator import ReducedEstimator
-from .stream import REMEMBERED, Disagreement, Faults, Forecast, Scores, mean_mm, position_of
+from .stream import ROUNDING, CommandSeries, Faults, frame_of
 
 Engine = Callable[[Robot, Mapping[str, Given], Mapping[str, float], float], TwinEstimator[Any]]
 _ENGINES: Final[Mapping[str, Engine]] = {"full": FullEstimator, "reduced": ReducedEstimator}
-_ROUNDING: Final = 1e-3  # of times, in steps: clocks that count from 1970 resolve microseconds
 _LONGEST_GAP: Final = 2.0  # without a packet, after which the twin starts again [s]
 _STALE: Final = 10  # packets in order, all too old, after which the clock has been set back
-JUMPS: Final = "jumps of the whole body"
 _LATEST: Final = 1e12  # of times [s]
 _FAR: Final = 10.0  # distance of the first markers that hints at another unit, over the size of the body
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A robot at the last step.
-
-    Attributes:
-        time: of the clock of the packets [s].
-        state: of the robot, one environment.
-        markers: (M, 3) [m].
-        deviations: (M, 3) of their coordinates [m].
-        parameters: refined values and their standard deviations, by name.
-    """
-
-    time: float
-    state: State
-    markers: FloatArray
-    deviations: FloatArray
-    parameters: Mapping[str, tuple[float, float]]
 
 
 @dataclass
 class _Interval:
     """Frames taken during a step, and the beliefs after it: as simulated, and as corrected by the frames."""
 
-    frames: list[tuple[float, int, FloatArray]] = field(default_factory=list)
+    frames: list[tuple[float, FloatArray]] = field(default_factory=list)
     predicted: Belief | None = None
     corrected: Belief | None = None
-    corrections: list[tuple[float, Correction]] = field(default_factory=list)
+    corrections: list[Correction] = field(default_factory=list)
     before: float | None = None  # time of the last frame before this interval
     last: float | None = None  # time of the last frame until its end
 
@@ -117,15 +98,14 @@ class Twin:
         self._pending: list[tuple[Forecast, FloatArray]] = []
         self._free: deque[float] = deque(maxlen=REMEMBERED)
         self._counts = Faults()
-        self._commands: list[tuple[float, int, dict[str, Given]]] = [(-np.inf, 0, dict(self.estimator.inputs))]
-        self._planned: list[tuple[float, dict[str, Given]]] = []
+        self._commands, self._planned = CommandSeries(self.estimator.inputs, self._h), CommandSeries({}, self._h)
         self._latest = -np.inf  # time of the newest packet
         self._steps: dict[int, _Interval] = {}
         self._refined: FloatArray | None = None
-        self._packets = self._stale = 0
+        self._stale = 0
         self._simulated, self._done = 0, -1  # last steps that were simulated, and corrected, with all packets
         self._again = self._framed = False
-        self._origin: float | None = None
+        self._origin = np.nan  # time of the first packet
 
     def __repr__(self) -> str:
         """Returns a short description: robot, kind of simulator, steps, and times of predictions and packets."""
@@ -143,7 +123,7 @@ class Twin:
             self._forget(interval)
         self._latest = time
         self._origin, self._newest, self._again, self._stale, self._framed = time, 0, False, 0, False
-        self._commands = [(-np.inf, 0, commands)]
+        self._commands = CommandSeries(commands, self._h)
         self._steps = {0: _Interval(predicted=belief)}
         self._simulated, self._done = 0, -1
         self._pending = []
@@ -168,21 +148,18 @@ class Twin:
         commands = self._read(time, inputs)
         for fault in self.estimator.faults(commands):
             self._counts.add(fault)
-        self._packets += 1
-        frame = None if markers is None else self._frame(markers)
-        if self._origin is None or self._is_other_clock(time):
-            self._start(time, {**self._commanded(np.inf), **commands}, frame)
+        frame = None if markers is None else frame_of(markers, self._numbers, self._counts)
+        if not self.has_begun or self._is_other_clock(time):
+            self._start(time, {**self._commands.at(np.inf), **commands}, frame)
             commands = {}
         elif frame is not None and not self._framed:
             self._check_unit(frame, next(one.predicted for one in self._steps.values() if one.predicted is not None))
         self._framed = self._framed or frame is not None
-        assert self._origin is not None
-        number = int(np.ceil((time - self._origin) / self._h - _ROUNDING))
+        number = int(np.ceil((time - self._origin) / self._h - ROUNDING))
         oldest = max(self._newest - self._keep + 1, 0)
         too_late = number < oldest
         if commands:
-            self._commands.append((time, self._packets, commands))
-            self._commands.sort(key=lambda entry: entry[:2])
+            self._commands.add(time, commands)
             changed = max(number, oldest)
             self._simulated, self._done = min(self._simulated, changed), min(self._done, changed)
         if too_late:
@@ -194,7 +171,7 @@ class Twin:
             self._counts.add("packets out of order")
         self._newest, self._latest = max(self._newest, number), max(self._latest, time)
         if frame is not None:
-            insort(self._steps[number].frames, (time, self._packets, frame), key=lambda entry: entry[:2])
+            insort(self._steps[number].frames, (time, frame), key=lambda entry: entry[0])
             self._done = min(self._done, number - 1)
             self._simulated = min(self._simulated, number)
         return True
@@ -208,7 +185,10 @@ class Twin:
         Raises:
             InputError: no time, or an unknown input or values that it cannot have; the last plan stays.
         """
-        self._planned = sorted(((at, self._read(at, values)) for at, values in commands), key=lambda entry: entry[0])
+        planned = CommandSeries({}, self._h)
+        for at, values in commands:
+            planned.add(at, self._read(at, values))
+        self._planned = planned
 
     def _read(self, time: float, inputs: Mapping[str, Given]) -> dict[str, Given]:
         if not isinstance(time, Real) or not abs(time) < _LATEST:
@@ -228,7 +208,6 @@ class Twin:
 
     def _is_other_clock(self, time: float) -> bool:
         """Whether the twin starts again: after a gap, or where the clock of the packets was set back."""
-        assert self._origin is not None
         if self._again:
             return True
         now = self._origin + self._newest * self._h
@@ -238,24 +217,9 @@ class Twin:
         self._stale = self._stale + 1 if time < now - self.patience - self._h else 0
         if self._stale >= _STALE:
             self._counts.add("starts with an earlier clock")
-            self._planned = []
+            self._planned = CommandSeries({}, self._h)
             return True
         return False
-
-    def _frame(self, markers: Mapping[str, ArrayLike] | ArrayLike) -> FloatArray:
-        count = self.estimator.count
-        if isinstance(markers, Mapping):
-            frame = np.full((count, 3), np.nan)
-            for label, place in markers.items():
-                if label not in self._numbers:
-                    self._counts.add(f"unknown marker {label!r}")
-                    continue
-                frame[self._numbers[label]] = position_of(place, label)
-            return frame
-        frame = np.asarray(markers, dtype=np.float64)
-        if frame.shape != (count, 3):
-            raise InputError(f"a packet has markers of shape {frame.shape}: give ({count}, 3), or positions by name.")
-        return np.where(np.isfinite(frame).all(axis=1)[:, None], frame, np.nan)
 
     def _check_unit(self, frame: FloatArray, belief: Belief) -> None:
         off = np.linalg.norm(frame - self.estimator.markers(belief)[0], axis=1)
@@ -271,7 +235,6 @@ class Twin:
         """Computes what packets have changed; returns the number of the last step."""
         if not self.has_begun:
             raise InputError("the twin has seen no packet: give it one by take().")
-        assert self._origin is not None
         with torch.no_grad():
             for number in range(self._done + 1, self._newest + 1):
                 interval = self._steps[number]
@@ -285,49 +248,27 @@ class Twin:
         for forecast, seen in pending:
             number = round((forecast.times[-1] - self._origin) / self._h)
             if number in self._steps and self._steps[number].frames:
-                time, _, frame = self._steps[number].frames[-1]
+                time, frame = self._steps[number].frames[-1]
                 self._scores.add(forecast, seen, time, frame)
             elif number > self._newest - self._keep:  # A frame may still come.
                 self._pending.append((forecast, seen))
         for number in [number for number in self._steps if number <= self._newest - self._keep]:
             self._forget(self._steps.pop(number))
-        self._commands = self._needed(self._origin + min(self._steps) * self._h)
+        self._commands.forget(self._origin + min(self._steps) * self._h)
         return self._newest
 
-    def _needed(self, oldest: float) -> list[tuple[float, int, dict[str, Given]]]:
-        """Commands without those that others had followed before a time."""
-        latest = dict[str, tuple[float, int, dict[str, Given]]]()
-        later = []
-        for since, order, commands in self._commands:
-            if since > oldest:
-                later.append((since, order, commands))
-            else:
-                latest |= {name: (since, order, {name: value}) for name, value in commands.items()}
-        return [*sorted(latest.values(), key=lambda entry: entry[:2]), *later]
-
-    def _commanded(self, time: float) -> dict[str, Given]:
-        """The commands that hold at a time."""
-        held = dict[str, Given]()
-        for since, _, commands in self._commands:
-            if since <= time + _ROUNDING * self._h:
-                held |= commands
-        return held
-
     def _advanced(self, belief: Belief, number: int) -> Belief:
-        assert self._origin is not None
         start = self._origin + (number - 1) * self._h
         while True:
-            commands = self._commanded(start)
+            commands = self._commands.at(start)
             try:
                 return self.estimator.advance(belief, commands)
             except ConvergenceError:
                 self._counts.add("failed steps, after which the state was that of the simulator without markers")
                 return self._without_markers(belief, commands)
             except InputError as error:  # Such as a base that moves too fast: what was commanded last is forgotten.
-                held = [entry for entry in self._commands if entry[0] <= start + _ROUNDING * self._h]
-                if not held:
+                if not self._commands.drop_last(start):
                     raise
-                self._commands.remove(held[-1])
                 self._counts.add(f"a command was left out: {error}")
 
     def _without_markers(self, belief: Belief, commands: dict[str, Given]) -> Belief:
@@ -340,37 +281,28 @@ class Twin:
     def _corrected(self, interval: _Interval, number: int) -> None:
         belief, interval.corrections = interval.predicted, []
         assert belief is not None
-        assert self._origin is not None
         end = self._origin + number * self._h
         interval.before = self._steps[number - 1].last if number - 1 in self._steps else interval.before
         last = interval.before
-        for time, _, frame in interval.frames:
+        for time, frame in interval.frames:
             passed = self._h if last is None else time - last
             belief, correction = self.estimator.correct(belief, frame, max(end - time, 0.0), passed)
-            interval.corrections.append((time, correction))
+            interval.corrections.append(correction)
             last = time
         interval.corrected, interval.last = belief, last
 
     def _forget(self, interval: _Interval) -> None:
         """Counts what happened in a step that no packet can change any more."""
-        for _, correction in interval.corrections:
-            self._tell(correction, self._counts)
+        for correction in interval.corrections:
+            for fault in correction.faults(self.labels):
+                self._counts.add(fault)
             if np.isfinite(free := mean_mm(correction.free, self.labels)):
                 self._free.append(free)
-
-    def _tell(self, correction: Correction, counts: Faults) -> None:
-        for word, chosen in (("jumps", correction.refused), ("has moved on the body", correction.moved)):
-            for number in np.flatnonzero(chosen):
-                counts.add(f"{self.labels[number] if self.labels else 'a vertex'} {word}")
-        if correction.restarted:
-            counts.add(JUMPS)
-        if correction.worse:
-            counts.add("it went on from the simulator without markers, which was closer")
 
     @property
     def has_begun(self) -> bool:
         """Whether there was a packet."""
-        return self._origin is not None
+        return not np.isnan(self._origin)
 
     @property
     def now(self) -> Estimate:
@@ -380,7 +312,6 @@ class Twin:
             InputError: there was no packet.
         """
         belief = self._belief_at(self._update())
-        assert self._origin is not None
         markers, deviations = self.estimator.markers(belief)
         return Estimate(
             self._origin + self._newest * self._h,
@@ -393,13 +324,14 @@ class Twin:
     @property
     def counts(self) -> dict[str, int]:
         """Numbers of faults of packets and of restarts, by their descriptions."""
-        if self._origin is None:
+        if not self.has_begun:
             return {}
         self._update()
         counts = self._counts.copy()
         for interval in self._steps.values():
-            for _, correction in interval.corrections:
-                self._tell(correction, counts)
+            for correction in interval.corrections:
+                for fault in correction.faults(self.labels):
+                    counts.add(fault)
         return dict(counts)
 
     def ahead(self, seconds: float | None = None, **inputs: Given) -> Forecast:
@@ -418,21 +350,20 @@ class Twin:
         if seconds is not None and not 0.0 < seconds < np.inf:
             raise InputError(f"seconds is {seconds}: give the length of the prediction, more than zero.")
         belief = self._belief_at(self._update())
-        assert self._origin is not None
-        held, now = self._commanded(np.inf), self._origin + self._newest * self._h
-        planned = [entry for entry in self._planned if entry[0] > self._latest]
-        steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - _ROUNDING)), 1)
-        markers, state = [self.estimator.markers(belief)[0]], belief
+        held, now = self._commands.at(np.inf), self._origin + self._newest * self._h
+        steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - ROUNDING)), 1)
+
+        def advance(before: Belief, number: int) -> Belief:
+            planned = self._planned.at(now + number * self._h, after=self._latest)
+            try:
+                return self.estimator.advance(before, {**held, **planned, **inputs}, renew=False)
+            except (ConvergenceError, InputError):
+                self._counts.add("predictions that failed")
+                raise
+
         with torch.no_grad():
-            for number in range(steps):
-                while planned and planned[0][0] <= now + (number + _ROUNDING) * self._h:
-                    held = held | planned.pop(0)[1]
-                try:
-                    state = self.estimator.advance(state, {**held, **inputs}, renew=False)
-                except (ConvergenceError, InputError):
-                    self._counts.add("predictions that failed")
-                    raise
-                markers.append(self.estimator.markers(state)[0])
+            beliefs = rollout(advance, belief, range(steps), lambda reached: reached)
+        markers, state = [self.estimator.markers(reached)[0] for reached in beliefs], beliefs[-1]
         times = now + self._h * np.arange(steps + 1, dtype=np.float64)
         deviations = self.estimator.markers(state)[1]
         prediction = Forecast(
@@ -445,7 +376,7 @@ class Twin:
 
     def _last_seen(self) -> FloatArray | None:
         """Markers (M, 3) as they were last seen [m], NaN where not for `patience`."""
-        frames = [frame for number in sorted(self._steps) for *_, frame in self._steps[number].frames]
+        frames = [frame for number in sorted(self._steps) for _, frame in self._steps[number].frames]
         if not frames:
             return None
         seen = frames[0].copy()
@@ -458,7 +389,7 @@ class Twin:
     @property
     def disagreement(self) -> Disagreement | None:
         """Errors of the last predictions; None before one has come to its end."""
-        if self._origin is None:
+        if not self.has_begun:
             return None
         self._update()
         return self._scores.disagreement(float(np.mean(self._free)) if self._free else float("nan"))

@@ -149,42 +149,29 @@ class Trials:
             DataFileError: the file is missing, damaged or of another kind.
         """
         with read_hdf5(path, _KIND) as file:
-            names, labels, begins, inputs = (
-                tuple(map(str, file.attrs[key])) for key in ("names", "labels", "begins", "inputs")
-            )
-            r = len(names)
+            words = {key: tuple(map(str, file.attrs[key])) for key in ("names", "labels", "begins", "inputs")}
+            more = {key: tuple(map(str, file.attrs.get(key, ()))) for key in ("sessions", "obstacles")}
+            inputs, r = words.pop("inputs"), len(words["names"])
             times = read_array(file, "times", (r, None))
-            observed = read_array(file, "observed", (r, times.shape[1], len(labels) or None, 3))
-            m = observed.shape[2]
+            observed = read_array(file, "observed", (r, times.shape[1], len(words["labels"]) or None, 3))
             shapes = {
-                "bound": (m, 3),
-                "smoothed": observed.shape,
-                "velocity": observed.shape,
-                "initial": (r, 2, None, 3),
+                **{"held": (r, observed.shape[2], 3), "payload": (r,), "bound": (observed.shape[2], 3)},
+                **{"smoothed": observed.shape, "velocity": observed.shape},
+                **{"initial": (r, 2, None, 3), "base": (r, None, 6)},
             }
-            optional: dict[str, Any] = {
-                name: read_array(file, name, shape) if name in file else None for name, shape in shapes.items()
-            }
+            arrays = {name: read_array(file, name, x) for name, x in shapes.items() if name in file}
+            known: dict[str, Any] = {**words, **arrays}
             return cls(
-                names,
-                labels,
-                begins,
-                times,
-                observed,
-                held=read_array(file, "held", (r, m, 3)) if "held" in file else observed[:, 0],
-                payload=read_array(file, "payload", (r,)) if "payload" in file else np.zeros(r),
+                **known,
+                times=times,
+                observed=observed,
                 gravity=np.asarray(file.attrs["gravity"], dtype=np.float64),
                 time_step=float(file.attrs["time_step"]),
-                base=read_array(file, "base", (r, None, 6)) if "base" in file else None,
                 inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
                 resting={n: read_array(file, f"{n}_resting", (r, None)) for n in inputs if f"{n}_resting" in file},
                 channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
-                sessions=tuple(map(str, file.attrs.get("sessions", ()))),
-                obstacles={
-                    str(name): read_array(file, f"obstacles/{name}", (r, None, 6))
-                    for name in file.attrs.get("obstacles", ())
-                },
-                **optional,
+                sessions=more["sessions"],
+                obstacles={n: read_array(file, f"obstacles/{n}", (r, None, 6)) for n in more["obstacles"]},
             )
 
     def joined(self, other: "Trials") -> "Trials":

@@ -10,8 +10,7 @@ the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or
 """
 
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -55,9 +54,9 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
         DataFileError: The bag is missing or damaged, lacks a topic, or has messages of a type that cannot be read.
         InputError: rosbags is not installed, or a source is misspelt.
     """
-    markers = [_Pose(path, text) for text in bag.markers.values()]
-    inputs = [_Input(path, text) for text in bag.inputs]
-    base = None if bag.base is None else _Pose(path, bag.base)
+    markers = [_Source(path, text, _pose) for text in bag.markers.values()]
+    inputs = [_Source(path, text, _input) for text in bag.inputs]
+    base = None if bag.base is None else _Source(path, bag.base, _pose)
     if not markers:
         raise InputError("data.bag.markers is empty: name a topic for every marker.")
     factors = [source.factor for source in inputs]
@@ -123,21 +122,21 @@ def _opened(path: Path) -> Iterator[Any]:
         raise DataFileError(f"{path} is damaged, or no bag of ROS ({what}): record it with ROS again.") from error
 
 
-class _Source(ABC):
+class _Source:
     """A topic, a member of its messages, and their times and values."""
 
-    def __init__(self, path: Path, text: str) -> None:
+    def __init__(self, path: Path, text: str, read: "Callable[[_Source, str, Any], Sequence[float] | None]") -> None:
         match = _SOURCE.fullmatch(text.strip())
         if match is None:
             raise InputError(f"data.bag names '{text}': write a topic, as /tip, /tf#tip or '/pressure#1 [mbar]'.")
-        self.path, self.text, self.topic = path, text, match["topic"]
+        self.path, self.text, self.topic, self._read = path, text, match["topic"], read
         self.member, self.unit = match["member"], match["unit"] or "1"
         self.stamps, self.received = list[float](), list[float]()  # s; stamps are NaN without a header
         self.values = list[Sequence[float]]()
 
     def add(self, kind: str, message: Any, received: float) -> None:
         """Adds a message of a type, unless it lacks the member."""
-        value = self.read(kind, message)
+        value = self._read(self, kind, message)
         if value is None:
             return
         if hasattr(message, "transforms"):
@@ -147,10 +146,6 @@ class _Source(ABC):
         self.stamps.append(float(stamp or np.nan))
         self.received.append(received)
         self.values.append(value)
-
-    @abstractmethod
-    def read(self, kind: str, message: Any) -> Sequence[float] | None:
-        """Returns the value in a message of a type; None where it lacks the member."""
 
     def series(self, late: float) -> tuple[FloatArray, FloatArray]:
         """Times (n,) [s] that grow, and values (n, ...); ``late`` is the clock of the bag less that of the headers."""
@@ -173,88 +168,85 @@ class _Source(ABC):
             )
         return values[self.number - 1]
 
+    @property
+    def factor(self) -> float:
+        """Factor of an input to SI units."""
+        if self.unit not in SI_PER_ACTUATION_UNIT:
+            units = ", ".join(SI_PER_ACTUATION_UNIT)
+            raise InputError(f"data.bag.inputs has '{self.text}', whose unit is unknown: give one of {units}.")
+        return SI_PER_ACTUATION_UNIT[self.unit]
 
-class _Pose(_Source):
-    """Places [m] and quaternions, w first, NaN without a rotation."""
 
-    def read(self, kind: str, message: Any) -> Sequence[float] | None:
-        if kind in _IMAGES:
-            raise DataFileError(
-                f"{self.path}: {self.topic} has images: track the markers in them by another program, and give its "
-                "table."
-            )
-        if kind == "tf2_msgs/msg/TFMessage":
-            message = next((own for own in message.transforms if own.child_frame_id == self.member), None)
-            if message is None:
-                return None
-        if hasattr(message, "transform"):
-            return _rigid(message.transform.translation, message.transform.rotation)
-        if kind == "sensor_msgs/msg/PointCloud2":
-            return self._of_cloud(message)
-        if kind == "geometry_msgs/msg/PoseArray":
-            message = self.entry(message.poses)
-        for name in ("pose", "pose", "point", "vector"):  # with a covariance, a pose lies in a pose
-            message = getattr(message, name, message)
-        if hasattr(message, "position") and hasattr(message, "orientation"):
-            return _rigid(message.position, message.orientation)
-        if all(isinstance(getattr(message, axis, None), float) for axis in "xyz"):
-            return (message.x, message.y, message.z, *[np.nan] * 4)
+def _pose(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
+    """Returns a place [m] and a quaternion, w first, NaN without a rotation; None without the member."""
+    if kind in _IMAGES:
         raise DataFileError(
-            f"{self.path}: {self.topic} has messages of the type {kind}, which hold no place: markers are poses, "
-            "points, transforms, odometry, arrays of poses and clouds of points in a fixed order."
+            f"{source.path}: {source.topic} has images: track the markers in them by another program, and give its "
+            "table."
         )
+    if kind == "tf2_msgs/msg/TFMessage":
+        message = next((own for own in message.transforms if own.child_frame_id == source.member), None)
+        if message is None:
+            return None
+    if hasattr(message, "transform"):
+        return _rigid(message.transform.translation, message.transform.rotation)
+    if kind == "sensor_msgs/msg/PointCloud2":
+        return _point(source, message)
+    if kind == "geometry_msgs/msg/PoseArray":
+        message = source.entry(message.poses)
+    for name in ("pose", "pose", "point", "vector"):  # with a covariance, a pose lies in a pose
+        message = getattr(message, name, message)
+    if hasattr(message, "position") and hasattr(message, "orientation"):
+        return _rigid(message.position, message.orientation)
+    if all(isinstance(getattr(message, axis, None), float) for axis in "xyz"):
+        return (message.x, message.y, message.z, *[np.nan] * 4)
+    raise DataFileError(
+        f"{source.path}: {source.topic} has messages of the type {kind}, which hold no place: markers are poses, "
+        "points, transforms, odometry, arrays of poses and clouds of points in a fixed order."
+    )
 
-    def _of_cloud(self, message: Any) -> Sequence[float]:
-        """A point of a cloud, whose points must come in a fixed order."""
-        if self.number > message.width * message.height:
-            return (np.nan,) * 7
-        fields = {own.name: own for own in message.fields}
-        if not {"x", "y", "z"} <= {*fields} or any(fields[axis].datatype not in _CLOUD_TYPES for axis in "xyz"):
-            raise DataFileError(f"{self.path}: the cloud {self.topic} has no x, y and z as floating-point numbers.")
-        row, column = divmod(self.number - 1, message.width)
-        first, data = row * message.row_step + column * message.point_step, bytes(message.data)
-        types = [(">" if message.is_bigendian else "<") + _CLOUD_TYPES[fields[axis].datatype] for axis in "xyz"]
-        starts = [first + fields[axis].offset for axis in "xyz"]
-        point = [float(np.frombuffer(data, kind, 1, at)[0]) for kind, at in zip(types, starts, strict=True)]
-        return (*point, *[np.nan] * 4)
+
+def _point(source: _Source, message: Any) -> Sequence[float]:
+    """Returns a point of a cloud, whose points must come in a fixed order, without a rotation."""
+    if source.number > message.width * message.height:
+        return (np.nan,) * 7
+    fields = {own.name: own for own in message.fields}
+    if not {"x", "y", "z"} <= {*fields} or any(fields[axis].datatype not in _CLOUD_TYPES for axis in "xyz"):
+        raise DataFileError(f"{source.path}: the cloud {source.topic} has no x, y and z as floating-point numbers.")
+    row, column = divmod(source.number - 1, message.width)
+    first, data = row * message.row_step + column * message.point_step, bytes(message.data)
+    types = [(">" if message.is_bigendian else "<") + _CLOUD_TYPES[fields[axis].datatype] for axis in "xyz"]
+    starts = [first + fields[axis].offset for axis in "xyz"]
+    point = [float(np.frombuffer(data, kind, 1, at)[0]) for kind, at in zip(types, starts, strict=True)]
+    return (*point, *[np.nan] * 4)
 
 
 def _rigid(place: Any, turn: Any) -> Sequence[float]:
     return place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z
 
 
-class _Input(_Source):
-    """Inputs, in their own unit."""
-
-    @property
-    def factor(self) -> float:
-        """Factor to SI units."""
-        if self.unit not in SI_PER_ACTUATION_UNIT:
-            units = ", ".join(SI_PER_ACTUATION_UNIT)
-            raise InputError(f"data.bag.inputs has '{self.text}', whose unit is unknown: give one of {units}.")
-        return SI_PER_ACTUATION_UNIT[self.unit]
-
-    def read(self, kind: str, message: Any) -> Sequence[float] | None:
-        if kind == "sensor_msgs/msg/JointState":
-            joint, _, quantity = (self.member or "").rpartition(".")
-            if quantity not in ("position", "velocity", "effort"):
-                raise InputError(
-                    f"data.bag.inputs has '{self.text}': name the joint and its position, velocity or effort, as in "
-                    f"{self.topic}#finger.effort."
-                )
-            values = dict(zip(message.name, getattr(message, quantity), strict=False))
-            return (float(values[joint]),) if joint in values else None
-        if kind == "sensor_msgs/msg/FluidPressure":
-            return (float(message.fluid_pressure),)
-        data = getattr(message, "data", None)
-        if isinstance(data, bool | int | float):
-            return (float(data),)
-        if data is not None and kind.endswith("MultiArray"):
-            return (float(self.entry(data)),)
-        raise DataFileError(
-            f"{self.path}: {self.topic} has messages of the type {kind}, which hold no input: inputs are numbers and "
-            "arrays of numbers (std_msgs), JointState and FluidPressure."
-        )
+def _input(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
+    """Returns an input in its own unit; None without the member."""
+    if kind == "sensor_msgs/msg/JointState":
+        joint, _, quantity = (source.member or "").rpartition(".")
+        if quantity not in ("position", "velocity", "effort"):
+            raise InputError(
+                f"data.bag.inputs has '{source.text}': name the joint and its position, velocity or effort, as in "
+                f"{source.topic}#finger.effort."
+            )
+        values = dict(zip(message.name, getattr(message, quantity), strict=False))
+        return (float(values[joint]),) if joint in values else None
+    if kind == "sensor_msgs/msg/FluidPressure":
+        return (float(message.fluid_pressure),)
+    data = getattr(message, "data", None)
+    if isinstance(data, bool | int | float):
+        return (float(data),)
+    if data is not None and kind.endswith("MultiArray"):
+        return (float(source.entry(data)),)
+    raise DataFileError(
+        f"{source.path}: {source.topic} has messages of the type {kind}, which hold no input: inputs are numbers and "
+        "arrays of numbers (std_msgs), JointState and FluidPressure."
+    )
 
 
 def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tuple[FloatArray, float]:

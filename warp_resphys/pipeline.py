@@ -60,8 +60,8 @@ from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
+from .experiment.splits import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .experiment.timing import time_models
-from .experiment.trials import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers

@@ -8,7 +8,7 @@ from support.configured import settings
 from warp_resphys.experiment import duration
 from warp_resphys.experiment.duration import announcement, work_of
 from warp_resphys.experiment.experiment import Experiment
-from warp_resphys.experiment.trials import split_of
+from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.stages import run_stages
 from warp_resphys.pipeline import _announce, acquire, learning_stages

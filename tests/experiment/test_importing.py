@@ -18,7 +18,7 @@ from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
-from warp_resphys.experiment.trials import trials_of
+from warp_resphys.experiment.splits import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.files import read_hdf5, read_json
 from warp_resphys.io.settings import parse

@@ -13,7 +13,7 @@ from warp_resphys import select_vertices
 from warp_resphys.experiment import identify_law
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.simulate import build_target, initial_state
-from warp_resphys.experiment.trials import all_trials
+from warp_resphys.experiment.splits import all_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.files import read_json
 from warp_resphys.learning.baselines import BASELINES

@@ -35,7 +35,7 @@ from support.main_job import (
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment.build import build_mesh, build_simulator
 from warp_resphys.experiment.checks import check_run
-from warp_resphys.experiment.trials import split_of
+from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.progress import Progress
 from warp_resphys.io.stages import fingerprint, package_versions

@@ -4,7 +4,7 @@ import pytest
 
 from support.configured import check, composed, settings
 from warp_resphys.experiment.checks import check_run
-from warp_resphys.experiment.trials import folds_of, split_of, trials_of
+from warp_resphys.experiment.splits import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 from warp_resphys.io.settings import parse
 from warp_resphys.settings.run import RunSettings

@@ -11,7 +11,7 @@ from support.main_job import run_without_report
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.mesh_check import check_mesh
-from warp_resphys.experiment.trials import split_of
+from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, StageInterrupted, run_stages

@@ -17,7 +17,7 @@ from warp_resphys.experiment.ablation import generate_motion, read_motion
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET
 from warp_resphys.experiment.simulate import simulate, vertices_in
-from warp_resphys.experiment.trials import split_of, trials_of
+from warp_resphys.experiment.splits import split_of, trials_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext

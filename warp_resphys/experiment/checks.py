@@ -40,7 +40,7 @@ from .identify import ELASTIC
 from .recordings.recorded_checks import check_recorded
 from .shapes import check_shape
 from .simulate import substeps_of, target_settings, vertices_in
-from .trials import split_of, trials_of
+from .splits import split_of, trials_of
 
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
 _SHARE_OF_MEMORY = 0.8

@@ -21,7 +21,7 @@ from ..report.wording import duration_text
 from ..settings.stages import StageSettings
 from .experiment import MODELS, SIMFREE, Experiment
 from .mesh_check import CHECKED_SECONDS
-from .trials import evenly
+from .splits import evenly
 
 _LEAST_SECONDS = 60.0  # of the estimates that are shown
 _SHORT = 8e6  # steps times vertices that take less than that

@@ -25,7 +25,7 @@ from ..settings.learning import IdentifySettings, LawSettings, RangeSettings
 from ..settings.stages import StageSettings
 from .experiment import MODELS, Experiment
 from .files import IDENTIFICATION
-from .trials import evenly
+from .splits import evenly
 
 log = logging.getLogger(__name__)
 

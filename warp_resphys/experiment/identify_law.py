@@ -32,7 +32,7 @@ from .experiment import LAW, Experiment
 from .files import LAW_FILE
 from .identify import Checkpoint, Found, IsLast, refined_searches, search_parameters
 from .law_trials import LawTrials, Score, branches_of, is_refined, strong_names
-from .trials import evenly
+from .splits import evenly
 
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49

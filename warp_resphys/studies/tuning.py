@@ -22,7 +22,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ..experiment.experiment import LEARNED, Experiment
 from ..experiment.learn import fitting_of
-from ..experiment.trials import folds_of, split_of
+from ..experiment.splits import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.progress import show
 from ..io.settings import Count, Natural, Settings, Word, parse, setting

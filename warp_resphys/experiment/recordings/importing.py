@@ -25,7 +25,7 @@ from ...io.files import write_json
 from ...io.stages import StageContext
 from ..build import bound_markers
 from ..files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET
-from ..trials import evenly
+from ..splits import evenly
 from .registered_trials import RegisteredTrials
 
 log = logging.getLogger(__name__)

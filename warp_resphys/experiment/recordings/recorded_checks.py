@@ -18,7 +18,7 @@ from ..actuators import Drive, drive_of
 from ..build import build_material, marker_view_of, mounted_on
 from ..laboratory import largest_input
 from ..simulate import substeps_of
-from ..trials import all_trials, folds_of, split_of, trials_of
+from ..splits import all_trials, folds_of, split_of, trials_of
 from .reader import standing_enough
 
 

@@ -25,7 +25,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.io.stages import StageContext, run_stages
 from warp_resphys.learning import fitting
 from warp_resphys.learning.correction import force_frames
-from warp_resphys.learning.error_tables import TestedModels
+from warp_resphys.learning.error_tables import ComparedModels
 from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.settings.stages import StageSettings
 
@@ -268,7 +268,7 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
     more = {"bound": np.zeros((1, 3)), "inputs": pressed}
     motions = ObservedMotions(Trials(("a", "b"), ("m",), ("rest", "rest"), *about, **more))
     markers = {"sysid": good, "resphys": lost}
-    results = TestedModels(motions, (), {"1": ("a", "b")}, markers, left, horizons=(0.02, 0.04)).errors()
+    results = ComparedModels(motions, (), {"1": ("a", "b")}, markers, left, horizons=(0.02, 0.04)).errors()
     assert results["errors_mm"]["sysid"]["mean"] == pytest.approx(5.0)
     assert results["errors_mm"]["resphys"]["diverged"] == 1
     assert results["range"]["resphys"] == {"left": 1, "first_s": {"b": pytest.approx(0.03)}}

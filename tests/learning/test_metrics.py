@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from warp_resphys.data.driving import time_since_change
+from warp_resphys.data.driving import phases, time_since_change
 from warp_resphys.learning.metrics import (
     errors_per_marker,
     marker_errors,
     paired_gain,
-    phases,
     summarise,
     summarise_folds,
     summarise_trajectories,

@@ -10,7 +10,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.files import atomic_hdf5, create, write_json
 from ..io.parts import Parts, TrialPart
 from ..io.stages import StageContext
-from ..learning.error_tables import TestedModels, amplitudes
+from ..learning.error_tables import ComparedModels, amplitudes
 from ..learning.evaluation import rollout_parts
 from ..learning.without_physics import without_physics
 from ..settings.stages import StageSettings
@@ -70,7 +70,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     }
     found = experiment.reconstructed("resphys") if experiment.dataset.bound is None and not settings.with_law else None
     (reconstructed,) = (None,) if found is None else found.of(test, "q")
-    tested = TestedModels(
+    tested = ComparedModels(
         experiment.motions, settings.split.train, settings.groups, observed, left, reconstructed, settings.horizons
     )
     errors = tested.errors() | {"baselines": plain}

@@ -16,7 +16,7 @@ from .observed_motions import ObservedMotions
 
 
 @dataclass(frozen=True)
-class TestedModels:
+class ComparedModels:
     """Roll-outs of the tested trials by several models; a rigid body counts as one marker.
 
     Attributes:

@@ -1,5 +1,6 @@
-"""Contact of points with obstacles: barrier and lagged, smoothed Coulomb friction (equations in ``energies.contact``).
+"""Contact of points with obstacles: barrier and lagged, smoothed Coulomb friction.
 
+Equations are in ``energies.contact.obstacle_contact``.
 Here s = d / D, and y = |u| is the slide u of a point in the tangential plane of its normal at the start of the step.
 """
 

@@ -1,4 +1,4 @@
-"""Contact between surfaces of triangles: barrier and friction of pairs (equations in ``energies.surfaces``)."""
+"""Barrier and friction of pairs of surfaces of triangles (equations in ``energies.contact.surface_contact``)."""
 
 import warp as wp
 

@@ -11,12 +11,12 @@ import torch
 
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.contact import Contact
+from warp_resphys.energies.contact.obstacle_contact import Contact
+from warp_resphys.energies.contact.obstacles import HalfSpace
+from warp_resphys.energies.contact.pairs import PairList, Surface
+from warp_resphys.energies.contact.surface_contact import SurfaceContact
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.materials import Corotated
-from warp_resphys.energies.obstacles import HalfSpace
-from warp_resphys.energies.pairs import PairList, Surface
-from warp_resphys.energies.surfaces import SurfaceContact
 from warp_resphys.energies.tendons import Tendons
 from warp_resphys.environments.making import ball_mesh
 from warp_resphys.experiment.build import choose_device

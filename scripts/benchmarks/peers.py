@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.contact import Contact
+from warp_resphys.energies.contact.obstacle_contact import Contact
+from warp_resphys.energies.contact.obstacles import HalfSpace
 from warp_resphys.energies.materials import StableNeoHookean
-from warp_resphys.energies.obstacles import HalfSpace
 from warp_resphys.experiment.build import choose_device
 from warp_resphys.fem.bodies import Body
 from warp_resphys.io.errors import InputError

@@ -17,7 +17,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.energies.barrier import barrier_pressure
+from warp_resphys.energies.contact.barrier import barrier_pressure
 from warp_resphys.io.errors import DerivativeError
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (4, 1, 1))

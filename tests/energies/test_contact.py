@@ -23,8 +23,10 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
-from warp_resphys.energies.contact import Contact, vertex_areas, vertex_factors
-from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, ObstacleSet, Pose, Sphere
+from warp_resphys.energies.contact.contact_points import vertex_areas, vertex_factors
+from warp_resphys.energies.contact.obstacle_contact import Contact
+from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
+from warp_resphys.energies.contact.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.selection import select_cells
 

@@ -10,7 +10,7 @@ import trimesh
 from support.slopes import check_slopes
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Mesh, Simulator, SolverSettings, State, box_hexahedra
 from warp_resphys.energies import DistanceGrid
-from warp_resphys.energies.obstacles import ObstacleSet, Pose
+from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
 from warp_resphys.io.errors import InputError, MeshError
 
 RADIUS = 0.02  # m

@@ -26,8 +26,8 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.energies import FrictionPair
+from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher, warp_view
-from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.environments.making import ball_mesh
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels.contact import nearest_points

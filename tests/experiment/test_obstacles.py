@@ -16,9 +16,9 @@ from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.data.trials import Trials
-from warp_resphys.energies.contact import Contact
-from warp_resphys.energies.obstacles import Box, HalfSpace, Sphere
-from warp_resphys.energies.surfaces import FrictionPair, SurfaceContact
+from warp_resphys.energies.contact.obstacle_contact import Contact
+from warp_resphys.energies.contact.obstacles import Box, HalfSpace, Sphere
+from warp_resphys.energies.contact.surface_contact import FrictionPair, SurfaceContact
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact

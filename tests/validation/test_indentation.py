@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from support.contact import pressure
 from warp_resphys import Body, Contact, Mesh, Simulator, StableNeoHookean, box_hexahedra
-from warp_resphys.energies.contact import vertex_areas
-from warp_resphys.energies.obstacles import Cylinder, Sphere
+from warp_resphys.energies.contact.contact_points import vertex_areas
+from warp_resphys.energies.contact.obstacles import Cylinder, Sphere
 
 FloatArray = NDArray[np.float64]
 YOUNG, POISSON = 264e3, 0.45  # Pa, -

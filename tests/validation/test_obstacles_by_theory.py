@@ -9,8 +9,8 @@ import torch
 
 from support.contact import BLOCK, WEIGHT, D, G, distances, on_obstacles, resting_floor, solves
 from warp_resphys import Mesh, SolverSettings, State
-from warp_resphys.energies.contact import vertex_areas
-from warp_resphys.energies.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
+from warp_resphys.energies.contact.contact_points import vertex_areas
+from warp_resphys.energies.contact.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
 
 SLIP = 1e-3  # v_s [m/s]
 AXIS = (0.3, -0.2, 0.9)

@@ -43,10 +43,10 @@ from warp_resphys import (
     box_tetrahedra,
     select_vertices,
 )
+from warp_resphys.energies.contact.obstacles import Cylinder, HalfSpace
+from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.materials import Material
-from warp_resphys.energies.obstacles import Cylinder, HalfSpace
-from warp_resphys.energies.pairs import PairList, Surface
 from warp_resphys.environments.making import ball_mesh
 from warp_resphys.mesh.rod import rod
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..energies.contact import MOTION, Contact
+from ..energies.contact.contact_points import MOTION
+from ..energies.contact.obstacle_contact import Contact
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError

@@ -7,8 +7,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..energies.contact import GROWTH, MOTION, SHIFT, TURN, Contact
-from ..energies.obstacles import surface_of
+from ..energies.contact.contact_points import GROWTH, MOTION, SHIFT, TURN
+from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacles import surface_of
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray, IntArray
 from .registration import RigidTransform

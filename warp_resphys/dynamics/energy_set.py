@@ -14,10 +14,11 @@ import torch
 
 from ..energies.base import BoundEnergy, EnergySite, EnergyStep, Memory
 from ..energies.body_energies import PlacedEnergy
-from ..energies.contact import BoundContact, ContactForces
-from ..energies.obstacles import ObstacleMotion
+from ..energies.contact.barrier import ContactForces
+from ..energies.contact.obstacle_contact import BoundContact
+from ..energies.contact.obstacle_poses import ObstacleMotion
+from ..energies.contact.surface_contact import BoundSurfaceContact
 from ..energies.potential import StepTerms
-from ..energies.surfaces import BoundSurfaceContact
 from ..energies.term import Term, Values
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates

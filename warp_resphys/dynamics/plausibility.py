@@ -9,9 +9,9 @@ import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
-from ..energies.contact import Contact
+from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacles import HalfSpace
 from ..energies.materials import Material
-from ..energies.obstacles import HalfSpace
 from ..fem.bodies import Body
 from ..fem.integration_points import volume_points
 from ..io.errors import warn

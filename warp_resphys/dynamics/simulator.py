@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from ..energies.body_energies import Materials, joined_names
-from ..energies.contact import ContactForces
+from ..energies.contact.barrier import ContactForces
 from ..energies.materials import Corotated, Material
 from ..fem.bodies import Body
 from ..io.errors import InputError
@@ -283,7 +283,7 @@ class Simulator:
     ) -> State:
         """Returns the static equilibrium under gravity and constant inputs, differentiable like a step.
 
-        Friction without rate, as of `energies.hysteresis` and `energies.contact`, makes it depend on the poses before.
+        Friction without rate, as of `energies.hysteresis` and of contact, makes it depend on the poses before.
         The state that is returned has the memory of such energies; that of others is of a body long at rest.
 
         Args:

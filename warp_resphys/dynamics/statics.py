@@ -9,7 +9,7 @@ from functools import partial
 import torch
 from typing_extensions import override
 
-from ..energies.contact import ContactForces
+from ..energies.contact.barrier import ContactForces
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..io.errors import ConvergenceError
 from ..io.progress import QUIET_SECONDS, Progress

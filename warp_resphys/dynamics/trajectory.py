@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ..energies.obstacles import ObstacleMotion
+from ..energies.contact.obstacle_poses import ObstacleMotion
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, number_of

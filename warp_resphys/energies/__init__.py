@@ -4,6 +4,11 @@ from ..stepping.quantity import Quantity as Quantity
 from .base import Energy as Energy
 from .catalogue import make_material as make_material
 from .catalogue import share_outside_law as share_outside_law
+from .contact.obstacles import Box as Box
+from .contact.obstacles import Capsule as Capsule
+from .contact.obstacles import DistanceGrid as DistanceGrid
+from .contact.obstacles import Sphere as Sphere
+from .contact.surface_contact import FrictionPair as FrictionPair
 from .materials import ConvexMaterial as ConvexMaterial
 from .materials import DensityMaterial as DensityMaterial
 from .materials import FibreFamily as FibreFamily
@@ -12,10 +17,5 @@ from .materials import Material as Material
 from .materials import MooneyRivlin as MooneyRivlin
 from .medium import Medium as Medium
 from .muscles import Muscle as Muscle
-from .obstacles import Box as Box
-from .obstacles import Capsule as Capsule
-from .obstacles import DistanceGrid as DistanceGrid
-from .obstacles import Sphere as Sphere
 from .pointwise import PointwiseEnergy as PointwiseEnergy
 from .strings import Strings as Strings
-from .surfaces import FrictionPair as FrictionPair

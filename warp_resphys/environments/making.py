@@ -16,9 +16,9 @@ from ..control.reduction import reduced_of
 from ..control.sampling import driven_input
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
 from ..data.obstacle_surface import ObstacleSurface
-from ..energies.contact import Contact
-from ..energies.obstacles import HalfSpace
-from ..energies.surfaces import SurfaceContact
+from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacles import HalfSpace
+from ..energies.contact.surface_contact import SurfaceContact
 from ..fem.bodies import Body, Rigid
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..energies.base import Energy
-from ..energies.contact import Contact
+from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
+from ..energies.contact.surface_contact import FrictionPair, SurfaceContact
 from ..energies.fibres import Fibres
 from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
 from ..energies.muscles import STRESS, Muscle, Muscles
-from ..energies.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
 from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
-from ..energies.surfaces import FrictionPair, SurfaceContact
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.bodies import Body
 from ..io.errors import InputError

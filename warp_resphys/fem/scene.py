@@ -24,8 +24,7 @@ class Scene(Body):
 
     Args:
         bodies: bodies by name.
-        contact: contact of the bodies with one another and with themselves (`energies.surfaces.SurfaceContact`), or
-            None.
+        contact: contact of the bodies with one another and with themselves (`SurfaceContact`), or None.
 
     Raises:
         InputError: no body.

@@ -16,7 +16,7 @@ from ..data.trials import payload_inputs
 from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
-from ..energies.contact import MOTION
+from ..energies.contact.contact_points import MOTION
 from ..energies.strings import PAYLOAD, Strings
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..dynamics.simulator import Simulator
+from ..energies.contact.surface_contact import SurfaceContact
 from ..energies.materials import Material
-from ..energies.surfaces import SurfaceContact
 from ..fem.bodies import Body
 from ..fem.scene import Scene
 from ..io.arrays import FloatArray
@@ -41,7 +41,7 @@ class RobotScene:
     Raises:
         InputError: no robot, one whose network replaces the simulator, robots of different time steps or gravity, a
             name that stands for two bodies, a pose that is none, or a body that cannot touch others
-            (`energies.surfaces.SurfaceContact`).
+            (`energies.contact.surface_contact.SurfaceContact`).
 
     Attributes:
         scene: the bodies.

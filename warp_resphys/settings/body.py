@@ -306,7 +306,7 @@ ObstacleSettings = Annotated[
 
 
 class FrictionPairSettings(Settings):
-    """Friction between two regions of the mesh, or within one, by `energies.surfaces.FrictionPair`."""
+    """Friction between two regions of the mesh, or within one, by `energies.contact.surface_contact.FrictionPair`."""
 
     first: Word = setting(description="name of a region")
     second: Word = setting(description="name of a region, which may be the same")
@@ -314,7 +314,7 @@ class FrictionPairSettings(Settings):
 
 
 class SurfaceContactSettings(Settings):
-    """Contact of the body with itself, and of its parts with one another, by `energies.surfaces`."""
+    """Contact of the body with itself, and of its parts with one another, by `energies.contact.surface_contact`."""
 
     stiffness: Positive = setting(1.0e5, "stiffness of the barrier", "Pa")
     friction: NotNegative = setting(0.0, "coefficient of friction")
@@ -324,7 +324,7 @@ class SurfaceContactSettings(Settings):
 
 
 class ContactSettings(Settings):
-    """Contact of the body with its obstacles, by `energies.contact`."""
+    """Contact of the body with its obstacles, by `energies.contact.obstacle_contact`."""
 
     stiffness: Positive | dict[str, Positive] = setting(1.0e5, "stiffness of the barrier, or one per obstacle", "Pa")
     friction: NotNegative | dict[str, NotNegative] = setting(0.0, "coefficient, or one per obstacle")

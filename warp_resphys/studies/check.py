@@ -18,12 +18,12 @@ import warp as wp
 
 from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.simulator import Simulator
-from ..energies.contact import Contact
+from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacles import Box, Cylinder, DistanceGrid
+from ..energies.contact.surface_contact import SurfaceContact
 from ..energies.fibres import Fibres
 from ..energies.materials import Corotated
-from ..energies.obstacles import Box, Cylinder, DistanceGrid
 from ..energies.pressure import Pressure
-from ..energies.surfaces import SurfaceContact
 from ..energies.tendons import Tendons
 from ..experiment.build import choose_device
 from ..fem.bodies import Body

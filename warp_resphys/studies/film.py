@@ -10,7 +10,7 @@ import warp as wp
 
 from ..control.control_stages import driven_settings, replay
 from ..data.obstacle_surface import ObstacleSurface
-from ..energies.contact import MOTION
+from ..energies.contact.contact_points import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
 from ..io.files import read_json

@@ -8,7 +8,8 @@ import torch
 
 from ..data.markers import Markers
 from ..data.registration import RigidTransform, kabsch
-from ..energies.contact import MOTION, Contact
+from ..energies.contact.contact_points import MOTION
+from ..energies.contact.obstacle_contact import Contact
 from ..experiment.build import bound_markers, marker_view_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError

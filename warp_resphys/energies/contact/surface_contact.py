@@ -26,17 +26,17 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..fem.integration_points import Points
-from ..fem.scene import Scene
-from ..io.errors import InputError, naming
-from ..mesh.volume_mesh import Mesh
-from ..stepping.quantity import Parameter, Quantity
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep
-from .contact import ContactForces
-from .launcher import Launcher
+from ...fem.integration_points import Points
+from ...fem.scene import Scene
+from ...io.errors import InputError, naming
+from ...mesh.volume_mesh import Mesh
+from ...stepping.quantity import Parameter, Quantity
+from ..base import BoundEnergy, Energy, EnergySite, EnergyStep
+from ..launcher import Launcher
+from ..term import PointSet, value_of
+from .barrier import ContactForces
 from .pairs import PairList, Surface
 from .surface_term import FRICTION, STIFFNESS, SurfacePoints, SurfaceTerm
-from .term import PointSet, value_of
 
 _LEAST: Final = 1e-4  # share of D within which surfaces count as touching
 

@@ -10,11 +10,11 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 
-from ..io.errors import InputError
-from ..kernels.contact import broad_phase, nearest_points
-from ..kernels.modules import launch_stream, shareable
-from ..mesh.volume_mesh import Mesh, boundary_triangles
-from .launcher import Launcher, struct_of, warp_view
+from ...io.errors import InputError
+from ...kernels.contact import broad_phase, nearest_points
+from ...kernels.modules import launch_stream, shareable
+from ...mesh.volume_mesh import Mesh, boundary_triangles
+from ..launcher import Launcher, struct_of, warp_view
 from .obstacles import signed_distances
 
 _FIRST_CAPACITY = 4096

@@ -1,11 +1,12 @@
-"""The barrier and the smoothed friction of contact on tensors (equations in `energies.contact`)."""
+"""The barrier and the smoothed friction of contact on tensors, and contact forces (equations in `obstacle_contact`)."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from typing_extensions import override
 
-from ..stepping.adjoints import AdjointFunction, first_derivatives
+from ...stepping.adjoints import AdjointFunction, first_derivatives
 
 
 def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
@@ -43,3 +44,30 @@ def friction_over_slide(u: torch.Tensor, slip: torch.Tensor) -> tuple[torch.Tens
     square, tiny = u.square().sum(-1), torch.finfo(u.dtype).tiny
     y = torch.where(square > 0.0, square.clamp_min(tiny).sqrt(), 0.0)
     return y, torch.where(y < slip, (2.0 - y / slip) / slip, 1.0 / y.clamp_min(tiny))
+
+
+@dataclass(frozen=True)
+class ContactForces:
+    """Contact at the end of a step, for every vertex of the surface and every obstacle, differentiable.
+
+    That between surfaces has no axis of obstacles, and is with the nearest others.
+
+    Attributes:
+        obstacles: names of the O obstacles; none for contact between surfaces.
+        vertices: (P,) vertices of the surface.
+        gap: (B, P, O) distances [m].
+        normal: (B, P, O, 3) forces of the barrier on the vertices [N].
+        friction: (B, P, O, 3) forces of friction on them [N].
+        slide: (B, P, O) size of the velocity of sliding at the end of the step, times the effective step h_e [m]: for
+            implicit Euler the slide in the step, for BDF2 not, whose h_e is two thirds of a step.
+        sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than friction needs to be
+            fully developed.
+    """
+
+    obstacles: tuple[str, ...]
+    vertices: torch.Tensor
+    gap: torch.Tensor
+    normal: torch.Tensor
+    friction: torch.Tensor
+    slide: torch.Tensor
+    sticks: torch.Tensor

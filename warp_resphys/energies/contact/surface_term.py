@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -10,19 +10,18 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.integration_points import Points
-from ..io.errors import InputError
-from ..kernels.contact import nearest_points
-from ..kernels.contact import surface_pairs as kernels
-from ..stepping.quantity import Quantity
-from .barrier import barrier_pressure, friction_over_slide
-from .launcher import HostLaunches, Launcher, struct_of, warp_view
+from ...fem.integration_points import Points
+from ...io.errors import InputError
+from ...kernels.contact import nearest_points
+from ...kernels.contact import surface_pairs as kernels
+from ...stepping.quantity import Quantity
+from ..launcher import HostLaunches, Launcher, warp_view
+from ..term import Adjoint, PairTangents, PointSet, Term, Values, value_of
 from .pairs import PairList, Surface
-from .term import Adjoint, PairTangents, PointSet, Term, Values, value_of
+from .surface_friction import Grips, NearPairs, Sliding
 
 STIFFNESS = Quantity("surface_stiffness", "Pa", 0.0)
 FRICTION = Quantity("surface_friction", "", 0.0, closed=True, per="coefficient")
-_FEATURES = int(nearest_points.EDGE_FEATURES)
 _TINY = 1e-300  # keeps a division by a length defined
 
 
@@ -46,38 +45,6 @@ class SurfacePoints(Points):
         """Returns the vertices (F, 2, `count`) of both regions of pairs, with the same numbers."""
         after = count - self.first - self.regions.shape[2]
         return np.pad(self.regions, [(0, 0), (0, 0), (self.first, after)])
-
-
-class Sliding(NamedTuple):
-    """Friction of pairs at the start of a step, differentiable."""
-
-    environment: torch.Tensor  # (G,)
-    nodes: torch.Tensor  # (G, 4)
-    weights: torch.Tensor  # (G, 4) of the nearest points
-    normal: torch.Tensor  # (G, 3)
-    load: torch.Tensor  # (G,) normal force [N]
-    regions: torch.Tensor  # (G,) number of the coefficient
-
-    def slide(self, x: torch.Tensor, reference: torch.Tensor) -> torch.Tensor:
-        """Returns the relative ways (G, 3) of both parts of pairs in their tangential planes [m] (see `force`)."""
-        row = self.environment[:, None]
-        way = (self.weights[:, :, None] * (x[row, self.nodes] - reference[row, self.nodes])).sum(1)
-        return way - (way * self.normal).sum(-1, keepdim=True) * self.normal
-
-    def force(
-        self, x: torch.Tensor, reference: torch.Tensor, friction: torch.Tensor, slip: torch.Tensor
-    ) -> torch.Tensor:
-        """Returns the forces (G, 3) on the first parts of pairs [N].
-
-        Args:
-            x: (B, N, 3) positions [m].
-            reference: (B, N, 3) positions without slide [m].
-            friction: (B, F) coefficients.
-            slip: (B, 1) slide at which friction is fully developed [m].
-        """
-        u = self.slide(x, reference)
-        _, factor = friction_over_slide(u, slip[self.environment, 0])
-        return -(friction[self.environment, self.regions] * self.load * factor)[:, None] * u
 
 
 class SurfaceTerm(Term):
@@ -276,43 +243,15 @@ class SurfaceTerm(Term):
         self.launcher.launch(*self._record(warp_view(positions, wp.vec3d), active))
         return self._chosen(self.launcher.active)
 
-    def _pairs(self, chosen: torch.Tensor, x: torch.Tensor) -> "_Near":
-        """Returns the geometry of chosen pairs at positions (B, N, 3), differentiable."""
-        own, ours = self.launcher, self._list
-        indices = chosen.to(torch.int32)
-        w, t, s = (self._force.new_zeros(len(chosen), _FEATURES, 4) for _ in range(3))
-        part = self._force.new_zeros(len(chosen), _FEATURES)
-        features = struct_of(nearest_points.Features, coefficient=part, w=w, t=t, s=s)
-        inputs = [warp_view(indices, wp.int32), ours.pairs, wp.float64(self._reach), warp_view(x, wp.vec3d)]
-        own.launch(own.record(nearest_points.pair_features, (len(chosen), _FEATURES), inputs, [features]))
-        environment, nodes = ours.environment[chosen], ours.nodes[chosen]
-        ends = x[environment[:, None], nodes]
-        # Weights that do not change here, but whose derivatives are those of the nearest points.
-        r, e, f = w @ ends, t @ ends, s @ ends
-        ee = (e * e).sum(-1) + (t == 0.0).all(-1).double()
-        ff, ef = (f * f).sum(-1) + (s == 0.0).all(-1).double(), (e * f).sum(-1)
-        whole = torch.maximum(ee * ff - ef * ef, 1e-12 * ee * ff)
-        er, fr = (e * r).sum(-1), (f * r).sum(-1)
-        first, second = (fr * ef - er * ff) / whole, (er * ef - fr * ee) / whole
-        w = w + first[..., None] * t + second[..., None] * s
-        r = w @ ends
-        cross = torch.linalg.cross(ends[:, 1] - ends[:, 0], ends[:, 3] - ends[:, 2]).square().sum(-1)
-        share = (cross / ours.parallel[chosen]).clamp_max(1.0)
-        factor = torch.where(ours.kind[chosen] == 0, 1.0, (2.0 - share) * share) * ours.area[chosen]
-        return _Near(environment, nodes, w, r, r.norm(dim=-1), part, factor)
-
     def sliding(self, start: torch.Tensor, stiffness: torch.Tensor) -> Sliding | None:
         """Returns friction for the state at the start of a step, or None without pairs within reach."""
         chosen = self._near_at(start.detach())
         if not len(chosen):
             return None
-        near = self._pairs(chosen, start)
-        n, pressure = near.r / near.d[..., None], near.part * barrier_pressure(near.d, self._reach)
-        normal = n[:, 0]
-        load = near.factor * stiffness[near.environment, 0] * ((pressure[..., None] * n).sum(1) * normal).sum(-1)
-        kept = load > 0.0
-        out = (near.environment, near.nodes, near.weights[:, 0], normal, load, self._regions(chosen))
-        return Sliding(*(value[kept] for value in out)) if bool(kept.any()) else None
+        return Sliding.of(self._pairs(chosen, start), self._reach, stiffness, self._regions(chosen))
+
+    def _pairs(self, chosen: torch.Tensor, x: torch.Tensor) -> NearPairs:
+        return NearPairs.of(self.launcher, self._list, chosen, x)
 
     def _regions(self, chosen: torch.Tensor) -> torch.Tensor:
         """Returns the number of the coefficient of friction of pairs: that of the first pair of regions they are in."""
@@ -387,54 +326,3 @@ class SurfaceTerm(Term):
             return out | {STIFFNESS.name: out[STIFFNESS.name] + by_stiffness}
 
         return differentiate
-
-
-class _Near(NamedTuple):
-    """Geometry of pairs within reach."""
-
-    environment: torch.Tensor  # (A,)
-    nodes: torch.Tensor  # (A, 4)
-    weights: torch.Tensor  # (A, 9, 4) of the nearest points, by feature (``kernels.contact.nearest_points.nearest``)
-    r: torch.Tensor  # (A, 9, 3) from the nearest point of the second part to that of the first [m]
-    d: torch.Tensor  # (A, 9) its length [m]
-    part: torch.Tensor  # (A, 9) coefficients of the features
-    factor: torch.Tensor  # (A,) area, with the factor for almost parallel edges [m^2]
-
-
-@dataclass(frozen=True)
-class Grips:
-    """Friction of pairs in a step.
-
-    Attributes:
-        environment: (G,) environments.
-        nodes: (G, 4) vertices.
-        struct: arrays for the kernels.
-        outputs: arrays of gradients and energies.
-        incidence: for ``kernels.contact.surface_pairs.gather``.
-    """
-
-    environment: torch.Tensor
-    nodes: torch.Tensor
-    struct: Any
-    outputs: list[Any]
-    incidence: list[Any]
-
-    @property
-    def count(self) -> int:
-        """Number of pairs G."""
-        return len(self.environment)
-
-    @classmethod
-    def of(cls, pairs: PairList, sliding: Sliding) -> "Grips":
-        """Returns friction of pairs (G, ...) (`kernels.contact.surface_pairs.FrictionPairs`)."""
-        environment, nodes, load = sliding.environment, sliding.nodes, sliding.load
-        kept = {
-            name: (value if value.is_floating_point() else value.to(torch.int32)).contiguous()
-            for name, value in sliding._asdict().items()
-        }
-        struct = struct_of(kernels.FrictionPairs, **kept)
-        sums = load.new_zeros(len(load), 4, 3), torch.zeros_like(load)
-        incidence = pairs.incidence(environment, nodes)
-        outputs = [warp_view(sums[0], nearest_points.Corners), warp_view(sums[1], wp.float64)]
-        own = [warp_view(x, wp.int32) for x in incidence]
-        return cls(environment, nodes, struct, outputs, own)

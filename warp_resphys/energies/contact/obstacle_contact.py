@@ -24,56 +24,41 @@ state: there is none where the body was not pressed against the obstacle before.
 M. Li et al.: Incremental potential contact. ACM Transactions on Graphics 39 (4), 2020.
 """
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import warp as wp
-from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.integration_points import Points
-from ..io.errors import InputError, listed, naming
-from ..kernels.contact import barriers as kernels
-from ..mesh.elements import FACES
-from ..mesh.volume_mesh import Mesh, boundary_faces, face_triangles
-from ..stepping.quantity import Parameter, Quantity
-from ..stepping.rotations import rotations
-from ..stepping.state import State
-from .barrier import barrier_pressure, friction_over_slide
-from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
-from .launcher import Launcher, struct_of, warp_view
-from .obstacles import DistanceGrid, Obstacle, ObstacleMotion, ObstacleSet, Pose
-from .term import Adjoint, PointSet, Term, Values, value_of
-
-log = logging.getLogger(__name__)
-
-STIFFNESS = Quantity("contact_stiffness", "Pa", 0.0, per="obstacle")
-FRICTION = Quantity("contact_friction", "", 0.0, closed=True, per="obstacle")
-GROWTH = Quantity("obstacle_growth", "m", per="obstacle", typical=1e-3)
-SHIFT = tuple(Quantity(f"obstacle_{axis}", "m", per="obstacle", typical=1e-2) for axis in "xyz")
-TURN = tuple(Quantity(f"obstacle_turn_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz")
-MOTION = (
-    *(Quantity(f"obstacle_move_{axis}", "m", per="obstacle", typical=1e-2) for axis in "xyz"),
-    *(Quantity(f"obstacle_rotate_{axis}", "rad", per="obstacle", typical=0.1) for axis in "xyz"),
+from ...fem.integration_points import Points
+from ...io.errors import InputError, listed
+from ...mesh.volume_mesh import Mesh
+from ...stepping.quantity import Parameter, Quantity
+from ...stepping.rotations import rotations
+from ...stepping.state import State
+from ..base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
+from ..launcher import Launcher
+from ..term import PointSet, Values, value_of
+from .barrier import ContactForces, barrier_pressure, friction_over_slide
+from .clearance import Clearance
+from .contact_points import (
+    FRICTION,
+    GROWTH,
+    MOTION,
+    POSE,
+    SHIFT,
+    STIFFNESS,
+    TURN,
+    ContactPoints,
+    vertex_areas,
+    vertex_factors,
 )
-POSE: Final = ("contact_place", "contact_turn")
-FRICTION_VALUES: Final = ("contact_load", "contact_normal", "contact_reference")
-_PUSHES = 50  # of vertices out of obstacles that have moved
-_ADVANCES = 100  # along the way of an obstacle in a step
-_DEEP = 0.3  # share of D within which a start is warned of
-
-
-@dataclass(frozen=True)
-class ContactPoints(Points):
-    """Vertices of a surface."""
-
-    areas: NDArray[np.float64]  # (P,) [m^2]
-    factors: NDArray[np.float64]  # (P,) of friction
+from .obstacle_poses import ObstacleMotion, ObstacleSet, Pose
+from .obstacle_term import ContactTerm
+from .obstacles import DistanceGrid, Obstacle
 
 
 @dataclass(frozen=True)
@@ -167,70 +152,11 @@ class Contact(Energy):
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "ContactTerm":
-        return ContactTerm(launcher, sets, self)
+        return ContactTerm(launcher, sets, [*self.obstacles.values()], self.distance)
 
     @override
     def bind(self, site: EnergySite) -> "BoundContact":
         return BoundContact(self, site)
-
-
-def vertex_areas(mesh: Mesh) -> NDArray[np.float64]:
-    """Returns the part of the surface that belongs to every vertex, (N,) [m^2]; its sum is that of the surface."""
-    faces, areas = boundary_faces(mesh), np.zeros(len(mesh.vertices))
-    if faces.shape[1] != FACES[faces.shape[1]].corners:
-        faces = face_triangles(faces)  # Integrals of quadratic shape functions vanish at corners.
-    face = FACES[faces.shape[1]]
-    places, weights = face.rule(2)
-    values, slopes = face.shape(places)
-    tangents = np.einsum("qkd,fki->fqdi", slopes, mesh.vertices[faces])
-    sizes = np.linalg.norm(np.cross(tangents[..., 0, :], tangents[..., 1, :]), axis=-1) * weights
-    np.add.at(areas, faces, np.einsum("fq,qk->fk", sizes, values))
-    return areas
-
-
-def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float64]:
-    """Returns the factor of friction at every vertex, (N,): the mean of its cells', which is one outside all regions.
-
-    Raises:
-        InputError: the mesh has no such region, or a cell is in two of them.
-    """
-    own, named = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells), dtype=bool)
-    for name, factor in factors.items():
-        with naming("contact.friction_factors: "):
-            cells = mesh.region(name)
-        if named[cells].any():
-            raise InputError(f"contact.friction_factors: {name!r} shares cells with another region: leave one out.")
-        own[cells], named[cells] = factor, True
-    corners, size = mesh.cells.ravel(), len(mesh.vertices)
-    counts = np.bincount(corners, minlength=size).clip(1)
-    return np.asarray(np.bincount(corners, np.repeat(own, mesh.cells.shape[1]), size) / counts)
-
-
-@dataclass(frozen=True)
-class ContactForces:
-    """Contact at the end of a step, for every vertex of the surface and every obstacle, differentiable.
-
-    That between surfaces has no axis of obstacles, and is with the nearest others.
-
-    Attributes:
-        obstacles: names of the O obstacles; none for contact between surfaces.
-        vertices: (P,) vertices of the surface.
-        gap: (B, P, O) distances [m].
-        normal: (B, P, O, 3) forces of the barrier on the vertices [N].
-        friction: (B, P, O, 3) forces of friction on them [N].
-        slide: (B, P, O) size of the velocity of sliding at the end of the step, times the effective step h_e [m]: for
-            implicit Euler the slide in the step, for BDF2 not, whose h_e is two thirds of a step.
-        sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than friction needs to be
-            fully developed.
-    """
-
-    obstacles: tuple[str, ...]
-    vertices: torch.Tensor
-    gap: torch.Tensor
-    normal: torch.Tensor
-    friction: torch.Tensor
-    slide: torch.Tensor
-    sticks: torch.Tensor
 
 
 class BoundContact(BoundEnergy):
@@ -264,14 +190,15 @@ class BoundContact(BoundEnergy):
             names = [(f"{when}{name}", unit, size) for when in ("", "previous_") for name, unit, size in sizes]
             self.memory = tuple(Memory(name, unit, (contact.count, *size), "obstacle") for name, unit, size in names)
         self._fixed = torch.as_tensor(site.body.fixed_vertices + site.first, device=like.device)
-        self._free = (~torch.isin(self._vertices, self._fixed)).to(self._area)  # (P,) zero at fixed vertices
-        self._rigid = list[tuple[torch.Tensor, torch.Tensor]]()  # points of rigid parts, and their vertices within
+        free = (~torch.isin(self._vertices, self._fixed)).to(self._area)
+        rigid = list[tuple[torch.Tensor, torch.Tensor]]()
         for name in site.body.controls:
             cells = site.body.mesh.cells[site.body.mesh.region(name)]
             own = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
             if len(surface := torch.isin(self._vertices, own).nonzero().ravel()):  # others are out of reach
-                self._rigid.append((surface, own[~torch.isin(own, self._vertices)]))
-        self._check_start(like)
+                rigid.append((surface, own[~torch.isin(own, self._vertices)]))
+        self._clearance = Clearance(contact.obstacles, contact.distance, self._shapes, self._vertices, free, rigid)
+        self._clearance.check_start(like, self.pose(contact.constants, {}))
 
     def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
         """Returns the poses for parameters and inputs by name."""
@@ -333,7 +260,7 @@ class BoundContact(BoundEnergy):
         x = state.q[:, self._vertices]
         d, n = self._shapes.distances(x, before)
         if x.device.type == "cpu":  # On a GPU the host would wait.
-            self._check(state.q, before, "at the start of a step", d)
+            self._clearance.check(state.q, before, "at the start of a step", d)
         same = stage.velocity_reference is state.q
         reference = (x if same else stage.velocity_reference[:, self._vertices])[:, :, None]
         reference = reference.expand(-1, -1, self._contact.count, -1)
@@ -348,9 +275,9 @@ class BoundContact(BoundEnergy):
             self._check_motion(step.inputs, before, now)
             here = now.world(inside)
         if self._contact.moves or step.fixed_positions is not None:
-            self._check_way(here.detach(), self._ends(x, step.fixed_positions), now, d.detach())
+            self._clearance.check_way(here.detach(), self._ends(x, step.fixed_positions), now, d.detach())
         if self._contact.moves:
-            start = self._pushed_out(state.q.detach(), now, d.detach())
+            start = self._clearance.pushed_out(state.q.detach(), now, d.detach())
         load = self._load(d, step.values)
         if self._has_factors:
             load = load * self._factor[:, None]
@@ -432,68 +359,6 @@ class BoundContact(BoundEnergy):
         if bool((torch.einsum("boij,boij->bo", before.turn, now.turn) < 1.0).any()):
             raise InputError("an obstacle turns by more than 90 degrees in a step: turn it less in a step.")
 
-    def _check_way(self, carried: torch.Tensor, ends: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> None:
-        """Raises InputError where an obstacle passes over a vertex, or a fixed vertex through an obstacle.
-
-        A way is followed to its first place on an obstacle: by the tangential planes of a convex one, which are
-        never beyond it, and by the largest slope of the distance from another.
-
-        Args:
-            carried: (B, P, O, 3) vertices as if they had moved with the obstacles [m].
-            ends: (B, P, 3) where they are before the solve, fixed vertices at the end of the step [m].
-            pose: poses after the motion.
-            gaps: (B, P, O) distances before it [m].
-        """
-        ways = ends[:, :, None] - carried
-        for k in (ways.norm(dim=-1) > gaps).any(1).any(0).nonzero().ravel().tolist():
-            obstacle, way = tuple(self._contact.obstacles.values())[k], ways[:, :, k]
-            end, side = (value[:, :, k] for value in self._shapes.distances(ends, pose))
-            share, most = torch.zeros_like(end), torch.full_like(end, obstacle.size[1]) * way.norm(dim=-1)
-            for _ in range(_ADVANCES):
-                d, n = (
-                    value[:, :, k] for value in self._shapes.distances(carried[:, :, k] + share[..., None] * way, pose)
-                )
-                slope = most if isinstance(obstacle, DistanceGrid) else -(n * way).sum(-1)
-                further = torch.where(slope > 0.0, d / slope.clamp_min(torch.finfo(d.dtype).tiny), 2.0)
-                share = (share + further.clamp_min(0.0)).clamp_max(2.0)
-                if bool(((share >= 1.0) | (further < 1e-6)).all()):
-                    break
-            passes = (share < 1.0) & ((end > 0.0) | ((n * side).sum(-1) < 0.0))
-            if bool(passes.any()):
-                vertex = int(self._vertices[passes.any(0).nonzero()[0]])
-                raise InputError(
-                    f"vertex {vertex} of the body and the obstacle {self._contact.names[k]!r} pass through one another "
-                    "in a step: move the obstacle, or the fixed vertices, less in a step."
-                )
-
-    def _pushed_out(self, q: torch.Tensor, pose: Pose, gaps: torch.Tensor) -> torch.Tensor:
-        """Returns positions (B, N, 3) as far from obstacles that have moved as before, at most half of D.
-
-        Args:
-            q: (B, N, 3) positions before the motion [m].
-            pose: poses after it.
-            gaps: (B, P, O) distances before it [m].
-        """
-        need, free = gaps.clamp_max(0.5 * self._contact.distance), self._free
-        for _ in range(_PUSHES):
-            d, n = self._shapes.distances(q[:, self._vertices], pose)
-            # Not to the last digit, which float32 does not have; nor where another environment needs another push.
-            lack, worst = (torch.where(d < 0.999 * need, need - d, 0.0) * free[:, None]).max(-1)
-            if not bool(lack.any()):
-                break
-            normal = n.gather(2, worst[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
-            ways, inside = lack[..., None] * normal, list[tuple[torch.Tensor, torch.Tensor]]()
-            for surface, within in self._rigid:  # A rigid part moves as its vertex that lacks most.
-                most = lack[:, surface].argmax(1)
-                way = ways[torch.arange(len(q), device=q.device), surface[most], None]
-                ways[:, surface] = way
-                inside.append((within, way.expand(-1, len(within), -1)))
-            q = q.index_add(1, self._vertices, ways)
-            for within, way in inside:
-                q = q.index_add(1, within, way)
-        self._check(q, pose, "after an obstacle has moved")
-        return q
-
     def outside(self, q: torch.Tensor, state: State, values: Values) -> torch.Tensor:
         """Returns positions (B, N, 3) [m] out of the obstacles, at least by the gaps of a state, at most by half of D.
 
@@ -502,101 +367,4 @@ class BoundContact(BoundEnergy):
         """
         pose = self._pose(values, {}, state.batch)
         gaps, _ = self._shapes.distances(state.q[:, self._vertices], pose)
-        return self._pushed_out(q, pose, gaps)
-
-    def _check_start(self, rest: torch.Tensor) -> None:
-        """Raises InputError for a distance that fits no contact, and warns of a start that throws the body away."""
-        contact, own = self._contact, rest[self._vertices]
-        thickness = float((own.amax(0) - own.amin(0)).min())
-        if contact.distance > thickness:
-            raise InputError(
-                f"contact.distance is {1e3 * contact.distance:g} mm and the body {1e3 * thickness:g} mm thick: take a "
-                "hundredth to a tenth of that."
-            )
-        pose = self.pose(contact.constants, {})
-        d, _ = self._shapes.distances(rest[None, self._vertices], pose)
-        self._check(rest[None], pose, "at rest", d)
-        least = d.amin((0, 1))
-        if bool((least < _DEEP * contact.distance).any()):
-            log.warning(
-                "The body starts %.2g mm from %s, deep in its barrier, which throws it away: start it at "
-                "contact.distance (%g mm) or further, or hold it there.",
-                1e3 * float(least.min()),
-                contact.names[int(least.argmin())],
-                1e3 * contact.distance,
-            )
-
-    def _check(self, q: torch.Tensor, pose: Pose, when: str, d: torch.Tensor | None = None) -> None:
-        """Raises InputError where a vertex is within an obstacle."""
-        if d is None:
-            d, _ = self._shapes.distances(q[:, self._vertices], pose)
-        deepest = d.detach().amin((0, 1))
-        if bool((deepest <= 0.0).any()):
-            worst = int(deepest.argmin())
-            vertex = int(self._vertices[d.detach()[..., worst].amin(0).argmin()])
-            raise InputError(
-                f"the body is within the obstacle {self._contact.names[worst]!r} {when}: vertex {vertex} by "
-                f"{-1e3 * float(deepest[worst]):.3g} mm; move one of them, or move obstacles less in a step."
-            )
-
-
-class ContactTerm(Term):
-    """Kernels of contact with obstacles."""
-
-    _kernels = kernels
-
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet], contact: Contact) -> None:
-        (s,) = sets
-        assert isinstance(s.source, ContactPoints)
-        p, o = s.n_points, contact.count
-        names = (*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name, "contact_slip", *FRICTION_VALUES, "contact_start")
-        shapes = ((o, 3), (o, 3, 3), (o,), (o,), (o,), (1,), (p, o), (p, o, 3), (p, o, 3), (s.n_vertices, 3))
-        super().__init__(launcher, sets, dict(zip(names, shapes, strict=True)))
-        self._count, self._reach = o, contact.distance
-        self._shapes = ObstacleSet(tuple(contact.obstacles.values()), contact.distance, launcher.device)
-        self._area = torch.as_tensor(s.source.areas, device=launcher.device)
-        self._moved = torch.as_tensor(s.source.nodes[:, 0], device=launcher.device)
-
-    def _obstacles(self) -> Any:
-        return self._shapes.at(*(self.values[name] for name in (*POSE, GROWTH.name)))
-
-    @override
-    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
-        names = {"coefficient": FRICTION.name} | {
-            n.removeprefix("contact_"): n for n in ("contact_slip", *FRICTION_VALUES)
-        }
-        friction = struct_of(kernels.Friction, **{field: self.values[name] for field, name in names.items()})
-        area = warp_view(self._area, wp.float64)
-        return [s.points, area, self._obstacles(), self.view(STIFFNESS.name), friction, positions]
-
-    @override
-    def feasible(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.values["contact_start"], self._moved
-
-    @override
-    def bounds(self, origin: Any, positions: Any, share: Any) -> list[Any]:
-        batch, (s,) = self.launcher, self.sets
-        inputs = [warp_view(batch.active, wp.int32), s.points, self._obstacles(), origin, positions]
-        return [batch.record(kernels.bound, (batch.batch, s.n_points, self._count), inputs, [share])]
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        return self.values[STIFFNESS.name].sum(1, keepdim=True) / self._reach * self._area
-
-    @override
-    def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        batch, (s,), size = self.launcher, self.sets, (self.n_points, self._count)
-        names = ("place", "turn", "growth", "stiffness", "coefficient", "load", "normal", "reference")
-        shapes = {"turn": (3, 3), **dict.fromkeys(("place", "normal", "reference"), (3,))}
-        out = {name: batch.zeros(*size, *shapes.get(name, ())) for name in names}
-        inputs = [*self._arguments(s, warp_view(positions, wp.vec3d)), warp_view(direction, wp.vec3d)]
-        slopes = struct_of(kernels.Slopes, **out)
-        command = batch.record(kernels.adjoint, (batch.batch, *size), inputs, [slopes])
-
-        def differentiate() -> dict[str, torch.Tensor]:
-            batch.launch(command)
-            shared = zip((*POSE, GROWTH.name, STIFFNESS.name, FRICTION.name), names, strict=False)
-            sums = {value: out[name].sum(1) for value, name in shared}
-            return sums | {name: out[name.removeprefix("contact_")].clone() for name in FRICTION_VALUES}
-
-        return differentiate
+        return self._clearance.pushed_out(q, pose, gaps)

@@ -1,0 +1,1 @@
+"""Contact of bodies with rigid obstacles, with one another and with themselves."""

@@ -1,0 +1,169 @@
+"""Poses of obstacles, and distances and normals of points from them, differentiable."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from typing_extensions import override
+
+from ...io.arrays import FloatArray
+from ...kernels.contact import signed_distances as kernels
+from ...mesh.motion_files import MovingSurface
+from ...stepping.adjoints import AdjointFunction, first_derivatives
+from ..launcher import Launcher, struct_of, warp_view
+from .obstacles import DistanceGrid, Obstacle, surface_of
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Places (B, O, 3) [m], rotations (B, O, 3, 3) and growth (B, O) [m] of obstacles."""
+
+    place: torch.Tensor
+    turn: torch.Tensor
+    growth: torch.Tensor
+
+    def of(self, number: int) -> "Pose":
+        """Returns the poses of one obstacle."""
+        return Pose(*(value[:, number, None] for value in (self.place, self.turn, self.growth)))
+
+    def local(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns positions (B, P, O, 3) in the axes of the obstacles, from those in the world."""
+        return torch.einsum("boji,bpoj->bpoi", self.turn, x - self.place[:, None])
+
+    def world(self, y: torch.Tensor) -> torch.Tensor:
+        """Inverse of `local`."""
+        return torch.einsum("boij,bpoj->bpoi", self.turn, y) + self.place[:, None]
+
+
+class ObstacleSet:
+    """Shapes of obstacles on a device.
+
+    Args:
+        obstacles: the obstacles.
+        reach: distance at which contact begins [m].
+        device: a torch device.
+    """
+
+    def __init__(self, obstacles: tuple[Obstacle, ...], reach: float, device: torch.device) -> None:
+        grids = [o if isinstance(o, DistanceGrid) else None for o in obstacles]
+        parts = [np.zeros(0) if grid is None else grid.coefficients.ravel() for grid in grids]
+        firsts = np.cumsum([0, *(len(part) for part in parts)])
+        nodes = [
+            (0,) * 4 if g is None else (*g.distances.shape, first) for g, first in zip(grids, firsts, strict=False)
+        ]
+        low = [(0.0,) * 3 if grid is None else grid.low for grid in grids]
+        arrays = {
+            "kind": np.array([o.kind for o in obstacles], dtype=np.int32),
+            "size": np.array([o.size for o in obstacles]),
+            "low": np.array(low),
+            "nodes": np.array(nodes, dtype=np.int32),
+            "coefficients": np.concatenate(parts),
+        }
+        self._fixed = {name: torch.as_tensor(values, device=device) for name, values in arrays.items()}
+        self._reach = reach
+        self._measurements: dict[tuple[int, int, int], _Measurement] = {}
+
+    def at(self, place: torch.Tensor, turn: torch.Tensor, growth: torch.Tensor) -> Any:
+        """Returns the obstacles at float64 poses, as a kernel argument that reads these tensors."""
+        return struct_of(kernels.Obstacles, **self._fixed, reach=self._reach, place=place, turn=turn, growth=growth)
+
+    def distances(self, x: torch.Tensor, pose: Pose) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns signed distances (B, P, O) [m] and normals (B, P, O, 3) of positions (B, P, 3), differentiable."""
+        size = batch, points, count = (*x.shape[:2], pose.place.shape[1])
+        if size not in self._measurements:
+            self._measurements[size] = _Measurement(self, batch, points, count, x.device)
+        d, n = _Distances.apply(self._measurements[size], x, pose.place, pose.turn, pose.growth)
+        return d, n
+
+
+class _Measurement(Launcher):
+    """Buffers and launches of `kernels.contact.signed_distances.measure` and its adjoint for one size of a batch."""
+
+    def __init__(self, shapes: ObstacleSet, batch: int, points: int, count: int, device: torch.device) -> None:
+        super().__init__(batch, device)
+        self._size = (points, count)
+        self.inputs = [self.zeros(points, 3), self.zeros(count, 3), self.zeros(count, 3, 3), self.zeros(count)]
+        x, *pose = self.inputs
+        self._given = [shapes.at(*pose), warp_view(x, wp.vec3d)]
+        self.results, views = self._pair()
+        self.measure = self.record(kernels.measure, (batch, *self._size), self._given, views)
+
+    def _pair(self) -> tuple[list[torch.Tensor], list[Any]]:
+        """Returns buffers of distances and normals, and Warp's views of them."""
+        buffers = [self.zeros(*self._size), self.zeros(*self._size, 3)]
+        return buffers, [warp_view(buffer, kind) for buffer, kind in zip(buffers, (wp.float64, wp.vec3d), strict=True)]
+
+    @cached_property
+    def adjoint(self) -> tuple[list[torch.Tensor], torch.Tensor, torch.Tensor, Any]:
+        """Buffers of derivatives by the results, by positions and by rotations, and the launch; made when needed."""
+        by_results, views = self._pair()
+        position, turn = self.zeros(*self._size, 3), self.zeros(*self._size, 3, 3)
+        slopes = [warp_view(position, wp.vec3d), warp_view(turn, wp.mat33d)]
+        inputs = [*self._given, *views]
+        return (
+            by_results,
+            position,
+            turn,
+            self.record(kernels.measure_adjoint, (self.batch, *self._size), inputs, slopes),
+        )
+
+
+class _Distances(AdjointFunction):
+    """Signed distances and normals."""
+
+    @override
+    @staticmethod
+    def forward(ctx: Any, own: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        with own.lock:
+            for buffer, value in zip(own.inputs, given, strict=True):
+                buffer.copy_(value.detach())
+            own.launch(own.measure)
+            d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
+        ctx.own = own
+        ctx.save_for_backward(*given)
+        return d, n
+
+    @override
+    @staticmethod
+    @first_derivatives
+    def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        own = ctx.own
+        with own.lock:
+            buffers, position, turn, command = own.adjoint
+            for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
+                buffer.copy_(value)
+            own.launch(command)
+            sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
+            needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
+            return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
+
+
+@dataclass(frozen=True, eq=False)
+class ObstacleMotion:
+    """Motion of an obstacle in a roll-out of T steps.
+
+    Attributes:
+        name: of the obstacle, with that of its body if there are several.
+        obstacle: its shape.
+        beside: (N, 3) vertices of the body at rest, beside which the plate of a half-space lies [m].
+        poses: (T + 1,) poses of B environments, of this obstacle alone.
+    """
+
+    name: str
+    obstacle: Obstacle
+    beside: FloatArray
+    poses: tuple[Pose, ...]
+
+    def surface(self, environment: int) -> MovingSurface:
+        """Returns the moving triangles of an environment."""
+        growth = float(self.poses[0].growth[environment, 0].detach())
+        own, triangles = surface_of(self.obstacle, growth, self.beside)
+        local = torch.as_tensor(own)[None, :, None]
+        points = []
+        for pose in self.poses:
+            here = (value[environment, None].detach().cpu().double() for value in (pose.place, pose.turn, pose.growth))
+            points.append(Pose(*here).world(local)[0, :, 0].numpy())
+        return MovingSurface(self.name, np.stack(points), triangles)

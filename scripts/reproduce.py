@@ -27,9 +27,9 @@ import yaml
 from warp_resphys.commands import run_label
 from warp_resphys.data.recordings.segment import convert_segment
 from warp_resphys.io.errors import ResphysError
-from warp_resphys.io.files import read_json, write_text
 from warp_resphys.io.machine import commit, hardware
-from warp_resphys.io.stages import package_versions
+from warp_resphys.io.resuming import package_versions
+from warp_resphys.io.safe_files import read_json, write_text
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.metrics import PUBLISHED_MM
 from warp_resphys.report.data import Errors, trial_errors

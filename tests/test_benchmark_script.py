@@ -4,7 +4,7 @@ import benchmark
 import pytest
 from benchmarks import measuring, peers, steps
 
-from warp_resphys.io.files import read_json
+from warp_resphys.io.safe_files import read_json
 
 TINY = ("mesh.divisions=[2,1,1]", "--repeats=1", "--materials=0.45")
 

@@ -25,9 +25,9 @@ from support.main_job import end_of
 from warp_resphys import __version__, cli, commands
 from warp_resphys.commands import NOBODY_READS, run_label
 from warp_resphys.io.errors import InputError
+from warp_resphys.io.resuming import StageInterrupted
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings
-from warp_resphys.io.stages import StageInterrupted
 from warp_resphys.overrides import readable
 from warp_resphys.settings.run import RunSettings
 

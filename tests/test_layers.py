@@ -27,7 +27,7 @@ def rows():
 
 
 def place_of(name):
-    """Where a module inside the package belongs: "io.files" to `io/`, "cli" to `cli`."""
+    """Where a module inside the package belongs: "io.text" to `io/`, "cli" to `cli`."""
     first = name.split(".")[0]
     return f"{first}/" if (PACKAGE / first).is_dir() or first in ("kernels", "conf", "scripts") else first
 

@@ -17,9 +17,9 @@ from warp_resphys.learning.networks import ACTIVATIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
 from warp_resphys.settings.control import Model
 from warp_resphys.settings.learning import NetworkSettings
+from warp_resphys.settings.observed import MarkerSettings
 from warp_resphys.settings.reference import editor_schema, page
-from warp_resphys.settings.stages import StageSettings
-from warp_resphys.settings.trials import MarkerSettings
+from warp_resphys.settings.stage_keys import StageSettings
 from warp_resphys.stepping.integrators import INTEGRATORS
 
 ROOT = Path(__file__).parents[1]

@@ -65,19 +65,19 @@ from .experiment.timing import time_models
 from .io.atomic import digest
 from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
-from .io.files import read_json, write_json
 from .io.kernel_cache import start_quietly
 from .io.progress import show
-from .io.stages import Stage, package_versions, resources_used, run_stages, unfinished
+from .io.resuming import Stage, package_versions, resources_used, run_stages, unfinished
+from .io.safe_files import read_json, write_json
 from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
 from .settings.body import BodySettings, TargetSettings
 from .settings.control import ControlSettings
+from .settings.motions import Split, Trial
 from .settings.run import RunSettings
-from .settings.stages import BATCH, FIGURES, IMPORTED, LEARNING, NETWORKS, PLAYED, SIMULATOR, StageSettings
-from .settings.trials import Split, Trial
+from .settings.stage_keys import BATCH, FIGURES, IMPORTED, LEARNING, NETWORKS, PLAYED, SIMULATOR, StageSettings
 
 log = logging.getLogger(__name__)
 

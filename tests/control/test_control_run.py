@@ -22,7 +22,7 @@ from warp_resphys.control.sampling import check_plannable
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import Laboratory, ReducedWorld
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.io.safe_files import read_array, read_hdf5
 from warp_resphys.settings.control import ReductionSettings
 from warp_resphys.studies.live_twin import TwinSettings
 from warp_resphys.twin.reduced_estimator import ReducedEstimator

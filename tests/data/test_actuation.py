@@ -7,7 +7,7 @@ from warp_resphys.data.input_response import check_inputs, draw_inputs
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.energies.tendons import TENSION
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.settings.trials import SequenceSettings
+from warp_resphys.settings.played import SequenceSettings
 
 STEP = 0.01
 

@@ -12,7 +12,7 @@ from support.command_line import outcome
 from warp_resphys.data.base_motion import since_first
 from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.settings.trials import BagSettings
+from warp_resphys.settings.data_kinds import BagSettings
 
 RATE, FRAMES = 50.0, 41
 TIMES = np.arange(FRAMES) / RATE

@@ -8,7 +8,7 @@ from support.command_line import outcome, refusal
 from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.io import decoding
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.settings.trials import TableSettings
+from warp_resphys.settings.data_kinds import TableSettings
 
 TIMES = 100.0 + np.arange(30) / 50.0
 TIP = np.stack([0.02 * np.sin(5.0 * TIMES), 0.1 + 0.0 * TIMES, 0.01 * TIMES], -1)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.settings.trials import TableSettings
+from warp_resphys.settings.data_kinds import TableSettings
 
 
 @pytest.fixture
@@ -257,7 +257,7 @@ def test_wrong_archives(tmp_path, positions, changes, message):
 
 
 def test_arrays_larger_than_any_recording_are_not_read(tmp_path, positions, monkeypatch):
-    monkeypatch.setattr("warp_resphys.io.files.LARGEST_ARRAYS", 10 << 20)
+    monkeypatch.setattr("warp_resphys.io.safe_files.LARGEST_ARRAYS", 10 << 20)
     zeros = np.zeros((200_000, 3, 3))  # 14 MB, of which little is left in the file
     np.savez_compressed(tmp_path / "swing.npz", positions=zeros, rate_hz=100.0)
     assert (tmp_path / "swing.npz").stat().st_size < 1 << 20

@@ -4,7 +4,7 @@ import numpy as np
 
 from warp_resphys.data.driving import driving, first_change, phases_of, since_change
 from warp_resphys.data.trials import Trials
-from warp_resphys.io.files import read_hdf5
+from warp_resphys.io.safe_files import read_hdf5
 
 TIMES = 0.1 * np.arange(6)
 

@@ -10,7 +10,7 @@ from warp_resphys.experiment.duration import announcement, work_of
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.fan_out import Workers
-from warp_resphys.io.stages import run_stages
+from warp_resphys.io.resuming import run_stages
 from warp_resphys.pipeline import _announce, acquire, learning_stages
 
 TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "trainer.epochs=40", "trainer.rollout_every=20")

@@ -11,8 +11,8 @@ from warp_resphys.experiment import folds as module
 from warp_resphys.experiment.folds import Fold, run_folds, workers_for
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.fan_out import WorkerError, Workers
-from warp_resphys.io.stages import Stage, StageInterrupted
-from warp_resphys.settings.run import ParallelSettings
+from warp_resphys.io.resuming import Stage, StageInterrupted
+from warp_resphys.settings.run_keys import ParallelSettings
 
 
 def write(context):

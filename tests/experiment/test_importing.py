@@ -20,14 +20,14 @@ from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
 from warp_resphys.experiment.splits import trials_of
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_hdf5, read_json
+from warp_resphys.io.resuming import StageContext, fingerprint, run_stages
+from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.io.stages import StageContext, fingerprint, run_stages
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import IMPORTED, PLAYED, StageSettings
+from warp_resphys.settings.stage_keys import IMPORTED, PLAYED, StageSettings
 from warp_resphys.stepping.inputs import Inputs
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.simulate import build_target, initial_state
 from warp_resphys.experiment.splits import all_trials
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.files import read_json
+from warp_resphys.io.safe_files import read_json
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment

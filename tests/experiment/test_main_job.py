@@ -36,9 +36,9 @@ from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment.build import build_mesh, build_simulator
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.splits import split_of
-from warp_resphys.io.files import read_checkpoint, read_hdf5
 from warp_resphys.io.progress import Progress
-from warp_resphys.io.stages import fingerprint, package_versions
+from warp_resphys.io.resuming import fingerprint, package_versions
+from warp_resphys.io.safe_files import read_checkpoint, read_hdf5
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.reconstruction import LBFGSB
 

@@ -24,14 +24,14 @@ from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
 from warp_resphys.experiment.simulate import target_settings
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_json
+from warp_resphys.io.safe_files import read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings
-from warp_resphys.settings.trials import MotionSettings
+from warp_resphys.settings.motions import MotionSettings
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
 from warp_resphys.twin.twin import Twin

@@ -15,12 +15,12 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator
 from warp_resphys.experiment.report import read_recordings
 from warp_resphys.experiment.sensitivity import sensitivities
-from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
+from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.replay import exact
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.robot.loading import load
-from warp_resphys.settings.trials import MotionSettings
+from warp_resphys.settings.motions import MotionSettings
 from warp_resphys.stepping.inputs import Inputs
 
 pytestmark = pytest.mark.slow

@@ -20,9 +20,9 @@ from warp_resphys.energies.catalogue import make_material
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.classes import ClassSettings, check_packages
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_checkpoint, read_json
+from warp_resphys.io.resuming import Stage, fingerprint
+from warp_resphys.io.safe_files import read_checkpoint, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.io.stages import Stage, fingerprint
 from warp_resphys.learning.networks import OwnNetwork
 from warp_resphys.robot.description import describe
 from warp_resphys.settings.run import RunSettings

@@ -24,9 +24,9 @@ from warp_resphys.energies.catalogue import read_law
 from warp_resphys.experiment.pictures.camera_laboratory import depth_image, noisy_mask
 from warp_resphys.experiment.pictures.picture_stages import picture_stages
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_hdf5, read_json
+from warp_resphys.io.resuming import run_stages
+from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.io.stages import run_stages
 from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
 from warp_resphys.pictures.scene_files import read_tracked

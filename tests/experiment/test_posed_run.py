@@ -10,7 +10,7 @@ from support.main_job import finish, run_without_report
 from support.played_run import check_robots
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
-from warp_resphys.io.files import read_array, read_hdf5, read_json
+from warp_resphys.io.safe_files import read_array, read_hdf5, read_json
 from warp_resphys.report.identification_section import own_table
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh, ShippedArm

@@ -20,14 +20,14 @@ from warp_resphys.experiment import learn
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.errors import ResphysError
-from warp_resphys.io.files import read_array, read_checkpoint, read_hdf5, read_json
+from warp_resphys.io.resuming import StageContext, run_stages
+from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.io.stages import StageContext, run_stages
 from warp_resphys.learning import fitting
 from warp_resphys.learning.correction import force_frames
 from warp_resphys.learning.error_tables import ComparedModels
 from warp_resphys.learning.observed_motions import ObservedMotions
-from warp_resphys.settings.stages import StageSettings
+from warp_resphys.settings.stage_keys import StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED)
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}

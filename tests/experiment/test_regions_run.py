@@ -12,7 +12,7 @@ from support.main_job import run_without_report
 from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.files import DATASET, REGISTRATION, TRUTH
-from warp_resphys.io.files import read_array, read_hdf5, read_json
+from warp_resphys.io.safe_files import read_array, read_hdf5, read_json
 from warp_resphys.robot.description import Description, describe
 from warp_resphys.twin.stream import recorded_packets
 

@@ -12,16 +12,16 @@ from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.mesh_check import check_mesh
 from warp_resphys.experiment.splits import split_of
-from warp_resphys.io.files import read_checkpoint, read_hdf5, read_json
+from warp_resphys.io.resuming import StageContext, StageInterrupted, run_stages
+from warp_resphys.io.safe_files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.io.stages import StageContext, StageInterrupted, run_stages
 from warp_resphys.learning.identification import ParameterSearch
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
 from warp_resphys.report.error_section import mesh_text
 from warp_resphys.report.wording import NO_BREAK_SPACE
-from warp_resphys.settings.stages import StageSettings
+from warp_resphys.settings.stage_keys import StageSettings
 
 PLAIN = ("rest", "interpolation", "linear")  # two training trials are too few for a regression
 MODELS = [model for model in ALL_MODELS if model not in (LAW, "resphys_uncorrected")]

@@ -12,8 +12,8 @@ from warp_resphys.data.rigid_bodies import angles, motion_between
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.files import DATASET, TRUTH
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_json
-from warp_resphys.io.stages import run_stages
+from warp_resphys.io.resuming import run_stages
+from warp_resphys.io.safe_files import read_json
 from warp_resphys.pipeline import acquisition_stages
 
 # The laboratory is the simulator, so that the cap hangs where the import expects it.

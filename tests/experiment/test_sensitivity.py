@@ -10,7 +10,7 @@ import pytest
 
 from warp_resphys.data.rigid_bodies import arms
 from warp_resphys.experiment.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread
-from warp_resphys.settings.trials import CORNERS
+from warp_resphys.settings.motions import CORNERS
 
 RANDOM = np.random.default_rng(0)
 MARKERS = 2

@@ -19,11 +19,11 @@ from warp_resphys.experiment.files import DATASET
 from warp_resphys.experiment.simulate import simulate, vertices_in
 from warp_resphys.experiment.splits import split_of, trials_of
 from warp_resphys.io.errors import InputError
+from warp_resphys.io.resuming import StageContext
 from warp_resphys.io.settings import parse
-from warp_resphys.io.stages import StageContext
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
-from warp_resphys.settings.stages import SIMULATOR, StageSettings
+from warp_resphys.settings.stage_keys import SIMULATOR, StageSettings
 from warp_resphys.stepping.inputs import Inputs
 
 SIZE = (0.1, 0.03, 0.03)

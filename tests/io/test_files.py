@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.io import atomic, files
+from warp_resphys.io import atomic, safe_files
 from warp_resphys.io.errors import DataFileError
 
 POSITIONS = np.linspace(0.0, 1.0, 130 * 4 * 3).reshape(130, 4, 3)
@@ -17,38 +17,38 @@ POSITIONS = np.linspace(0.0, 1.0, 130 * 4 * 3).reshape(130, 4, 3)
 @pytest.fixture
 def trajectory(tmp_path: Path) -> Path:
     path = tmp_path / "data" / "trajectory.h5"
-    with files.atomic_hdf5(path, "trajectories", {"time_step": 0.01}) as file:
-        files.create(file, "positions", POSITIONS, "m")
-        files.create(file, "weights/mass", np.array(0.05), "kg")
+    with safe_files.atomic_hdf5(path, "trajectories", {"time_step": 0.01}) as file:
+        safe_files.create(file, "positions", POSITIONS, "m")
+        safe_files.create(file, "weights/mass", np.array(0.05), "kg")
     return path
 
 
 def read_positions(path: Path) -> np.ndarray:
-    with files.read_hdf5(path, "trajectories") as file:
-        return files.read_array(file, "positions", shape=(None, 4, 3))
+    with safe_files.read_hdf5(path, "trajectories") as file:
+        return safe_files.read_array(file, "positions", shape=(None, 4, 3))
 
 
 class TestAtomicFiles:
     def test_a_failing_writer_does_not_change_the_old_file(self, tmp_path):
         path = tmp_path / "metrics.json"
-        files.write_json(path, {"a": 1})
+        safe_files.write_json(path, {"a": 1})
         with atomic.atomic_path(path) as partial:
             partial.write_text("2")
-            assert files.read_json(path) == {"a": 1}
-        assert files.read_json(path) == 2
+            assert safe_files.read_json(path) == {"a": 1}
+        assert safe_files.read_json(path) == 2
         with pytest.raises(TypeError), atomic.atomic_path(path) as partial:
             partial.write_bytes("neither bytes nor finished")
-        assert files.read_json(path) == 2
+        assert safe_files.read_json(path) == 2
         assert os.listdir(tmp_path) == ["metrics.json"]
 
     def test_an_unwritable_path_is_named(self, tmp_path):
         (tmp_path / "file").write_text("")
         with pytest.raises(DataFileError, match=r"cannot write .*file/sub/a\.json \(Not a directory\)"):
-            files.write_json(tmp_path / "file" / "sub" / "a.json", {})
+            safe_files.write_json(tmp_path / "file" / "sub" / "a.json", {})
         (tmp_path / "folder.h5").mkdir()
         with (
             pytest.raises(DataFileError, match=r"cannot write .*folder\.h5"),
-            files.atomic_hdf5(tmp_path / "folder.h5", "k"),
+            safe_files.atomic_hdf5(tmp_path / "folder.h5", "k"),
         ):
             pass
 
@@ -58,10 +58,10 @@ class TestAtomicFiles:
 
     def test_a_full_disk_is_named_and_the_old_file_stays(self, tmp_path):
         path = tmp_path / "a.json"
-        files.write_json(path, 1)
+        safe_files.write_json(path, 1)
         with pytest.raises(DataFileError, match=r"disk is full while writing .*a\.json"), atomic.atomic_path(path):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        assert files.read_json(path) == 1
+        assert safe_files.read_json(path) == 1
 
     @pytest.mark.parametrize("name", ["a.safetensors", "a.h5", "a.json"])
     def test_a_file_that_the_system_cuts_short_is_named_and_not_left(self, tmp_path, name):
@@ -69,13 +69,13 @@ class TestAtomicFiles:
         path, limits = tmp_path / name, resource.getrlimit(resource.RLIMIT_FSIZE)
 
         def write():
-            with files.atomic_hdf5(path, "k") as file:
-                files.create(file, "x", np.ones(8000), "m")
+            with safe_files.atomic_hdf5(path, "k") as file:
+                safe_files.create(file, "x", np.ones(8000), "m")
 
         work = {
-            "a.safetensors": lambda: files.write_checkpoint(path, "k", {"x": torch.ones(8000).double()}, {}),
+            "a.safetensors": lambda: safe_files.write_checkpoint(path, "k", {"x": torch.ones(8000).double()}, {}),
             "a.h5": write,
-            "a.json": lambda: files.write_json(path, [0] * 40_000),
+            "a.json": lambda: safe_files.write_json(path, [0] * 40_000),
         }
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))  # Python ignores the signal.
         try:
@@ -90,13 +90,13 @@ class TestJson:
     def test_numpy_values_paths_and_infinite_numbers(self, tmp_path):
         path = tmp_path / "a.json"
         data = {"x": np.float64(1.5), "n": np.array([[1, 2]]), "p": Path("b"), "bad": [np.nan, -np.inf], 3: True}
-        files.write_json(path, data)
+        safe_files.write_json(path, data)
         parsed = json.loads(path.read_text(), parse_constant=pytest.fail)
         assert parsed == {"x": 1.5, "n": [[1, 2]], "p": "b", "bad": [None, None], "3": True}
 
     def test_objects_are_refused(self, tmp_path):
         with pytest.raises(TypeError, match="object cannot be written"):
-            files.write_json(tmp_path / "a.json", {"a": object()})
+            safe_files.write_json(tmp_path / "a.json", {"a": object()})
         assert os.listdir(tmp_path) == []
 
     @pytest.mark.parametrize(
@@ -107,18 +107,18 @@ class TestJson:
         if content is not None:
             path.write_bytes(content)
         with pytest.raises(DataFileError, match=f"{path}.*{message}"):
-            files.read_json(path)
+            safe_files.read_json(path)
 
 
 class TestHdf5:
     def test_round_trip_with_units_and_chunks_along_time(self, trajectory):
-        with files.read_hdf5(trajectory, "trajectories") as file:
+        with safe_files.read_hdf5(trajectory, "trajectories") as file:
             dataset = file["positions"]
             assert dataset.chunks == (64, 4, 3)
             assert dataset.attrs["units"] == "m"
             assert file.attrs["time_step"] == 0.01
-            assert files.read_array(file, "weights/mass", shape=()) == 0.05
-            assert np.array_equal(files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2])
+            assert safe_files.read_array(file, "weights/mass", shape=()) == 0.05
+            assert np.array_equal(safe_files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2])
         assert np.array_equal(read_positions(trajectory), POSITIONS)
 
     def test_cut_anywhere_it_is_refused(self, trajectory):
@@ -143,14 +143,14 @@ class TestHdf5:
 
     def test_a_finished_file_is_one_of_the_same_settings_that_is_whole(self, tmp_path):
         path = tmp_path / "forces.h5"
-        assert not files.is_final(path, "forces", "f")
-        with files.atomic_hdf5(path, "forces", {"fingerprint": "f"}) as file:
-            files.create(file, "force", np.ones((4, 10, 3)), "N")
-        assert files.is_final(path, "forces", "f")
-        assert not files.is_final(path, "forces", "g")
+        assert not safe_files.is_final(path, "forces", "f")
+        with safe_files.atomic_hdf5(path, "forces", {"fingerprint": "f"}) as file:
+            safe_files.create(file, "force", np.ones((4, 10, 3)), "N")
+        assert safe_files.is_final(path, "forces", "f")
+        assert not safe_files.is_final(path, "forces", "g")
         path.write_bytes(path.read_bytes()[:-9])
         with pytest.raises(DataFileError, match=r"forces\.h5 is truncated"):
-            files.is_final(path, "forces", "f")
+            safe_files.is_final(path, "forces", "f")
 
     @pytest.mark.parametrize(
         ("attributes", "message"),
@@ -165,7 +165,7 @@ class TestHdf5:
         path = tmp_path / "a.h5"
         with h5py.File(path, "w") as file:
             file.attrs.update(attributes)
-        with pytest.raises(DataFileError, match=message), files.read_hdf5(path, "trajectories"):
+        with pytest.raises(DataFileError, match=message), safe_files.read_hdf5(path, "trajectories"):
             pass
 
     def test_no_hdf5_at_all(self, tmp_path):
@@ -177,17 +177,17 @@ class TestHdf5:
             ("none.h5", "does not exist"),
             (".", "Is a directory"),
         ]:
-            with pytest.raises(DataFileError, match=message), files.read_hdf5(tmp_path / name, "trajectories"):
+            with pytest.raises(DataFileError, match=message), safe_files.read_hdf5(tmp_path / name, "trajectories"):
                 pass
 
     def test_missing_and_misshapen_datasets(self, trajectory):
-        with files.read_hdf5(trajectory, "trajectories") as file:
+        with safe_files.read_hdf5(trajectory, "trajectories") as file:
             for name in ("velocities", "weights"):
                 with pytest.raises(DataFileError, match=f"no dataset '{name}'"):
-                    files.read_array(file, name)
+                    safe_files.read_array(file, name)
             for shape in [(None, 4), (None, 5, 3)]:
                 with pytest.raises(DataFileError, match=r"shape \(130, 4, 3\) where any x"):
-                    files.read_array(file, "positions", shape=shape)
+                    safe_files.read_array(file, "positions", shape=shape)
 
     @pytest.mark.parametrize("kind", ["external link", "soft link", "external storage", "virtual"])
     def test_data_outside_of_the_file_are_refused(self, tmp_path, trajectory, kind):
@@ -205,11 +205,11 @@ class TestHdf5:
                 layout = h5py.VirtualLayout((130, 4, 3), "f8")
                 layout[...] = h5py.VirtualSource(str(trajectory), "positions", (130, 4, 3))
                 group.create_virtual_dataset("x", layout)
-        with pytest.raises(DataFileError, match="'/inner/x'"), files.read_hdf5(path, "trajectories"):
+        with pytest.raises(DataFileError, match="'/inner/x'"), safe_files.read_hdf5(path, "trajectories"):
             pass
 
     def test_errors_of_other_files_are_not_blamed_on_this_one(self, trajectory, tmp_path):
-        with pytest.raises(FileNotFoundError), files.read_hdf5(trajectory, "trajectories"):
+        with pytest.raises(FileNotFoundError), safe_files.read_hdf5(trajectory, "trajectories"):
             (tmp_path / "other").read_text()
 
 
@@ -221,52 +221,52 @@ class TestCheckpoints:
     def test_round_trip(self, tmp_path):
         path = tmp_path / "a.safetensors"
         shared = {**self.tensors, "alias": self.tensors["weight"]}
-        files.write_checkpoint(path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"})
-        tensors, metadata = files.read_checkpoint(path, "network")
+        safe_files.write_checkpoint(path, "network", shared, {"epoch": 3, "mean": np.float64(0.5), "fingerprint": "f"})
+        tensors, metadata = safe_files.read_checkpoint(path, "network")
         assert all(torch.equal(tensors[name], shared[name]) for name in shared)
         assert metadata == {"epoch": 3, "mean": 0.5, "fingerprint": "f"}
         tensors["weight"] += 1  # own memory, not the file's
-        assert torch.equal(files.read_checkpoint(path, "network")[0]["weight"], self.tensors["weight"])
+        assert torch.equal(safe_files.read_checkpoint(path, "network")[0]["weight"], self.tensors["weight"])
 
     def test_damage_anywhere_is_one_sentence_or_does_no_harm(self, tmp_path):
         path = tmp_path / "a.safetensors"
-        files.write_checkpoint(path, "network", self.tensors, {"epoch": 3, "fingerprint": "f"})
+        safe_files.write_checkpoint(path, "network", self.tensors, {"epoch": 3, "fingerprint": "f"})
         content, refused = path.read_bytes(), 0
         for place in range(len(content)):
             damaged = bytearray(content)
             damaged[place] ^= 1 << place % 8
             path.write_bytes(damaged)
             try:
-                files.read_checkpoint(path, "network")
+                safe_files.read_checkpoint(path, "network")
             except DataFileError:
                 refused += 1
         assert refused > 0.5 * len(content)
 
     def test_unusable(self, tmp_path):
         path = tmp_path / "a.safetensors"
-        files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
+        safe_files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
         with pytest.raises(DataFileError, match="'network'"):
-            files.read_checkpoint(path, "other")
+            safe_files.read_checkpoint(path, "other")
         content = path.read_bytes()
         for length in (0, 5, 40, len(content) - 1):
             path.write_bytes(content[:length])
             with pytest.raises(DataFileError, match=r"not a complete safetensors file|is damaged"):
-                files.read_checkpoint(path, "network")
+                safe_files.read_checkpoint(path, "network")
         with pytest.raises(DataFileError, match="does not exist"):
-            files.read_checkpoint(tmp_path / "none", "network")
+            safe_files.read_checkpoint(tmp_path / "none", "network")
         from safetensors.torch import save_file
 
         save_file({"x": torch.zeros(2)}, path)
         with pytest.raises(DataFileError, match="was not written by warp_resphys"):
-            files.read_checkpoint(path, "network")
+            safe_files.read_checkpoint(path, "network")
 
     def test_those_of_other_settings_or_cut_short_are_not_used(self, tmp_path, caplog):
         path = tmp_path / "a.safetensors"
-        files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
-        assert torch.equal(files.resume_checkpoint(path, "network", "f")[0]["weight"], self.tensors["weight"])
-        assert files.resume_checkpoint(path, "network", "g") is None
-        assert files.resume_checkpoint(tmp_path / "none", "network", "f") is None
+        safe_files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
+        assert torch.equal(safe_files.resume_checkpoint(path, "network", "f")[0]["weight"], self.tensors["weight"])
+        assert safe_files.resume_checkpoint(path, "network", "g") is None
+        assert safe_files.resume_checkpoint(tmp_path / "none", "network", "f") is None
         assert "belongs to other settings" in caplog.text
         path.write_bytes(path.read_bytes()[:-9])
-        assert files.resume_checkpoint(path, "network", "f") is None
+        assert safe_files.resume_checkpoint(path, "network", "f") is None
         assert f"{path} is not a complete safetensors file" in caplog.text

@@ -9,10 +9,9 @@ import pytest
 from rich.console import Console
 
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import write_json
 from warp_resphys.io.machine import peak_memory_gib
 from warp_resphys.io.progress import Progress, one_line
-from warp_resphys.io.stages import (
+from warp_resphys.io.resuming import (
     Stage,
     StageContext,
     StageInterrupted,
@@ -21,6 +20,7 @@ from warp_resphys.io.stages import (
     run_lock,
     run_stages,
 )
+from warp_resphys.io.safe_files import write_json
 
 REPOSITORY = Path(__file__).parents[2]
 

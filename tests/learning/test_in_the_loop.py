@@ -10,7 +10,7 @@ import torch
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import WHOLE_STATE, bind_markers
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.io.files import read_checkpoint, write_checkpoint
+from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.observed_motions import at_steps

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import read_checkpoint, write_checkpoint
+from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings

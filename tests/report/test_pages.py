@@ -28,8 +28,8 @@ from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.experiment.report import make_folds_report, read_driven, read_film, read_recordings, read_trials
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.files import read_json, write_json
-from warp_resphys.io.stages import StageContext
+from warp_resphys.io.resuming import StageContext
+from warp_resphys.io.safe_files import read_json, write_json
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.mesh.volume_mesh import Mesh

@@ -10,7 +10,7 @@ from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
 from warp_resphys.experiment.report import read_trials
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.io.files import read_json
+from warp_resphys.io.safe_files import read_json
 from warp_resphys.report import figures
 from warp_resphys.report.error_section import error_over_time
 from warp_resphys.report.wording import error_parts, number_text

@@ -12,7 +12,7 @@ from support.report_page import report
 from warp_resphys.data.camera import axes_from_below, motion_axes
 from warp_resphys.data.recordings.marker_quality import quality_table
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.files import write_json
+from warp_resphys.io.safe_files import write_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import (
     PUBLISHED_MM,

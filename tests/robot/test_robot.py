@@ -18,7 +18,7 @@ from support.main_job import run_without_report
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
 from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.io.files import read_json, write_json
+from warp_resphys.io.safe_files import read_json, write_json
 
 # The short segment; what is unknown of its pressures is identified.
 SEGMENT = """# @package _global_

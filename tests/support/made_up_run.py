@@ -10,7 +10,7 @@ import numpy as np
 from support.configured import settings
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import build_mesh
-from warp_resphys.io.files import atomic_hdf5, create, read_json, write_json
+from warp_resphys.io.safe_files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
 from warp_resphys.mesh.boxes import box_hexahedra
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import warp_resphys
-from warp_resphys.io.files import read_array, read_hdf5
+from warp_resphys.io.safe_files import read_array, read_hdf5
 
 
 def check_robots(folder, models=("simulation", "sysid", "simfree", "resphys"), tolerance=1e-8):

@@ -6,7 +6,7 @@ import sys
 from html.parser import HTMLParser
 
 from warp_resphys.experiment.report import make_report
-from warp_resphys.io.stages import StageContext
+from warp_resphys.io.resuming import StageContext
 
 FAILING = (sys.executable, "-c", "raise SystemExit('no OpenGL here')")
 

@@ -11,7 +11,7 @@ import torch
 from ..experiment.files import DRIVEN
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
-from ..io.files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
+from ..io.safe_files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from ..learning.correction import Learned
 from .linear_model import LinearModel
 from .polynomials import Polynomial, SquaredPolynomial

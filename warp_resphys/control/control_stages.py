@@ -13,16 +13,16 @@ from ..experiment.files import CONTROL, DATASET, DRIVEN, FEEDBACK, LINEAR, OPEN,
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
-from ..io.files import write_json
 from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.progress import Progress
+from ..io.resuming import StageContext, finished_record
+from ..io.safe_files import write_json
 from ..io.settings import parse
-from ..io.stages import StageContext, finished_record
 from ..mesh.motion_files import input_columns, write_csv
 from ..report.motions import DrivenBodies
 from ..robot.loading import load
 from ..settings.control import ControlSettings
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .control_files import (
     BASELINES,
     PLANNED,

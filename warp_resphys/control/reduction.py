@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, DataFileError
-from ..io.files import to_plain
 from ..io.progress import Progress
+from ..io.safe_files import to_plain
 from ..learning.coders import Coder
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings

@@ -18,7 +18,7 @@ from ..learning.correction import Learned
 from ..robot.actuation import RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
-from ..settings.trials import SequenceSettings
+from ..settings.played import SequenceSettings
 from ..stepping.state import State
 
 OnProgress = Callable[[int], None]

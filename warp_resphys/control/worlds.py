@@ -17,14 +17,14 @@ from ..experiment.laboratory import make_setup
 from ..experiment.simulate import substeps_of, target_settings
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from ..io.files import read_json
+from ..io.resuming import finished_record
+from ..io.safe_files import read_json
 from ..io.settings import parse
-from ..io.stages import finished_record
 from ..mesh.volume_mesh import boundary_triangles
 from ..robot.description import Description
 from ..robot.robot import Robot
-from ..settings.stages import StageSettings
-from ..settings.trials import MarkerSettings
+from ..settings.observed import MarkerSettings
+from ..settings.stage_keys import StageSettings
 from ..stepping.state import State
 from .reduced_model import ReducedModel
 

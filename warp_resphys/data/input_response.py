@@ -17,7 +17,8 @@ import torch
 
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
-from ..settings.trials import SequenceSettings, WaveSettings
+from ..settings.motions import WaveSettings
+from ..settings.played import SequenceSettings
 from ..stepping.quantity import Quantity
 
 Array = Any  # of NumPy or torch

@@ -12,7 +12,7 @@ from ..energies.strings import PAYLOAD, Strings
 from ..fem.bodies import Body
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
-from ..io.files import atomic_hdf5, create, read_array, read_hdf5
+from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5
 from ..mesh.selection import select_vertices
 from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
@@ -39,7 +39,7 @@ class Trials:
     Attributes:
         names: names of the trials.
         labels: labels of the M tracked markers; empty if every vertex is observed.
-        begins: how each trial begins, see `settings.trials.Begins`; held bodies are ``released`` here.
+        begins: how each trial begins, see `settings.motions.Begins`; held bodies are ``released`` here.
         times: (R, T) times of the frames [s]; trials that end early repeat their last time.
         observed: (R, T, M, 3) observed positions [m], NaN where a marker was not seen.
         held: (R, M, 3) positions before time zero [m], NaN for markers that a trial does not have.

@@ -13,7 +13,7 @@ from ..energies.contact.obstacle_poses import ObstacleMotion
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, number_of
-from ..io.files import atomic_hdf5, create
+from ..io.safe_files import atomic_hdf5, create
 from ..mesh.motion_files import input_columns, write_csv, write_usd, write_vtk
 from ..stepping.inputs import shapes
 from ..stepping.rollout import sample

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.classes import imported
 from ..io.errors import DataFileError, InputError, listed
-from ..io.files import read_json
+from ..io.safe_files import read_json
 from ..mesh.volume_mesh import Mesh
 from .materials import MASS_DAMPING, ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
 from ..io.fan_out import ALONE, Workers
-from ..io.files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.progress import show
-from ..io.stages import Stage, StageContext, package_versions, resources_used
+from ..io.resuming import Stage, StageContext, package_versions, resources_used
+from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
 from ..learning.reconstruction import follow, make_reconstructor
 from ..mesh.volume_mesh import surface_vertices
 from ..settings.run import RunSettings
-from ..settings.stages import SIMULATOR, StageSettings
+from ..settings.stage_keys import SIMULATOR, StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .build import build_body, build_simulator, simulation_device
@@ -39,7 +39,7 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
 
     Args:
         run: settings with the group ``ablation``.
-        files: of the bodies, see `settings.stages.StageSettings`.
+        files: of the bodies, see `settings.stage_keys.StageSettings`.
     """
     assert run.ablation is not None
     own = run.ablation

@@ -49,7 +49,7 @@ from ..settings.mesh import (
     SymmetrySettings,
     TetrahedralBox,
 )
-from ..settings.trials import BindingSettings, MarkerSettings, RigidBodySettings
+from ..settings.observed import BindingSettings, MarkerSettings, RigidBodySettings
 from .actuators import build_actuators
 
 

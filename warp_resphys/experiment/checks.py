@@ -29,10 +29,10 @@ from ..learning.reconstruction import make_reconstructor
 from ..mesh.selection import select_vertices
 from ..mesh.volume_mesh import surface_vertices
 from ..settings.body import BodySettings, MaterialSettings
+from ..settings.data_kinds import RecordedData, ReleaseFromLoad
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
-from ..settings.trials import RecordedData, ReleaseFromLoad
 from .actuators import Drive, check_drive, drive_of
 from .build import build_body, build_material, build_simulator
 from .experiment import LAW

@@ -15,10 +15,10 @@ import torch
 
 from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
-from ..io.stages import Stage
+from ..io.resuming import Stage
 from ..learning.reconstruction import make_reconstructor
 from ..report.wording import duration_text
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .experiment import MODELS, SIMFREE, Experiment
 from .mesh_check import CHECKED_SECONDS
 from .splits import evenly

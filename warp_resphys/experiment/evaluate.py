@@ -7,13 +7,13 @@ from itertools import chain
 import numpy as np
 
 from ..io.fan_out import ALONE, Workers
-from ..io.files import atomic_hdf5, create, write_json
 from ..io.parts import Parts, TrialPart
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import atomic_hdf5, create, write_json
 from ..learning.error_tables import ComparedModels, amplitudes
 from ..learning.evaluation import rollout_parts
 from ..learning.without_physics import without_physics
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .experiment import LEARNED, Experiment
 from .files import ERRORS, ROLLOUTS
 from .prediction_intervals import INTERVAL_MODELS, intervals_of, linearised, remaining, spreads_of

@@ -14,15 +14,15 @@ from ..data.markers import WHOLE_STATE, Observation
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
-from ..io.files import read_array, read_hdf5, read_json
+from ..io.safe_files import read_array, read_hdf5, read_json
 from ..learning.correction import Learned
 from ..learning.networks import NextState, ResidualForce, StateMap
 from ..learning.observed_motions import Identified, ObservedMotions
 from ..learning.parameters import split_name
 from ..learning.reconstruction import ReconstructedTrials
 from ..settings.body import MaterialSettings, SimulatorSettings
-from ..settings.run import models_of
-from ..settings.stages import StageSettings
+from ..settings.run_keys import models_of
+from ..settings.stage_keys import StageSettings
 from .build import bound_markers, build_body, build_simulator, marker_view_of
 from .files import DATASET, IDENTIFICATION, LAW_FILE, SCALED_DATASET, read_if_there, reconstruction_file, weights_file
 from .simulate import target_settings

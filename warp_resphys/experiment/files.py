@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, Final
 
-from ..io.files import read_json
+from ..io.safe_files import read_json
 
 DATASET: Final = "dataset.h5"
 SCALED_DATASET: Final = "dataset_scaled.h5"

@@ -11,8 +11,8 @@ from ..io.errors import InputError, ResphysError
 from ..io.fan_out import ALONE, WorkerError, Workers, fan_out
 from ..io.machine import available_cores
 from ..io.progress import Progress
-from ..io.stages import Stage, StageInterrupted, run_stages, unfinished
-from ..settings.run import ParallelSettings
+from ..io.resuming import Stage, StageInterrupted, run_stages, unfinished
+from ..settings.run_keys import ParallelSettings
 from .build import simulation_device
 
 Stages = Callable[[Workers], list[Stage]]

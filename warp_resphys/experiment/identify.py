@@ -12,9 +12,9 @@ import torch
 from ..data.rigid_bodies import corners_of, independent
 from ..data.trials import RESTING
 from ..io.errors import ConvergenceError
-from ..io.files import resume_checkpoint, write_checkpoint, write_json
 from ..io.progress import Progress
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import resume_checkpoint, write_checkpoint, write_json
 from ..learning.identification import ParameterSearch
 from ..learning.misfit import Misfit
 from ..learning.observed_motions import Identified
@@ -22,7 +22,7 @@ from ..learning.parameters import Bounds, Prior, configured_parameters, own_name
 from ..learning.placement import Accuracy
 from ..learning.replay import Replay, Start
 from ..settings.learning import IdentifySettings, LawSettings, RangeSettings
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .experiment import MODELS, Experiment
 from .files import IDENTIFICATION
 from .splits import evenly

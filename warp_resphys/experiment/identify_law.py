@@ -19,15 +19,15 @@ import numpy as np
 from ..data.rigid_bodies import independent
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import LAW_FORMAT, read_law, unit_of
-from ..io.files import write_json
 from ..io.progress import Progress
-from ..io.stages import StageContext, package_versions
+from ..io.resuming import StageContext, package_versions
+from ..io.safe_files import write_json
 from ..learning.identification import ParameterSearch
 from ..learning.law import VISCOSITIES, KnownMotion, LawClass, WeakForm, fit_classes
 from ..learning.misfit import Misfit
 from ..learning.parameters import Bounds
 from ..learning.replay import Replay
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .experiment import LAW, Experiment
 from .files import LAW_FILE
 from .identify import Checkpoint, Found, IsLast, refined_searches, search_parameters

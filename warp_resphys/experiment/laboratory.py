@@ -24,12 +24,13 @@ from ..data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
 from ..io.fan_out import ALONE, Workers
-from ..io.files import write_json
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import write_json
 from ..mesh.selection import select_vertices
-from ..settings.stages import StageSettings
-from ..settings.trials import PlaySettings, Trial
+from ..settings.motions import Trial
+from ..settings.played import PlaySettings
+from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample
 from ..stepping.state import State

@@ -1,9 +1,9 @@
 """Stage: trains the residual force of a model, or the network in place of the simulator."""
 
-from ..io.files import resume_checkpoint, write_checkpoint, write_json
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import resume_checkpoint, write_checkpoint, write_json
 from ..learning.fitting import Fitting, Snapshot, fit
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .build import choose_device
 from .experiment import LAW, SIMFREE, Experiment
 from .files import training_file, weights_file

@@ -9,13 +9,13 @@ from ..data.driving import first_change
 from ..data.rigid_bodies import as_markers
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..io.files import write_json
 from ..io.progress import Progress
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import write_json
 from ..learning.error_tables import amplitudes
 from ..learning.metrics import marker_errors, summarise
 from ..learning.replay import Replay
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .build import finer
 from .checks import check_memory
 from .experiment import Experiment

@@ -11,7 +11,7 @@ from ..data.driving import since_change
 from ..data.rigid_bodies import as_markers
 from ..data.trials import Trials
 from ..io.arrays import FloatArray
-from ..io.files import read_array, read_hdf5
+from ..io.safe_files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.error_tables import counted
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage

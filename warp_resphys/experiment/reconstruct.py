@@ -3,11 +3,11 @@
 import numpy as np
 
 from ..io.fan_out import ALONE, Workers
-from ..io.files import atomic_hdf5, create, write_json
 from ..io.parts import Parts
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import atomic_hdf5, create, write_json
 from ..learning import reconstruction
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .experiment import Experiment
 from .files import RECONSTRUCTION, read_if_there, reconstruction_file
 

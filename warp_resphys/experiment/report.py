@@ -20,8 +20,8 @@ from ..fem.bodies import Body
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
-from ..io.files import read_array, read_hdf5, read_json
-from ..io.stages import StageContext, package_versions, resources_used
+from ..io.resuming import StageContext, package_versions, resources_used
+from ..io.safe_files import read_array, read_hdf5, read_json
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.selection import select_vertices

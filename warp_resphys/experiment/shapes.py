@@ -15,15 +15,15 @@ import torch
 from ..dynamics.simulator import Simulator
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
-from ..io.files import read_json, write_json
 from ..io.progress import Progress
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import read_json, write_json
 from ..learning.metrics import marker_errors, summarise
 from ..mesh.selection import select_vertices
 from ..settings.body import BodySettings, SimulatorSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.shapes import ShapeSettings
-from ..settings.stages import StageSettings
+from ..settings.played import ShapeSettings
+from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity

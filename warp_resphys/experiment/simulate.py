@@ -26,22 +26,15 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.parts import Arrays, Parts, Report, TrialPart
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
 from ..mesh.selection import select_vertices
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
+from ..settings.data_kinds import MovingBase, ReadingSettings, ReleaseFromTwist, SimulatedData
 from ..settings.mesh import PlaceSettings
-from ..settings.stages import StageSettings
-from ..settings.trials import (
-    HeldSettings,
-    MotionSettings,
-    MovingBase,
-    ReadingSettings,
-    ReleaseFromTwist,
-    SimulatedData,
-    Trial,
-)
+from ..settings.motions import HeldSettings, MotionSettings, Trial
+from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import states
 from ..stepping.rotations import twisted

@@ -8,16 +8,10 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from ..io.errors import DataFileError, InputError
+from ..settings.data_kinds import RecordedData, ReleaseFromLoad, SimulatedData
+from ..settings.motions import Split, Trial, TrialSettings
+from ..settings.played import LaboratorySettings
 from ..settings.run import RunSettings
-from ..settings.trials import (
-    LaboratorySettings,
-    RecordedData,
-    ReleaseFromLoad,
-    SimulatedData,
-    Split,
-    Trial,
-    TrialSettings,
-)
 
 T = TypeVar("T")
 

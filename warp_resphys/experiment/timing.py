@@ -6,12 +6,12 @@ from statistics import mean, pstdev
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..io.files import write_json
 from ..io.progress import Progress
-from ..io.stages import StageContext
+from ..io.resuming import StageContext
+from ..io.safe_files import write_json
 from ..learning.correction import Learned
 from ..learning.evaluation import TrialRollout
-from ..settings.stages import StageSettings
+from ..settings.stage_keys import StageSettings
 from .experiment import Experiment
 from .files import TIMES
 

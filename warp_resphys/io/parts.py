@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from .fan_out import ALONE, Workers, fan_out
-from .files import atomic_hdf5, create, is_final, read_array, read_hdf5
 from .progress import Progress
-from .stages import StageContext
+from .resuming import StageContext
+from .safe_files import atomic_hdf5, create, is_final, read_array, read_hdf5
 
 Report = Callable[..., None]
 Arrays = Mapping[str, tuple[NDArray[Any], str]]  # with their units

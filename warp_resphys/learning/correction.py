@@ -13,7 +13,7 @@ import torch
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Constants, Simulator
 from ..io.errors import ConvergenceError
-from ..io.files import read_checkpoint, write_checkpoint
+from ..io.safe_files import read_checkpoint, write_checkpoint
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .networks import NextState, ResidualForce, StateMap, restore

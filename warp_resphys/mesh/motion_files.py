@@ -13,7 +13,7 @@ import numpy as np
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..io.errors import InputError
-from ..io.files import write_text
+from ..io.safe_files import write_text
 from .volume_mesh import Mesh, boundary_triangles, surface_vertices
 
 _USD = (".usd", ".usda", ".usdc")

@@ -26,7 +26,7 @@ from pydantic import ConfigDict, Strict
 from ..data.camera import PlacedCamera
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import DataFileError, InputError, listed
-from ..io.files import read_arrays
+from ..io.safe_files import read_arrays
 from ..io.settings import Count, Many, Positive, Settings, Some, Word, parse
 from ..io.text import read_rows, read_text
 from ..settings.pictures import ColourSettings

@@ -14,8 +14,8 @@ from ..learning.baselines import BASELINES
 from ..learning.metrics import PublishedError, mean_distance, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.volume_mesh import Mesh
+from ..settings.data_kinds import ReleaseFromLoad
 from ..settings.run import RunSettings
-from ..settings.trials import ReleaseFromLoad
 from ..stepping.quantity import Quantity
 from .wording import MODELS
 

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from ..io.atomic import disk_full_error, is_disk_full
 from ..io.errors import DataFileError
-from ..io.files import write_text
+from ..io.safe_files import write_text
 from ..settings.run import RunSettings
 from .render import DrawingError, Renderer
 from .wording import NO_BREAK_SPACE, duration_text, flatten

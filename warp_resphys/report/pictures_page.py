@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..io.arrays import FloatArray
 from ..io.errors import listed
-from ..io.files import read_array, read_hdf5
+from ..io.safe_files import read_array, read_hdf5
 from ..learning.parameters import TILTS
 from ..pictures.seen import NEUTRAL
 from ..settings.run import RunSettings

@@ -17,9 +17,9 @@ from ..experiment.experiment import LEARNED, SIMFREE, Experiment, network_of
 from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
 from ..io.classes import check_packages
 from ..io.errors import DataFileError, InputError, listed
-from ..io.files import read_checkpoint, write_checkpoint
+from ..io.resuming import finished_record, planned
+from ..io.safe_files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
-from ..io.stages import finished_record, planned
 from ..learning.correction import Learned, Range
 from ..learning.intervals import LEVEL, Intervals
 from ..learning.networks import restore
@@ -28,8 +28,8 @@ from ..mesh.volume_mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings
 from ..settings.mesh import PlaceSettings
-from ..settings.stages import StageSettings
-from ..settings.trials import MarkerSettings
+from ..settings.observed import MarkerSettings
+from ..settings.stage_keys import StageSettings
 
 log = logging.getLogger(__name__)
 

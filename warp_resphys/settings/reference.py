@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from ..io.files import write_text
+from ..io.safe_files import write_text
 from ..io.setting_errors import Schema, options
 from .body import BodySettings, TargetSettings
 from .run import RunSettings

@@ -13,10 +13,10 @@ from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact.contact_points import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
-from ..io.files import read_json
 from ..io.progress import show
+from ..io.resuming import finished_record
+from ..io.safe_files import read_json
 from ..io.settings import Many, Positive, Settings, Word, setting
-from ..io.stages import finished_record
 from ..learning.baselines import BASELINES
 from ..report.data import at_times
 from ..report.layers import RenderScene

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator
 
 from ..io.errors import InputError
-from ..io.files import read_json, write_json
 from ..io.progress import Progress, show
+from ..io.resuming import finished_record
+from ..io.safe_files import read_json, write_json
 from ..io.settings import Count, Natural, Settings, Some, Word, setting
-from ..io.stages import finished_record
 from ..report.page import PageTable
-from ..settings.trials import Labels, different
+from ..settings.motions import Labels, different
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at

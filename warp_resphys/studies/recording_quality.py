@@ -29,12 +29,12 @@ from ..data.recordings.recording import Recording
 from ..data.recordings.recording_files import READERS, read_recording, write_recording
 from ..io.atomic import atomic_path
 from ..io.errors import DataFileError, InputError, listed
-from ..io.files import write_json
 from ..io.progress import aligned
+from ..io.safe_files import write_json
 from ..io.settings import Count, Many, NotNegative, Positive, Settings, Word, setting
 from ..report.figures import STYLE, new_figure, save_png
 from ..report.wording import TONES
-from ..settings.trials import BagSettings, TableSettings
+from ..settings.data_kinds import BagSettings, TableSettings
 
 # Okabe and Ito (2008), without yellow: everyone can tell them apart.
 MARKER_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#1c2127")

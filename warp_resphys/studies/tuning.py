@@ -25,8 +25,8 @@ from ..experiment.learn import fitting_of
 from ..experiment.splits import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.progress import show
+from ..io.resuming import StageInterrupted, run_stages
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
-from ..io.stages import StageInterrupted, run_stages
 from ..learning.fitting import run_epochs
 from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import PageTable

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, ResphysError, did_you_mean
-from ...settings.trials import BagSettings
+from ...settings.data_kinds import BagSettings
 from ..base_motion import since_first
 from .recording import SI_PER_ACTUATION_UNIT, Recording
 

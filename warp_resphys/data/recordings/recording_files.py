@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from ...io.arrays import FloatArray
 from ...io.decoding import Arrays, decode
 from ...io.errors import DataFileError, DecodingError, InputError
-from ...io.files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
+from ...io.safe_files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from ...io.text import decoded
-from ...settings.trials import BagSettings, TableSettings
+from ...settings.data_kinds import BagSettings, TableSettings
 from ..base_motion import since_first
 from .bag import SUFFIXES, is_bag, read_bag, topics_of
 from .recording import SI_PER_ACTUATION_UNIT, Recording, hide_zeros, in_metres, without_subject

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from ...io.errors import DataFileError
-from ...io.files import read_arrays
+from ...io.safe_files import read_arrays
 from .processing import valve_opening
 from .recording import SI_PER_ACTUATION_UNIT, Recording, in_metres
 from .recording_files import numbers, write_recording

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, did_you_mean, listed
 from ...io.text import Rows, number, read_rows
-from ...settings.trials import TableSettings
+from ...settings.data_kinds import TableSettings
 from .columns import AXES, QUATERNION, Layout, Place, Turn, is_data, quaternions
 from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, Recording, hide_zeros, length_unit, without_subject
 

@@ -10,12 +10,12 @@ from ...data.camera import PlacedCamera
 from ...data.markers import bind_markers
 from ...io.arrays import BoolArray, FloatArray
 from ...io.atomic import atomic_path
-from ...io.files import write_json
-from ...io.stages import StageContext
+from ...io.resuming import StageContext
+from ...io.safe_files import write_json
 from ...pictures.outlines import ClosedSurface
 from ...pictures.seen import Photo, SeenPose
 from ...settings.pictures import PictureData, PoseSettings, SimulatedCamera
-from ...settings.stages import StageSettings
+from ...settings.stage_keys import StageSettings
 from ..build import build_body, build_simulator
 from .seen_poses import read_lenses, released_force, scene_file
 

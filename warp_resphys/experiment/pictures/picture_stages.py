@@ -19,9 +19,9 @@ import torch
 from ...data.camera import CORRECTIONS, PlacedCamera
 from ...energies.catalogue import LAW_FORMAT, unit_of
 from ...io.errors import InputError
-from ...io.files import atomic_hdf5, create, read_json, write_json
 from ...io.progress import Progress, show
-from ...io.stages import Stage, StageContext, package_versions, resources_used
+from ...io.resuming import Stage, StageContext, package_versions, resources_used
+from ...io.safe_files import atomic_hdf5, create, read_json, write_json
 from ...learning.identification import ParameterSearch
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
@@ -31,7 +31,7 @@ from ...report.identification_section import parameter_rows
 from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
 from ...settings.pictures import PictureData
 from ...settings.run import RunSettings
-from ...settings.stages import SIMULATOR, StageSettings
+from ...settings.stage_keys import SIMULATOR, StageSettings
 from ..build import build_mesh, simulation_device
 from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
 from ..identify import Checkpoint, bounds_of, search_parameters

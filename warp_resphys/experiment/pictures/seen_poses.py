@@ -17,8 +17,8 @@ from ...fem.bodies import Body
 from ...io.arrays import FloatArray, IntArray
 from ...io.atomic import atomic_path, digest
 from ...io.errors import DataFileError, InputError, listed, naming, number_of
-from ...io.files import atomic_hdf5, create, read_array, read_hdf5
-from ...io.stages import StageContext
+from ...io.resuming import StageContext
+from ...io.safe_files import atomic_hdf5, create, read_array, read_hdf5
 from ...mesh.readers import METRES, read_mesh
 from ...mesh.selection import select_vertices
 from ...mesh.volume_mesh import Mesh, quadratic
@@ -40,7 +40,7 @@ from ...pictures.seen import Photo, SeenPose
 from ...pictures.tags import tag_poses
 from ...settings.body import MaterialSettings
 from ...settings.pictures import PictureData, PoseSettings
-from ...settings.stages import StageSettings
+from ...settings.stage_keys import StageSettings
 from ..build import build_mesh, build_simulator
 
 log = logging.getLogger(__name__)

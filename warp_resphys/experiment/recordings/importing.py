@@ -21,8 +21,8 @@ from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between,
 from ...data.trials import RESTING, SLACK, UNDER_INPUTS, Trials
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, number_of
-from ...io.files import write_json
-from ...io.stages import StageContext
+from ...io.resuming import StageContext
+from ...io.safe_files import write_json
 from ..build import bound_markers
 from ..files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET
 from ..splits import evenly

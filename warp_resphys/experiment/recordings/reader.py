@@ -17,9 +17,10 @@ from ...data.rigid_bodies import corners_of, motion_between, owners, with_corner
 from ...data.trials import STATIC, payload_inputs
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed
-from ...io.stages import StageContext
-from ...settings.stages import StageSettings
-from ...settings.trials import ReadingSettings, Trial
+from ...io.resuming import StageContext
+from ...settings.data_kinds import ReadingSettings
+from ...settings.motions import Trial
+from ...settings.stage_keys import StageSettings
 from ...stepping.inputs import Inputs
 from ..actuators import drive_of
 from ..build import bound_markers, build_simulator, marker_view_of, nominal_places

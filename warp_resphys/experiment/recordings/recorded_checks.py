@@ -12,8 +12,10 @@ from ...data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ...fem.bodies import Body
 from ...io.errors import InputError, listed, naming, number_of
 from ...mesh.selection import select_vertices
+from ...settings.data_kinds import RecordedData
+from ...settings.motions import Trial
+from ...settings.observed import MarkerSettings
 from ...settings.run import RunSettings
-from ...settings.trials import MarkerSettings, RecordedData, Trial
 from ..actuators import Drive, drive_of
 from ..build import build_material, marker_view_of, mounted_on
 from ..laboratory import largest_input

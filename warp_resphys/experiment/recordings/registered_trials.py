@@ -18,8 +18,8 @@ from ...data.rigid_bodies import corners_of, owners
 from ...data.trials import SLACK, STATIC, UNDER_INPUTS
 from ...io.arrays import BoolArray, FloatArray
 from ...io.errors import DataFileError, listed
-from ...io.stages import StageContext
-from ...settings.trials import MotionSettings, Trial
+from ...io.resuming import StageContext
+from ...settings.motions import MotionSettings, Trial
 from ..actuators import Drive
 from .reader import POSE_SECONDS, Reader, central_places
 

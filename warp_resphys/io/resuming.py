@@ -25,9 +25,9 @@ from filelock import FileLock, Timeout
 from .atomic import digest
 from .classes import check_packages
 from .errors import DataFileError, InputError
-from .files import FORMAT_VERSION, read_json, to_plain, write_json
 from .machine import peak_memory_gib
 from .progress import one_line
+from .safe_files import FORMAT_VERSION, read_json, to_plain, write_json
 from .settings import Settings, packages_of
 
 log = logging.getLogger(__name__)

@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from pydantic import ConfigDict, PrivateAttr, model_validator
 from typing_extensions import override
 
-from ..io.files import to_plain
+from ..io.safe_files import to_plain
 from ..io.settings import Many, Settings, setting
 from .body import SimulatorSettings, TargetSettings
 from .control import ControlSettings, FigureSettings
+from .data_kinds import ReadingSettings
 from .learning import AblationSettings, IdentifySettings, LawSettings, TrainingSettings
 from .mesh import PlaceSettings
+from .motions import Split, Trial
+from .observed import BindingSettings
+from .played import LaboratorySettings, PlaySettings
 from .run import RunSettings
-from .trials import BindingSettings, LaboratorySettings, PlaySettings, ReadingSettings, Split, Trial
 
 S = TypeVar("S", bound=Settings)
 

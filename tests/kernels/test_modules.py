@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, StableNeoHookean, box_hexahedra, box_tetrahedra, select_vertices
-from warp_resphys.dynamics import equilibrium
+from warp_resphys.dynamics import workspace
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.kernels.modules import launch_stream, named_module, shareable
 
@@ -47,7 +47,7 @@ def test_launches_are_on_the_stream_of_torch(device):
 )
 def test_a_solve_launches_the_modules_that_were_compiled_together(law, mesh, monkeypatch):
     together, recorded = set(), set()
-    monkeypatch.setattr(equilibrium, "compile_together", lambda kernels, *_: together.update(k.module for k in kernels))
+    monkeypatch.setattr(workspace, "compile_together", lambda kernels, *_: together.update(k.module for k in kernels))
     for name in ("record", "record_blocks"):
         before = getattr(Launcher, name)
         note = lambda own, kernel, *rest, _to=before: (recorded.add(kernel.module), _to(own, kernel, *rest))[1]  # noqa: E731

@@ -77,7 +77,7 @@ def test_an_indefinite_hessian_is_clamped_where_it_is(host, device):
     def begun():
         s = simulator("newton", device, factors="single", max_iterations=1, on_failure="count")
         state = s.step(compressed(s))
-        return state.q, s.workspace(3).solver("dynamics", s.settings).hessian.clamped.tolist()
+        return state.q, s.workspace(3).minimiser("dynamics", s.settings).hessian.clamped.tolist()
 
     (q, clamped), (expected, expected_clamped) = begun(), host(begun)
     assert clamped == expected_clamped == [False, True, False]

@@ -64,7 +64,7 @@ def test_a_failure_is_not_extrapolated(device):
     state.v[0] += 1e4  # in place: the next step still follows
     failed = s.step(state)
     assert failed.converged.tolist() == [False, True]
-    counts = s.workspace(2).solver("dynamics", s.settings)._minimiser._history_counts[0]
+    counts = s.workspace(2).minimiser("dynamics", s.settings)._now.corrections
     before = counts.tolist()
     assert min(before) == 3
     calm = State(pose(s, "bent", 2).q, torch.zeros_like(failed.v))

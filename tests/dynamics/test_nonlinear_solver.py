@@ -258,7 +258,7 @@ def test_directions_equal_the_bfgs_formula():
     minimiser.refactor(state)
     while min(map(len, pairs)) < 3 * memory:
         state = minimiser.advance(state)
-        waits = minimiser._progress["phase"] != kernels.NEED_DIRECTION
+        waits = minimiser._now.fields["phase"] != kernels.NEED_DIRECTION
         searches += int(waits.sum())
         for b in range(2):
             if waits[b]:

@@ -14,7 +14,8 @@ from ..linalg.threads import in_threads, threads_for
 from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.state import SolveReport
 from .hessian import ExactHessian
-from .nonlinear_solver import NonlinearSolver, SolverSettings
+from .minimiser import Minimiser
+from .nonlinear_solver import SolverSettings
 from .workspace import Workspace
 
 P = TypeVar("P")
@@ -39,12 +40,12 @@ def equilibrium(
 
     Args:
         workspace: workspace of the batch.
-        purpose: ``dynamics`` or ``statics`` (`Workspace.solver`).
+        purpose: ``dynamics`` or ``statics`` (`Workspace.minimiser`).
         settings: settings of the solver.
         terms: terms of the step.
         start: (B, N, 3) initial guess [m], without gradient; it affects the result only within the tolerance.
         fixed_positions: (B, D, 3) positions of the fixed vertices [m].
-        follows: passed to `NonlinearSolver.solve`.
+        follows: passed to `Minimiser.solve`.
 
     Returns:
         The last iterate, and the solver's report, which says whether it converged (`check_converged`).
@@ -76,11 +77,11 @@ class _Minimisation:
         start, *others = (None if tensor is None else tensor.detach() for tensor in tensors)
         assert start is not None
 
-        def work(rows: slice, own: Workspace, solver: NonlinearSolver) -> tuple[torch.Tensor, SolveReport]:
+        def work(rows: slice, own: Workspace, minimiser: Minimiser) -> tuple[torch.Tensor, SolveReport]:
             follows = None if self.follows is None else self.follows[rows]
-            return _minimise(own, solver, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others)))
+            return _minimise(own, minimiser, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others)))
 
-        results = self._in_shards(lambda own: own.solver(self.purpose, self.settings), work, start[0].numel())
+        results = self._in_shards(lambda own: own.minimiser(self.purpose, self.settings), work, start[0].numel())
         self.report = _joined([report for _, report in results])
         return results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
 
@@ -177,7 +178,7 @@ def _terms(names: Names, tensors: Sequence[Any]) -> StepTerms:
 
 def _minimise(
     workspace: Workspace,
-    solver: NonlinearSolver,
+    minimiser: Minimiser,
     follows: torch.Tensor | None,
     names: Names,
     start: Any,
@@ -196,12 +197,12 @@ def _minimise(
     parts: list[SolveReport] = []
     while not potential.place_fixed(fixed, fixed_positions, _LEAST_WAY if len(parts) < _MOST_PARTS else 1.0):
         assert potential.feasible is not None
-        parts.append(solver.solve(potential.coordinates.hold(potential.feasible.clone())))
+        parts.append(minimiser.solve(potential.coordinates.hold(potential.feasible.clone())))
         potential.feasible.copy_(potential.positions)
     if len(fixed):
         start = start.clone()
         start[:, fixed] = fixed_positions
-    report = solver.solve(potential.improved_start(start).to(start), None if parts else follows)
+    report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
     work = {name: sum(getattr(part, name) for part in [*parts, report]) for name in ("iterations", "factorisations")}
     return potential.positions.to(start.dtype, copy=True), replace(report, **work)
 

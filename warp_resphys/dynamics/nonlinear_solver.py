@@ -32,7 +32,7 @@ from ..kernels.minimisation import NEVER, Tolerances
 from ..linalg.choice import LINEAR_SOLVERS, make_linear_solver
 from ..stepping.state import SolveReport
 from .assembly import BlockPattern
-from .hessian import ExactHessian, HessianApproximation, ProjectiveHessian
+from .hessian import ExactHessian, ProjectiveHessian
 from .minimiser import Minimiser
 
 SolverName = Literal["projective_dynamics", "quasi_newton", "newton"]
@@ -92,8 +92,10 @@ def check_converged(settings: SolverSettings, report: SolveReport | None, positi
     )
 
 
-class NonlinearSolver:
-    """Minimises a potential repeatedly, with factor and buffers kept between solves.
+def make_minimiser(
+    potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings, dtype: torch.dtype
+) -> Minimiser:
+    """Returns the minimiser of a potential.
 
     Args:
         potential: the potential.
@@ -101,41 +103,20 @@ class NonlinearSolver:
         settings: settings of the solver.
         dtype: dtype of states.
     """
-
-    def __init__(
-        self, potential: IncrementalPotential, pattern: BlockPattern, settings: SolverSettings, dtype: torch.dtype
-    ) -> None:
-        self.potential, self.settings = potential, settings
-        factors = torch.float32 if settings.factors == "single" else dtype
-        self.hessian: HessianApproximation
-        projective = settings.name == "projective_dynamics"
-        blocks = (pattern.rows, pattern.cols, len(pattern.free), 1 if projective else 3)
-        linear = make_linear_solver(settings.linear_solver, *blocks, potential.device, factors)
-        self.hessian = (ProjectiveHessian if projective else ExactHessian)(potential, pattern, linear)
-        quasi = settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
-        after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": NEVER}
-        self._minimiser = Minimiser(
-            potential,
-            self.hessian,
-            torch.float32 if linear.keeps_factors and not potential.couples_cells else factors,
-            0 if after[settings.name] == 0 else settings.memory,
-            struct_of(
-                Tolerances,
-                relative=settings.relative_tolerance,
-                absolute=settings.absolute_tolerance,
-                epsilon=torch.finfo(dtype).eps,
-                max_iterations=settings.max_iterations,
-                refactor_after=after[settings.name],
-            ),
-        )
-
-    def solve(self, start: torch.Tensor, follows: torch.Tensor | None = None) -> SolveReport:
-        """Minimises the potential; the solution is in ``potential.positions``.
-
-        Args:
-            start: (B, N, 3) inertial target, or any initial guess [m].
-            follows: (B,) environments in which this step follows the last solved one: their start is extrapolated and
-                they reuse the factor. None: no environment. Results of the others do not depend on earlier solves.
-        """
-        self._minimiser.minimise(start, follows)
-        return SolveReport(*self._minimiser.outcome())
+    factors = torch.float32 if settings.factors == "single" else dtype
+    projective = settings.name == "projective_dynamics"
+    blocks = (pattern.rows, pattern.cols, len(pattern.free), 1 if projective else 3)
+    linear = make_linear_solver(settings.linear_solver, *blocks, potential.device, factors)
+    hessian = (ProjectiveHessian if projective else ExactHessian)(potential, pattern, linear)
+    quasi = settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
+    after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": NEVER}[settings.name]
+    tolerances = struct_of(
+        Tolerances,
+        relative=settings.relative_tolerance,
+        absolute=settings.absolute_tolerance,
+        epsilon=torch.finfo(dtype).eps,
+        max_iterations=settings.max_iterations,
+        refactor_after=after,
+    )
+    pairs = torch.float32 if linear.keeps_factors and not potential.couples_cells else factors
+    return Minimiser(potential, hessian, pairs, settings.memory if after else 0, tolerances)

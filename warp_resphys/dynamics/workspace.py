@@ -20,7 +20,8 @@ from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
 from .assembly import BlockPattern
 from .hessian import ExactHessian
-from .nonlinear_solver import NonlinearSolver, SolverSettings
+from .minimiser import Minimiser
+from .nonlinear_solver import SolverSettings, make_minimiser
 
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]
@@ -100,10 +101,10 @@ class Workspace:
         value: T = self._cache[key]
         return value
 
-    def solver(self, purpose: str, settings: SolverSettings) -> NonlinearSolver:
-        """Returns the nonlinear solver for a purpose (dynamics, statics), with its own factor."""
+    def minimiser(self, purpose: str, settings: SolverSettings) -> Minimiser:
+        """Returns the minimiser for a purpose (dynamics, statics), with a factor of its own."""
         return self.cached(
-            (purpose, settings), lambda: NonlinearSolver(self.potential, self.pattern, settings, self.dtype)
+            (purpose, settings), lambda: make_minimiser(self.potential, self.pattern, settings, self.dtype)
         )
 
     def hessian(self, linear_solver: str, dtype: torch.dtype = torch.float64) -> ExactHessian:

@@ -18,7 +18,7 @@ from warp_resphys import (
     box_hexahedra,
     select_vertices,
 )
-from warp_resphys.dynamics import equilibrium, hessian
+from warp_resphys.dynamics import equilibrium, kept_factor
 from warp_resphys.dynamics.corotation import Corotation
 from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.linalg.pardiso import has_pardiso
@@ -56,7 +56,7 @@ def turned(angle):
 def adjoints(sim, states, monkeypatch):
     """Adjoints of a random gradient at states, one after another, and the factors and iterations that they took."""
     counts = SimpleNamespace(factors=0, iterations=[])
-    factor, iterate = type(sim.workspace(1).linear_solver("pardiso")).direction_factor, hessian.conjugate_gradients
+    factor, iterate = type(sim.workspace(1).linear_solver("pardiso")).direction_factor, kept_factor.conjugate_gradients
 
     def counted_factor(*arguments, **options):
         counts.factors += 1
@@ -68,7 +68,7 @@ def adjoints(sim, states, monkeypatch):
         return result
 
     monkeypatch.setattr("warp_resphys.linalg.pardiso.PardisoSolver.direction_factor", counted_factor)
-    monkeypatch.setattr(hessian, "conjugate_gradients", counted)
+    monkeypatch.setattr(kept_factor, "conjugate_gradients", counted)
     own = sim.workspace(1)
     matrix = own.hessian(sim.settings.linear_solver)
     sim.step(sim.rest_state())  # sets the terms of a step

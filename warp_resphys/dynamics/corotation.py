@@ -14,6 +14,7 @@ from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..fem.integration_points import SolidPoints
 from ..kernels import vertex_rotations as kernels
+from ..linalg.linear_solver import Factor
 
 
 class Corotation:
@@ -22,11 +23,14 @@ class Corotation:
     Args:
         potential: the potential, whose positions are used.
         vertices: (F,) vertices of the unknowns, in the order of the vectors.
+
+    Attributes:
+        vertices: these vertices, on the device.
     """
 
     def __init__(self, potential: IncrementalPotential, vertices: NDArray[np.int64]) -> None:
         p, shape = potential, (potential.batch, potential.n_vertices)
-        self._potential, self._vertices = p, torch.as_tensor(vertices, device=p.device)
+        self._potential, self.vertices = p, torch.as_tensor(vertices, device=p.device)
         self._sum, self._rotation = p.zeros(shape[1], 3, 3), p.zeros(shape[1], 3, 3)
         self._before, self._since = p.zeros(len(vertices), 3, 3), p.zeros(len(vertices), 3, 3)
         total, rotation, before, since = (
@@ -53,7 +57,7 @@ class Corotation:
     def record(self, active: torch.Tensor | None = None) -> None:
         """Records the rotations at the potential's positions as those of new factors of environments (B,), or all."""
         self._compute_rotations()
-        now = self._rotation[:, self._vertices]
+        now = self._rotation[:, self.vertices]
         active = torch.ones_like(now[:, 0, 0, 0], dtype=torch.bool) if active is None else active
         self._before.copy_(torch.where(active[:, None, None, None], now, self._before))
         self._since[active] = torch.eye(3, device=now.device, dtype=now.dtype)
@@ -74,3 +78,9 @@ class Corotation:
     def rotate(self, vectors: torch.Tensor) -> None:
         """Rotates vectors (B, F, 3) with the body, in place."""
         vectors.copy_((self._since @ vectors[..., None].double())[..., 0])
+
+    def solve_in_place(self, factor: Factor, right: torch.Tensor) -> None:
+        """Overwrites right-hand sides (B, F, 3) with R H^-1 R^T of them, from the factor of H."""
+        self.rotate_back(right)
+        factor.solve_in_place(right.flatten(1))
+        self.rotate(right)

@@ -246,7 +246,7 @@ def _adjoint_solution(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the adjoint z (B, N, 3) [m] and its product with the stiffness [N] at the potential's positions.
 
-    Without a factor of its own where `ExactHessian.solve_with_kept_factor` solves it.
+    Without a factor of its own where `ExactHessian.kept` solves it.
 
     Args:
         potential: potential with the terms and positions of the solution.
@@ -257,7 +257,7 @@ def _adjoint_solution(
         ConvergenceError: the Hessian is singular, for example if a body can turn about its only fixed vertex.
     """
     right = potential.restrict(gradient)
-    solutions = hessians[0].solve_with_kept_factor([right])
+    solutions = None if hessians[0].kept is None else hessians[0].kept.solve([right])
     if solutions is not None:
         return solutions[0], potential.stiffness_product(solutions[0])
     size = right.flatten(1).norm(dim=1)

@@ -5,26 +5,17 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..energies.launcher import warp_view
 from ..energies.potential import IncrementalPotential
 from ..energies.term import PairTangents
-from ..io.errors import InputError
-from ..kernels.hessian_blocks import sum_blocks
-from ..linalg.conjugate_gradients import conjugate_gradients
-from ..linalg.coupling import Coupling, CouplingSolver, VertexCouplings, coordinates
-from ..linalg.linear_solver import Factor, LinearSolver, numbered
+from ..linalg.coupling import CouplingSolver
+from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
 from .corotation import Corotation
-
-_MOST_VALUES = 2**31 - 1  # Warp's offsets here are 32-bit.
-_EXACT = 1e-12  # relative accuracy of solutions by the factor of an earlier state
-_MOST_ITERATIONS = 40  # of such a solution
-_FACTOR = 25  # iterations that take as long as a new factor
-_ROUNDED = 8  # Numbers of vertices with couplings are rounded up to multiples of it.
+from .kept_factor import KeptFactor
+from .pair_couplings import PairCouplings
 
 
 class HessianApproximation(ABC):
@@ -78,6 +69,9 @@ class ExactHessian(HessianApproximation):
         linear: the solver.
         assembly: assembly in the solver's layout.
         exact: whether factors are in float64.
+        kept: solves by the factor of an earlier state, or None where energies couple vertices of many cells, and for
+            linear solvers whose factors are cheap.
+        couplings: second derivatives of pairs as matrices of the unknowns.
     """
 
     def __init__(self, potential: IncrementalPotential, pattern: BlockPattern, linear: LinearSolver) -> None:
@@ -88,24 +82,13 @@ class ExactHessian(HessianApproximation):
         self._factor: Factor | None = None
         self.clamped = torch.zeros(potential.batch, dtype=torch.bool, device=potential.device)
         self.vertex_at = pattern.free[linear.order]
-        self._order = torch.as_tensor(self.vertex_at, device=potential.device)
         self._coupled: CouplingSolver | None = None
         rotates = linear.keeps_factors and not potential.has_pairs
         self._corotation = Corotation(potential, self.vertex_at) if rotates else None
-        self._kept: Factor | None = None  # factor of `solve_with_kept_factor`
-        self._solutions, self._iterations = 0, 0  # with it; the factor counts as `_FACTOR` iterations
-        # Numbers of the free and, behind them, the dependent vertices; -1 for fixed ones.
-        free, depends = torch.as_tensor(pattern.free, device=potential.device), potential.coordinates
-        self._vertices = torch.cat([free, depends.dependent])
-        self._place = torch.full((potential.n_vertices,), -1, device=potential.device)
-        self._place[self._vertices] = torch.arange(len(self._vertices), device=potential.device)
-        self._reduction: VertexCouplings | None = None
-        if depends.depends:
-            weights = depends.weights
-            place = self._place[depends.controls].masked_fill(weights == 0.0, -1)
-            own = torch.full((len(free), place.shape[1]), -1, device=potential.device)
-            own[:, 0] = self._place[free]
-            self._reduction = VertexCouplings(torch.cat([own, place]), torch.cat([(own >= 0).to(weights), weights]))
+        self.kept: KeptFactor | None = None
+        if self._corotation is not None and not potential.couples_cells:
+            self.kept = KeptFactor(potential, self.assembly, linear, self._corotation)
+        self.couplings = PairCouplings(potential, pattern.free)
 
     @override
     def ready(self) -> bool:
@@ -150,65 +133,6 @@ class ExactHessian(HessianApproximation):
         if self._coupled is not None:
             self._coupled.forget()
 
-    @property
-    def keeps_factor(self) -> bool:
-        """Whether a factor may serve several states (`solve_with_kept_factor`)."""
-        return self._corotation is not None and not self._potential.couples_cells
-
-    def solve_with_kept_factor(self, rights: Sequence[torch.Tensor]) -> list[torch.Tensor] | None:
-        """Returns solutions (B, N, 3) for right-hand sides by conjugate gradients with the factor of an earlier state.
-
-        Their last digits depend on which factor that is, and so on earlier solutions. The factor is replaced where the
-        iterations do not converge, and after a solution that took longer than the mean of all with this factor,
-        including the time of the factor: later replacement would increase that mean.
-
-        Returns:
-            None if the Hessian is not positive definite, or without `keeps_factor`: where energies couple vertices of
-            many cells, and for linear solvers whose factors are cheap.
-        """
-        if self._corotation is None or self._potential.couples_cells:
-            return None
-        self._potential.update_tangent()
-        self._corotation.update()
-        solutions = []
-        for right in rights:
-            size = right.flatten(1).norm(dim=1)[:, None, None]
-            size = torch.where(size > 0.0, size, 1.0)  # residuals are rounded to float32
-            solution = self._solved_with_kept_factor(right / size, self._corotation)
-            if solution is None:
-                return None
-            solutions.append(solution * size)
-        return solutions
-
-    def _solved_with_kept_factor(self, right: torch.Tensor, corotation: Corotation) -> torch.Tensor | None:
-        p = self._potential
-
-        def product(x: torch.Tensor) -> torch.Tensor:
-            return p.restrict(p.stiffness_product(x) + p.inertia[..., None] * x)
-
-        def precondition(x: torch.Tensor) -> torch.Tensor:
-            own = x[:, self._order]
-            self.solve_in_place(own, self.clamped)
-            return torch.zeros_like(x).index_copy_(1, self._order, own)
-
-        for renews in [True] if self._kept is None else [False, True]:
-            if renews:
-                self._kept = self.linear.direction_factor(self.assembly())
-                if self._kept.failed.any():
-                    break
-                corotation.record()
-                self._solutions, self._iterations = 0, _FACTOR
-            self._factor = self._kept
-            iterate = conjugate_gradients(product, precondition, right, _EXACT, _MOST_ITERATIONS)
-            if bool(iterate.converged.all()):
-                self._solutions += 1
-                self._iterations += iterate.iterations
-                if iterate.iterations * self._solutions > self._iterations:
-                    self._kept = None
-                return iterate.x
-        self._kept = None
-        return None
-
     @override
     def adapt(self) -> None:
         if self._corotation is not None:
@@ -218,11 +142,10 @@ class ExactHessian(HessianApproximation):
     def solve_in_place(self, right: torch.Tensor, needed: torch.Tensor) -> None:
         if self._factor is None:
             raise RuntimeError("refactor before solve")
-        if self._corotation is not None:
-            self._corotation.rotate_back(right)
-        self._factor.solve_in_place(right.flatten(1))
-        if self._corotation is not None:
-            self._corotation.rotate(right)
+        if self._corotation is None:
+            self._factor.solve_in_place(right.flatten(1))
+        else:
+            self._corotation.solve_in_place(self._factor, right)
         if self._potential.has_pairs:
             self._correct(self._potential.pair_tangents(True, needed), right.flatten(1)[:, :, None], self.linear.dofs)
 
@@ -235,73 +158,6 @@ class ExactHessian(HessianApproximation):
             self._coupled = CouplingSolver(len(x), x.shape[1], x)
         assert self._factor is not None
         self._coupled.correct(self._factor, couplings, x, order)
-
-    def couplings(self, parts: Sequence[PairTangents]) -> list[Coupling]:
-        """Returns second derivatives of pairs as matrices of the unknowns, one for every environment with pairs."""
-        if not parts:
-            return []
-        environment = torch.cat([part.environment for part in parts])
-        nodes = self._place[torch.cat([part.nodes for part in parts])]
-        blocks = torch.cat([part.blocks for part in parts])
-        device, total = nodes.device, len(self._vertices)
-        keys, local = torch.where(nodes < 0, -1, environment[:, None] * total + nodes).unique(return_inverse=True)
-        fixed = int((keys < 0).sum())  # all fixed vertices have one key
-        keys, local = keys[fixed:], local - fixed
-        if not len(keys):
-            return []
-        row = keys // total
-        count, at = numbered(row, self._potential.batch)
-        # A size that depends on the environment alone, so that on a CPU it is bit for bit what it is in another batch.
-        sizes = -(-count // _ROUNDED) * _ROUNDED
-        order = sizes.argsort(stable=True)
-        squares = (3 * sizes[order]) ** 2
-        first = torch.empty_like(sizes)
-        first[order] = squares.cumsum(0) - squares
-        rows = torch.stack([first[row], 3 * sizes[row], at], 1)
-        columns = torch.where(local < 0, -1, at[local.clamp_min(0)])
-        values = self._summed(blocks, local, rows, columns, int(squares.sum()))
-        vertices = torch.full((len(sizes), int(sizes.max())), -1, device=device)
-        vertices[row, at] = keys % total
-        out, done = list[Coupling](), 0
-        for size, number in zip(*(x.tolist() for x in sizes.unique(return_counts=True)), strict=True):
-            own, m = order[sizes[order] == size], 3 * size
-            if size:
-                matrices = values[done : done + number * m * m].view(number, m, m)
-                if self._reduction is None:
-                    out.append(Coupling(own, coordinates(vertices[own, :size]), matrices))
-                else:
-                    out += self._reduction.reduced(own, vertices[own, :size], matrices)
-                done += number * m * m
-        return out
-
-    def _summed(
-        self, blocks: torch.Tensor, local: torch.Tensor, rows: torch.Tensor, columns: torch.Tensor, size: int
-    ) -> torch.Tensor:
-        """Returns the values of the matrices (``kernels.hessian_blocks.sum_blocks``).
-
-        Args:
-            blocks: (A, 12, 12) second derivatives of pairs.
-            local: (A, 4) rows of their vertices, negative for those that are left out.
-            rows: (R, 3) first value, size and number in its matrix, of every row.
-            columns: (A, 4) numbers of their vertices in the matrices.
-            size: number of values.
-
-        Raises:
-            InputError: more values than a kernel addresses.
-        """
-        if size > _MOST_VALUES:
-            raise InputError(
-                f"the matrices of contact have {size:.1e} numbers, beyond the {_MOST_VALUES:.1e} that a kernel "
-                "addresses: take fewer environments, or coarser surfaces."
-            )
-        launcher, values = self._potential, blocks.new_zeros(size)
-        entry = local.ravel().argsort(stable=True)
-        start = torch.searchsorted(local.ravel()[entry], torch.arange(len(rows) + 1, device=local.device))
-        arrays = [(start, wp.int32), (entry, wp.int32), (rows, wp.vec3i), (columns, wp.vec4i)]
-        inputs = [warp_view(array.to(torch.int32), kind) for array, kind in arrays]
-        inputs.append(warp_view(blocks, wp.float64))
-        launcher.launch(launcher.record(sum_blocks, (len(rows),), inputs, [warp_view(values, wp.float64)]))
-        return values
 
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns solutions (B, 3 N, m) for right-hand sides (B, 3 N, m), zero at fixed vertices."""

@@ -57,8 +57,8 @@ class Linearisation:
     def factorise(self, x: torch.Tensor) -> None:
         """Prepares H at x (B, N, 3) [m] for `product` and `solve`, which makes an expensive factor if it needs one."""
         hessian = self._workspace.hessian(self._name)
-        self._at, self._has_factor = x.detach().clone(), not hessian.keeps_factor
-        if hessian.keeps_factor:
+        self._at, self._has_factor = x.detach().clone(), hessian.kept is None
+        if hessian.kept is not None:
             self.update(x)
             return
         self._potential.positions.copy_(x)
@@ -71,11 +71,11 @@ class Linearisation:
         fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
         with threads_for(self._unknowns):
             solution = None
-            if not self._has_factor:
+            if hessian.kept is not None and not self._has_factor:
                 self._potential.positions.copy_(self._at)
                 if 0 < fields.shape[3] <= _MOST_COLUMNS:
                     columns = [self._potential.restrict(column) for column in fields.double().unbind(3)]
-                    if (solutions := hessian.solve_with_kept_factor(columns)) is not None:
+                    if (solutions := hessian.kept.solve(columns)) is not None:
                         solution = torch.stack(solutions, 3).to(fields)
                 if solution is None:
                     hessian.refactor_exact()

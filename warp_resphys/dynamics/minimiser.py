@@ -221,8 +221,8 @@ class Minimiser:
                 p.launch(self._loop)
         finally:
             p.active.fill_(1)
-        fields, counts = now.fields, ("iterations", "factorisations")
-        iterations, factorisations = (fields[name].long() for name in counts)
+        fields = now.fields
+        iterations, factorisations = fields["iterations"].long(), fields["factorisations"].long()
         return SolveReport(iterations, fields["relative"].clone(), fields["phase"] == kernels.DONE, factorisations)
 
     def _solve_from_host(self, start: torch.Tensor) -> None:

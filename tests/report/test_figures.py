@@ -141,9 +141,9 @@ class TestMotion:
         moved = np.repeat(np.array([0.0, 1e-3, 2e-3, 3e-3])[:, None, None], 3, axis=2)
         driven = Driven(PRESSURE, ("chamber_1",), {"a": np.full((3, 1), 5e3)})
         figure = paths_of({"resphys": moved}, moved, times, driven=driven)
-        *coordinates, below = figure.axes
-        assert len(coordinates) == 3
-        assert all(axes.get_xlim() == below.get_xlim() for axes in coordinates)
+        coordinates, inputs = figure.axes[:3], figure.axes[3:]
+        assert len(inputs) == 3
+        assert all(axes.get_xlim() == below.get_xlim() for axes, below in zip(coordinates, inputs, strict=True))
         measured_line, model_line = coordinates[2].lines
         np.testing.assert_allclose(measured_line.get_ydata(), [0.0, 1.0, 2.0, 3.0], atol=1e-12)
         assert model_line.get_color() == TONES["resphys"].light

@@ -40,7 +40,7 @@ from warp_resphys.report.page import Canvas, Drawn
 from warp_resphys.report.wording import NONE, number_text
 
 FIGURES_OF_AN_ARM = {
-    *("error_over_time", "loss_history", "markers", "inputs"),
+    *("error_over_time", "loss_history", "paths_worst", "paths_best", "inputs"),
     *("training_resphys", "training_simfree"),
 }
 
@@ -139,7 +139,7 @@ class TestArms:
         assert "data.input_limitnull" in page.text
         for absent in ("SysID", "Published", "The published", "Identification", "dashed", "median filter"):
             assert absent not in page.text
-        without = {"loss_history", "training_simfree"}
+        without = {"loss_history", "training_simfree", "paths_best"}
         assert figures_in(tmp_path) == FIGURES_OF_AN_ARM - without
 
     @pytest.mark.parametrize("name", ["dataset.h5", "rollouts.h5", "errors.json", "registration.json"])
@@ -191,9 +191,8 @@ class TestArms:
             part = paths_section(SimpleNamespace(**data), canvas)
             return None if part is None else part.blocks
 
-        driven = read_driven(tmp_path, settings)
-        assert drawn(trials, driven) == ["markers"]
-        assert drawn(trials, None) == ["paths_worst", "paths_best"]
+        for driven in (read_driven(tmp_path, settings), None):
+            assert drawn(trials, driven) == ["paths_worst", "paths_best"]
         assert drawn(replace(trials, labels=()), None) is None
 
     def test_recordings_are_shown_on_the_body_as_it_hangs(self, tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ from warp_resphys.learning.metrics import (
 )
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report.control_section import control_section
-from warp_resphys.report.data import Driven, along_body, at_times, drawn_markers
+from warp_resphys.report.data import Driven, at_times
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.motions import instants
 from warp_resphys.report.page import Cell, PageTable, Row
@@ -242,21 +242,6 @@ class TestWhatIsShown:
         measured[70] = np.nan
         assert instants(measured, rest, simulated) == [25, 40, 97]
         assert instants(measured[:1], rest, simulated[:1]) == [0]
-
-    def test_markers_at_the_tip_and_one_above_it(self):
-        clamped = np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]])
-        bound = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, -0.27], [0.01, 0.0, -0.265], [0.0, 0.0, -0.15]])
-        np.testing.assert_allclose(along_body(bound, clamped)[0], 0.1, atol=1e-3)
-        np.testing.assert_array_equal(along_body(bound, clamped[:0]), along_body(bound, bound[:1]))
-        measured = np.repeat(bound[None], 5, axis=0)
-        measured[2, 2, 0] += 0.02
-        measured[3, :2, 0] += 0.01
-        measured[4, 3] = np.nan
-        assert drawn_markers(measured, bound, clamped) == [2, 0]
-        assert drawn_markers(measured[:, 1:2], bound[1:2], clamped) == [0]
-        for unseen, shown in ((2, [1, 0]), (1, [0]), (0, [3])):  # which that trial does not have
-            measured[:, unseen] = np.nan
-            assert drawn_markers(measured, bound, clamped) == shown
 
     def test_the_uncorrected_model_and_the_best_one(self):
         assert shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]

@@ -90,7 +90,7 @@ def test_its_page_shows_the_estimate_and_what_comes(robot):
         until_time = time.monotonic() + 60.0
         while "ahead" not in page._status.content and time.monotonic() < until_time:
             assert page.run(0.4) > 0.0
-        assert page._target.visible
+        assert page._scene.handles["measured body"].visible
         assert "ahead" in page._status.content
         assert len(live.seconds) > 0
     finally:

@@ -13,7 +13,7 @@ from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
 from . import figures
 from .body_picture import MeshSummary, mesh_picture
-from .data import Driven, RunReport, TrialResults, best_and_worst, drawn_markers, shown_markers
+from .data import Driven, RunReport, TrialResults, best_and_worst, shown_markers
 from .page import Block, Canvas, Drawn, Part
 from .wording import TONES, mm_text, unbroken
 
@@ -86,22 +86,25 @@ def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatAr
     figure = figures.new_figure(0.9 + 1.35 * len(sequences))
     panels = figure.subplots(len(sequences), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for axes, (title, rows) in zip(panels, sequences.items(), strict=True):
-        _inputs(axes, time_step * np.arange(len(rows) + 1, dtype=np.float64), rows, driven, title)
+        _inputs(axes, time_step * np.arange(len(rows) + 1, dtype=np.float64), rows, driven)
+        _input_label(axes, driven)
+        axes.set_title(title)
     panels[-1].set(xlabel="time [s]", xlim=(0.0, time_step * max(map(len, sequences.values()))))
     _part_legend(figure, driven, range(len(driven.channels)))
     return figure
 
 
-def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven, title: str) -> None:
+def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> None:
     """Draws steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
-    quantity = driven.quantity
     for values, colour in zip(rows.T, cycle(figures.CHAMBER_COLOURS), strict=False):
-        axes.stairs(quantity.shown_factor * values, times, baseline=None, color=colour, linewidth=1.2)
+        axes.stairs(driven.quantity.shown_factor * values, times, baseline=None, color=colour, linewidth=1.2)
     if driven.limit is not None:
-        axes.axhline(quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT)
-    axes.set_ylabel(f"{quantity.words} [{quantity.shown_unit}]")
-    axes.set_title(title)
+        axes.axhline(driven.quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT)
     figures.few_ticks(axes.yaxis, 4)
+
+
+def _input_label(axes: Axes, driven: Driven) -> None:
+    axes.set_ylabel(f"{driven.quantity.words} [{driven.quantity.shown_unit}]")
 
 
 def _poses(driven: Driven, tested: Sequence[str]) -> Figure:
@@ -139,40 +142,33 @@ def _part_legend(figure: Figure, driven: Driven, used: Sequence[int]) -> None:
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Returns the coordinates of markers over time; of a driven body, of two of them, with its inputs below."""
+    """Returns the coordinates of markers over time, in the trials of largest and least error, with their inputs."""
     trials, driven = data.trials, data.driven
     if trials is None or not trials.labels or not trials.moves:
         return None
     rows, blocks = best_and_worst(trials), []
-    for row, place in zip(rows, ("worst", "best"), strict=False):
-        name, target = trials.names[row], trials.target[row]
+    which = (("worst", "the last model of the table", "largest"), ("best", "the same model", "least"))
+    for row, (place, model, error) in zip(rows, which, strict=False):
+        name, target, shown = trials.names[row], trials.target[row], shown_markers(trials.target[row])
+        reach = np.nanmax(np.linalg.norm(target - trials.bound, axis=2), axis=0, initial=0.0)
+        kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]]).tolist()
+        models, start = [m for m in _DRAWN if m in trials.positions], trials.bound
+        caption = f"Trial {name}{f', in which {model} has its {error} error' if len(rows) > 1 else ''}: "
+        alt = f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines"
         if driven is None:
-            reach = np.nanmax(np.linalg.norm(target - trials.bound, axis=2), axis=0, initial=0.0)
-            shown = shown_markers(target)
-            kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]]).tolist()
-            which = "least error" if place == "best" else "largest error"
-            model = "the last model of the table" if place == "worst" else "the same model"
-            caption = f"Trial {name}{f', in which {model} has its {which}' if len(rows) > 1 else ''}: "
             caption += "coordinates of the markers relative to where they were held."
-            hidden = len(shown) - len(kept)
-            after = f" The {hidden} markers that move least are not drawn." if hidden else ""
-            alt = f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines."
-            models, start = [m for m in _DRAWN if m in trials.positions], trials.bound
         else:
-            words = driven.quantity.plural
-            kept, after = drawn_markers(target, trials.bound, data.mesh.vertices[data.fixed]), ""
-            caption = f"The trial {name}: displacement of markers from rest, and the {words} that drive it."
-            alt = f"Coordinates of markers over time in the trial {name}, and below them the {words} of the "
-            alt += f"{driven.quantity.per}s."
-            models = [m for m in _DRAWN if m in trials.positions and m != "simulation"] or list(trials.positions)
-            start = np.where(np.isfinite(target[0]), target[0], trials.bound)
+            words, start = driven.quantity.plural, np.where(np.isfinite(target[0]), target[0], trials.bound)
+            models = [m for m in models if m != "simulation"] or models
+            caption += f"displacement of the markers from rest, and the {words} that drive it."
+            alt += f"; below them the {words} of the {driven.quantity.per}s"
         banded = [model for model in ("resphys", "law", "sysid") if model in trials.half_widths][:1]
         bands = {model: trials.half_widths[model][row][:, kept] for model in banded}
+        hidden = len(shown) - len(kept)
+        caption += _band_note(data, bands)
+        caption += f" The {hidden} markers that move least are not drawn." if hidden else ""
         figure = marker_paths(trials, row, kept, models, start, bands, driven)
-        file = f"paths_{place}" if driven is None else "markers"
-        blocks.append(canvas.figure(file, figure, alt, f"{caption}{_band_note(data, bands)}{after}"))
-        if driven is not None:
-            break
+        blocks.append(canvas.figure(f"paths_{place}", figure, f"{alt}.", caption))
     return Part("Marker by marker", blocks)
 
 
@@ -194,41 +190,36 @@ def marker_paths(
         models: Whose positions are drawn.
         start: (M, 3) positions from which all are measured [m].
         bands: (T, kept) half-widths of prediction intervals [m], by model.
-        driven: Inputs; all panels are then stacked.
+        driven: Inputs.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         measured_and_simulated = [trials.target, *(trials.positions[model] for model in models)]
         target, *paths = (1e3 * (q[row] - start)[:, kept] for q in measured_and_simulated)  # [mm]
-    times, labels, many = trials.times[row], [trials.labels[marker] for marker in kept], len(trials.axes)
-    count, stacked = len(kept), driven is not None
-    rows, columns = (many * count, 1) if stacked else (count, many)
-    figure = figures.new_figure(2.9 + 0.95 * many * count if stacked else 0.9 + 1.25 * count)
-    ratios = [1.0] * rows + [1.5] * stacked
-    panels = figure.subplots(len(ratios), columns, sharex=True, squeeze=False, height_ratios=ratios)
+    times, ratios = trials.times[row], [1.0] * len(kept) + [1.3] * (driven is not None)
+    figure = figures.new_figure(0.9 + 1.25 * sum(ratios))
+    panels = figure.subplots(len(ratios), len(trials.axes), sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
     dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Measured"}
-    for place, axes in enumerate(panels[:rows].flat):
-        marker, column = divmod(place, many)
-        axis = trials.axes[column]
-        seen = target[:, marker, axis]
-        axes.plot(times[::every], seen[::every], ".", **dots)
-        for model, path in zip(models, paths, strict=True):
-            moved = np.where(np.abs(path[:, marker, axis]) < figures.LARGEST_SHOWN, path[:, marker, axis], np.nan)
-            axes.plot(times, moved, **figures.model_line(model, 1.1))
-            if model in bands:
-                ends = [moved + sign * 1e3 * bands[model][:, marker] for sign in (-1.0, 1.0)]
-                colour = TONES[model].light
-                axes.fill_between(times, *ends, color=colour, alpha=_BAND, linewidth=0.0, zorder=0.5)
-        figures.keep_in_view(axes, seen, 0.6, least)
-        figures.few_ticks(axes.yaxis, 4)
-        if column == 0 or stacked:
-            axes.set_ylabel(f"{'xyz'[axis] if stacked else labels[marker]} [mm]")
-        if column == 0 if stacked else marker == 0:
-            axes.set_title(f"Marker {labels[marker]}" if stacked else "xyz"[axis])
+    for marker, of_marker in enumerate(panels[: len(kept)]):
+        for axes, axis in zip(of_marker, trials.axes, strict=True):
+            seen = target[:, marker, axis]
+            axes.plot(times[::every], seen[::every], ".", **dots)
+            for model, path in zip(models, paths, strict=True):
+                moved = np.where(np.abs(path[:, marker, axis]) < figures.LARGEST_SHOWN, path[:, marker, axis], np.nan)
+                axes.plot(times, moved, **figures.model_line(model, 1.1))
+                if model in bands:
+                    ends = [moved + sign * 1e3 * bands[model][:, marker] for sign in (-1.0, 1.0)]
+                    axes.fill_between(times, *ends, color=TONES[model].light, alpha=_BAND, linewidth=0.0, zorder=0.5)
+            figures.keep_in_view(axes, seen, 0.6, least)
+            figures.few_ticks(axes.yaxis, 4)
+        of_marker[0].set_ylabel(f"{trials.labels[kept[marker]]} [mm]")
+    for axes, axis in zip(panels[0], trials.axes, strict=True):
+        axes.set_title("xyz"[axis])
     if driven is not None:
-        title = driven.quantity.plural.capitalize()
-        _inputs(panels[-1, 0], times, driven.values[trials.names[row]], driven, title)
+        for axes in panels[-1]:
+            _inputs(axes, times, driven.values[trials.names[row]], driven)
+        _input_label(panels[-1, 0], driven)
         _part_legend(figure, driven, range(len(driven.channels)))
     for axes in panels[-1]:
         axes.set(xlabel="time [s]", xlim=(0.0, times[-1]))

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +20,6 @@ from ..stepping.quantity import Quantity
 from .wording import MODELS
 
 Errors = Mapping[str, Sequence[float | None]]  # Of each model on the same held-out trials [mm]; None: it diverged.
-_TIP: Final = 0.12  # Markers within this distance of the one farthest from the clamp are at the tip, over its distance.
-_OTHER: Final = 0.25  # Least distance of another drawn marker from the tip, over the same.
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,34 +245,6 @@ def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> Fl
     return between
 
 
-def along_body(bound: FloatArray, clamped: FloatArray) -> FloatArray:
-    """Returns distances (M,) of markers from the clamped end, along the direction from it to their mean [m].
-
-    Args:
-        bound: (M, 3) [m] on the undeformed body.
-        clamped: (F, 3) [m] vertices of the clamped end; of a free body none, whose first marker takes their place.
-    """
-    start = clamped.mean(axis=0) if len(clamped) else bound[0]
-    axis = bound.mean(axis=0) - start
-    return np.asarray((bound - start) @ (axis / (np.linalg.norm(axis) or 1.0)))
-
-
 def shown_markers(target: FloatArray) -> IntArray:
     """Returns the indices of the markers (T, M, 3) of a trial that were seen in a frame; NaN where one was not."""
     return np.flatnonzero(np.isfinite(target).all(axis=2).any(axis=0))
-
-
-def drawn_markers(target: FloatArray, bound: FloatArray, clamped: FloatArray) -> list[int]:
-    """Returns the marker at the tip that moves most and, of those well above the tip, the one that moves most.
-
-    Args:
-        target: (T, M, 3) [m], NaN where a marker was not seen.
-        bound: (M, 3) [m] on the undeformed body.
-        clamped: (F, 3) [m] vertices of the clamped end.
-    """
-    moved = np.nanmax(np.linalg.norm(target - bound, axis=2), axis=0, initial=0.0)  # (M,) [m]
-    away, shown = along_body(bound, clamped), shown_markers(target)
-    tip, above = away >= (1.0 - _TIP) * away.max(), away < (1.0 - _OTHER) * away.max()
-    groups = [np.intersect1d(np.flatnonzero(group), shown) for group in (tip, above)]
-    groups = [group for group in groups if len(group)] or [shown]
-    return [int(group[np.argmax(moved[group])]) for group in groups]

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from dataclasses import replace
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -15,20 +16,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
-from ..data.camera import upwards
 from ..data.obstacle_surface import ObstacleSurface
-from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError
 from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
-from ..report.layers import MEASURED, OBSTACLE, sharp_edges
+from ..report.layers import MEASURED, Layer, body_layers, obstacle_layers, sharp_edges
 from ..report.wording import TONES
 from ..robot.actuation import BASE
-from ..robot.loading import RecordedTrial, held_out_names, load, trial_names
+from ..robot.loading import held_out_names, load, trial_names
 from .live import LiveRobot, range_of
+from .live_scene import LiveScene
 from .live_twin import LiveTwin, TwinSettings
 
 if TYPE_CHECKING:
@@ -148,97 +147,72 @@ class Page:
         self._lock = threading.Lock()
         self._playing, self._speed, self._stopped = True, 1.0, False
         self._holder: int | None = None  # Client that drags the body.
-        self._shown_state: object = None
-        self._shown_trial: RecordedTrial | None = None
+        self._shown_now: tuple[object, ...] = (None, None, None)  # State, trial and robot that are shown.
         self.pictures = 0
         mesh = live.robot.simulator.body.mesh
         self._surface = surface_vertices(mesh)
         self._faces = np.searchsorted(self._surface, boundary_triangles(mesh))
-        self._scale = 1.0 / float(
-            np.ptp(mesh.vertices, axis=0).max()
-        )  # Of the scene: viser's cameras expect bodies of about a metre.
-        self._middle = mesh.vertices.mean(axis=0)
         self._sharp = sharp_edges(mesh.vertices[self._surface], self._faces)
-        self._set_scene()
+        self._scene = LiveScene(server, mesh.vertices, np.asarray(live.robot.simulator.gravity, dtype=np.float64))
+        self._show()
+        if isinstance(live, LiveRobot):
+            self._set_dragging(live)
         self._set_controls()
 
     # Scene
 
-    def _shown(self, points: FloatArray) -> NDArray[np.float32]:
-        return np.asarray((points - self._middle) * self._scale, dtype=np.float32)
+    def _layers(self) -> dict[str, Layer]:
+        """Returns the layers of the scene as it is now, by name, in metres; those without points are not shown."""
+        live = self._live
+        around = ObstacleSurface.of(live.robot.simulator.body, live.robot.parameters).moved(live.moved)
+        body, edges = body_layers(live.positions[self._surface], self._faces, 0.0, sharp=self._sharp)
+        solid = obstacle_layers(around.points, around.triangles)
+        measured, none = live.measured, np.empty((0, 3))
+        target = none if live.target is None else live.target[self._surface]
+        seen = none if measured is None or not live.robot.labels else measured
+        return {
+            "body": replace(body, colour=TONES["resphys"].dark),
+            "edges": edges,
+            "measured body": Layer("surface", target, self._faces, TONES["target"].light, opacity=0.4),
+            "markers": Layer("balls", live.markers, colour=TONES["resphys"].light, size=1.4 * _DOT),
+            "measured": Layer("balls", seen, colour=MEASURED, size=_DOT),
+            **{f"obstacles{part}": layer for part, layer in zip(("", " edges"), solid, strict=False)},
+        }
 
-    def _real(self, point: tuple[float, float, float]) -> FloatArray:
-        return np.asarray(point, dtype=np.float64) / self._scale + self._middle
-
-    def _set_scene(self) -> None:
-        server, live = self._server, self._live
-        up = upwards(np.asarray(live.robot.simulator.gravity, dtype=np.float64))
-        server.scene.set_up_direction((float(up[0]), float(up[1]), float(up[2])))
-        side = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
-        camera = server.initial_camera
-        camera.look_at = (0.0, 0.0, 0.0)
-        position = 1.3 * side / np.linalg.norm(side) + 0.35 * up
-        camera.position = (float(position[0]), float(position[1]), float(position[2]))
-        camera.up = (float(up[0]), float(up[1]), float(up[2]))
-        places = self._shown(live.positions[self._surface])
-        blue, grey = _bytes(TONES["resphys"].dark), _bytes(TONES["target"].light)
-        self._body = server.scene.add_mesh_simple(
-            "/body", places, self._faces.astype(np.uint32), color=blue, flat_shading=True, side="double"
-        )
-        self._target = server.scene.add_mesh_simple(
-            "/measured body", places, self._faces.astype(np.uint32), color=grey, opacity=0.4, visible=False
-        )
-        self._placed, body = live.robot, live.robot.simulator.body
-        self._around = ObstacleSurface.of(body, live.robot.parameters)
-        self._obstacles: Any = None
-        if len(self._around.points):
-            self._obstacles = server.scene.add_mesh_simple(
-                "/obstacles",
-                self._shown(self._around.points),
-                self._around.triangles.astype(np.uint32),
-                color=_bytes(OBSTACLE),
-                flat_shading=True,
-                side="double",
-            )
-        edges = places[self._sharp]
-        self._edges = server.scene.add_line_segments("/edges", edges, (30, 40, 50), thickness=0.003)
-        none = np.zeros((1, 3), dtype=np.float32)
-        self._markers = server.scene.add_point_cloud(
-            "/markers", none, (26, 95, 180), point_size=1.4 * _DOT, point_shape="circle", visible=False
-        )
-        self._measured = server.scene.add_point_cloud(
-            "/measured", none, _bytes(MEASURED), point_size=_DOT, point_shape="circle", visible=False
-        )
-
-        if isinstance(live, LiveTwin):
+    def _show(self) -> None:
+        """Shows the current state."""
+        live = self._live
+        now = (live.state, live.trial, live.robot)
+        if all(a is b for a, b in zip(now, self._shown_now, strict=True)):
             return
+        self._shown_now = now
+        with self._server.atomic():
+            for name, layer in self._layers().items():
+                self._scene.draw(name, layer)
 
-        @self._body.on_drag
+    def _set_dragging(self, live: LiveRobot) -> None:
+        """Lets browsers pull the body."""
+
+        def let_go() -> None:
+            self._holder = None
+            self._ask(live.let_go)
+
+        @self._scene.handles["body"].on_drag
         async def _(event: Any) -> None:  # Without awaiting, so that events are handled in their order.
             if event.phase == "start" and self._holder is None:
                 self._holder = event.client_id
-                self._ask(partial(live.grab, self._real(event.start_position)))
+                self._ask(partial(live.grab, self._scene.real(event.start_position)))
             if event.client_id != self._holder:
                 return
             if event.phase == "end":
-                self._let_go()
+                let_go()
             else:
-                self._ask(partial(live.drag, self._real(event.end_position)))
+                self._ask(partial(live.drag, self._scene.real(event.end_position)))
 
-        @server.on_client_disconnect
+        @self._server.on_client_disconnect
         async def _(client: Any) -> None:
             if client.client_id == self._holder:
-                self._let_go()
-
-    def _let_go(self) -> None:
-        self._holder = None
-        self._ask(self._driven.let_go)
-
-    @property
-    def _driven(self) -> LiveRobot:
-        """The robot, where it is no twin."""
-        assert isinstance(self._live, LiveRobot)
-        return self._live
+                let_go()
 
     # Controls
 
@@ -248,9 +222,8 @@ class Page:
             self._requests.append(request)
 
     def _set_controls(self) -> None:
-        server, live = self._server, self._live
-        gui, robot = server.gui, live.robot
-        server.gui.configure_theme(dark_mode=False, show_logo=False)
+        gui, robot, live = self._server.gui, self._live.robot, self._live
+        gui.configure_theme(dark_mode=False, show_logo=False)
         text = _HELP_TWIN if isinstance(live, LiveTwin) else _HELP
         gui.add_markdown(f"**{_plain(robot.description.name)}**, {robot.description.model}\n\n{text}")
         self._status = gui.add_markdown("")
@@ -262,26 +235,27 @@ class Page:
         speed = gui.add_dropdown("Speed", tuple(_SPEEDS), initial_value="real time")
         speed.on_update(lambda _: setattr(self, "_speed", _SPEEDS[speed.value]))
         self._trial: Any = None
-        self._sliders: dict[str, list[Any]] = {}
+        self._sliders: dict[tuple[str, int], Any] = {}  # By input and part.
         if isinstance(live, LiveRobot):
             self._set_driving(live)
         dark = gui.add_checkbox("Dark", False)
         dark.on_update(lambda _: gui.configure_theme(dark_mode=dark.value, show_logo=False))
 
     def _set_driving(self, live: LiveRobot) -> None:
-        """Controls of a robot that is driven by hand or by a trial."""
+        """Adds the controls of a robot that is driven by hand or by a trial."""
         gui, robot = self._server.gui, live.robot
         if robot.folder is not None:
             name = _BY_HAND if live.trial is None else live.trial.name
             self._trial = gui.add_dropdown("Motion", (_BY_HAND, *trial_names(robot)), initial_value=name)
-            self._trial.on_update(lambda _: self._ask(self._choose))
+            self._trial.on_update(lambda _: self._ask(partial(self._choose, live)))
         for name, robot_input in robot.inputs.items():
             words = f"{robot_input.quantity.plural or robot_input.name}".capitalize() if name != BASE else "Base"
             with gui.add_folder(words, expand_by_default=robot_input.low is not None):
-                self._sliders[name] = [self._slider(name, part) for part in range(len(robot_input.parts))]
+                for part in range(len(robot_input.parts)):
+                    self._sliders[name, part] = self._slider(live, name, part)
         if live.parameters:
             with gui.add_folder("Material and other parameters", expand_by_default=False):
-                parameters = {name: self._parameter(name) for name in live.parameters}
+                parameters = {name: self._parameter(live, name) for name in live.parameters}
                 back = gui.add_button("As identified")
 
                 def restore(_: Any) -> None:
@@ -291,27 +265,30 @@ class Page:
 
                 back.on_click(restore)
 
-    def _slider(self, name: str, part: int) -> Any:
-        """A slider for a part of an input, in the unit of its quantity for display."""
-        live, robot_input = self._driven, self._driven.robot.inputs[name]
-        factor = robot_input.quantity.shown_factor if robot_input.quantity.shown_unit else 1.0
-        unit = robot_input.quantity.shown_unit or robot_input.unit
-        unit = ("m" if part < 3 else "rad") if name == BASE else unit
-        low, high = (factor * float(limit[part]) for limit in live.limits[name])
+    def _slider(self, live: LiveRobot, name: str, part: int) -> Any:
+        """Returns a slider for a part of an input, in the unit of its quantity for display."""
+        robot_input = live.robot.inputs[name]
+        quantity = robot_input.quantity
+        unit = ("m" if part < 3 else "rad") if name == BASE else quantity.shown_unit or robot_input.unit
+        low, high = (quantity.shown_factor * float(limit[part]) for limit in live.limits[name])
         high = high if high > low else low + 1.0
         label = f"{robot_input.parts[part].replace('_', ' ')} [{unit}]"
         slider = self._server.gui.add_slider(label, low, high, (high - low) / 500.0, min(max(0.0, low), high))
 
+        def by_hand() -> None:
+            live.set_input(name, part, slider.value / quantity.shown_factor)  # The value when it is handled.
+            if self._trial is not None and self._trial.value != _BY_HAND:
+                self._trial.value = _BY_HAND
+
         def moved(event: Any) -> None:
             if event.client is not None:  # Not where a trial has moved the slider.
-                self._ask(lambda: self._by_hand(name, part, slider.value / factor))  # The value when it is handled.
+                self._ask(by_hand)
 
         slider.on_update(moved)
         return slider
 
-    def _parameter(self, name: str) -> Any:
-        """A slider for a parameter."""
-        live = self._driven
+    def _parameter(self, live: LiveRobot, name: str) -> Any:
+        """Returns a slider for a parameter."""
         quantity, value = live.parameters[name]
         low, high = range_of(quantity, value)
         label = f"{name.replace('_', ' ')}{f' [{quantity.unit}]' if quantity.unit else ''}"
@@ -327,29 +304,23 @@ class Page:
         self._live.reset()
         self._set_sliders()
 
-    def _choose(self) -> None:
-        name, now = self._trial.value, _BY_HAND if self._driven.trial is None else self._driven.trial.name
+    def _choose(self, live: LiveRobot) -> None:
+        name, now = self._trial.value, _BY_HAND if live.trial is None else live.trial.name
         if name == now:
             return
         try:
-            self._driven.play_trial(None if name == _BY_HAND else name)
+            live.play_trial(None if name == _BY_HAND else name)
         except ResphysError:
             self._trial.value = now
             raise
         self._set_sliders()
 
-    def _by_hand(self, name: str, part: int, value: float) -> None:
-        self._driven.set_input(name, part, value)
-        if self._trial is not None and self._trial.value != _BY_HAND:
-            self._trial.value = _BY_HAND
-
     def _set_sliders(self) -> None:
         """Moves the sliders to the current values of the inputs."""
-        for name, sliders in self._sliders.items():
-            quantity = self._driven.robot.inputs[name].quantity
-            factor = quantity.shown_factor if quantity.shown_unit else 1.0
-            for part, slider in enumerate(sliders):
-                value = float(np.clip(factor * self._driven.inputs[name][part], slider.min, slider.max))
+        if isinstance(self._live, LiveRobot):
+            for (name, part), slider in self._sliders.items():
+                factor = self._live.robot.inputs[name].quantity.shown_factor
+                value = float(np.clip(factor * self._live.inputs[name][part], slider.min, slider.max))
                 if abs(value - slider.value) > 0.5 * slider.step:
                     slider.value = value
 
@@ -391,36 +362,6 @@ class Page:
         """Ends `run`, from another thread."""
         self._stopped = True
 
-    def _show(self) -> None:
-        live = self._live
-        if self._obstacles is not None and (self._placed is not live.robot or live.moved):
-            if self._placed is not live.robot:  # Its parameters have changed.
-                self._placed = live.robot
-                self._around = ObstacleSurface.of(live.robot.simulator.body, live.robot.parameters)
-            self._obstacles.vertices = self._shown(self._around.moved(live.moved).points)
-        if self._shown_state is live.state and self._shown_trial is live.trial:
-            return
-        self._shown_state, self._shown_trial = live.state, live.trial
-        places = self._shown(live.positions)
-        with self._server.atomic():
-            surface = places[self._surface]
-            self._body.vertices = surface
-            self._edges.points = surface[self._sharp]
-            self._dots(self._markers, live.markers)
-            measured, target = live.measured, live.target
-            self._dots(self._measured, measured if measured is not None and live.robot.labels else np.empty((0, 3)))
-            if target is not None:
-                self._target.vertices = self._shown(target[self._surface])
-            if self._target.visible != (target is not None):
-                self._target.visible = target is not None
-
-    def _dots(self, cloud: Any, points: FloatArray) -> None:
-        seen = points[np.isfinite(points).all(axis=1)]
-        if len(seen):
-            cloud.points = self._shown(seen)
-        if cloud.visible != bool(len(seen)):
-            cloud.visible = bool(len(seen))
-
     def _show_status(self, rate: float, pace: float) -> None:
         """Shows time, rates and distance from the measured markers."""
         live = self._live
@@ -445,9 +386,3 @@ class Page:
 def _plain(text: str) -> str:
     """Escapes a text for Markdown."""
     return re.sub(r"([\\`*_{}\[\]()#+!|~-])", r"\\\1", escape(text, quote=False))
-
-
-def _bytes(tone: str) -> tuple[int, int, int]:
-    """Red, green and blue of a colour such as #1a5fb4, from 0 to 255."""
-    red, green, blue = (int(tone[at : at + 2], 16) for at in (1, 3, 5))
-    return red, green, blue

@@ -51,7 +51,7 @@ INTERRUPTED, USER_ERROR = 130, 2
 
 COMPARED: Final = (*BASELINES, "simulation", "sysid", "simfree", "resphys")
 CORRECTED: Final = ("sysid", "resphys")
-FIGURES: Final = ("error_over_time", "tip_displacement")
+FIGURES: Final = ("error_over_time", "paths_worst")
 BODY_PICTURES: Final = ("figures/body.png", "fold_*/figures/body.png", "figures/registration.png")
 MACHINE: Final = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
 PACKAGES: Final = ("python", "warp-lang", "torch")

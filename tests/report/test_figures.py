@@ -17,7 +17,6 @@ from warp_resphys.report.data import Driven, FollowedPath, TrialResults
 from warp_resphys.report.error_section import error_over_time, training_curves
 from warp_resphys.report.figures import CHAMBER_COLOURS, use_logarithm
 from warp_resphys.report.identification_section import loss_histories
-from warp_resphys.report.motion_section import _tip_figure
 from warp_resphys.report.wording import TONES
 
 TIMES = np.arange(20) * 0.01
@@ -57,20 +56,24 @@ def test_a_logarithmic_axis_has_enough_labels(errors, labels):
     assert inside == labels
 
 
-def test_lines_have_their_style_in_every_panel_and_none_hides_another():
-    still = np.zeros((20, 3))
-    models = {model: still[:, None] for model in ("regression", "sysid", "resphys")}
-    trials = trials_of(np.sin(still + np.arange(20)[:, None])[:, None], models)
-    body = SimpleNamespace(tip=[0], mesh=SimpleNamespace(vertices=np.zeros((1, 3))))
-    (figure,) = _tip_figure(body, trials, CANVAS)
-    motion, distance = figure.axes
-    above, below = ({line.get_label(): line for line in axes.lines} for axes in (motion, distance))
-    for label in ("Kernel regression", "SysID", "ResPhys"):
-        assert above[label].get_linestyle() == below[label].get_linestyle()
-        assert above[label].get_linewidth() == below[label].get_linewidth()
-    for label in ("Kernel regression", "SysID"):  # dashed, over the thicker line of ResPhys
-        assert above[label].get_linestyle() == "--"
-        assert above[label].get_zorder() > above["ResPhys"].get_zorder()
+def test_none_of_the_lines_of_models_that_agree_hides_another():
+    still = np.zeros((20, 1, 3))
+    figure = paths_of({model: still for model in ("regression", "sysid", "resphys")})
+    for axes in figure.axes:
+        lines = {line.get_label(): line for line in axes.lines}
+        for label in ("Kernel regression", "SysID"):  # dashed, over the thicker line of ResPhys
+            assert lines[label].get_linestyle() == "--"
+            assert lines[label].get_zorder() > lines["ResPhys"].get_zorder()
+            assert lines[label].get_linewidth() < lines["ResPhys"].get_linewidth()
+
+
+def test_the_tip_is_the_mean_of_its_vertices():
+    target = np.arange(2.0 * 4 * 3).reshape(2, 4, 3)
+    trials = trials_of(target, {"resphys": -target}, labels=()).of_tip(np.array([1, 3]))
+    assert trials.labels == ("tip",)
+    np.testing.assert_array_equal(trials.target[0], target[:, [1, 3]].mean(axis=1, keepdims=True))
+    np.testing.assert_array_equal(trials.positions["resphys"], -trials.target)
+    assert trials.bound.shape == (1, 3)
 
 
 class TestErrors:

@@ -183,17 +183,17 @@ class TestArms:
     def test_markers_are_drawn_over_time(self, tmp_path):
         settings = arm_settings()
         write_arm_run(tmp_path, settings, steps=40)
-        trials, mesh = read_trials(tmp_path, settings), build_mesh(settings.mesh)
+        trials = read_trials(tmp_path, settings)
         canvas = SimpleNamespace(figure=lambda name, *_: name)
 
         def drawn(shown, driven):
-            data = {"mesh": mesh, "fixed": [0], "metrics": {}, "trials": shown, "driven": driven}
+            data = {"tip": [], "metrics": {}, "trials": shown, "driven": driven}
             part = paths_section(SimpleNamespace(**data), canvas)
             return None if part is None else part.blocks
 
         for driven in (read_driven(tmp_path, settings), None):
             assert drawn(trials, driven) == ["paths_worst", "paths_best"]
-        assert drawn(replace(trials, labels=()), None) is None
+        assert drawn(replace(trials, labels=()), None) is None  # and no tip
 
     def test_recordings_are_shown_on_the_body_as_it_hangs(self, tmp_path, monkeypatch):
         settings, shown = arm_settings(), []

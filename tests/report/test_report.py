@@ -16,7 +16,7 @@ from warp_resphys.report.error_section import error_over_time
 from warp_resphys.report.wording import error_parts, number_text
 
 SETTINGS = vertex_settings()
-DRAWN = {"error_over_time", "tip_displacement", "training_resphys", "training_simfree", "motion"}
+DRAWN = {"error_over_time", "paths_worst", "paths_best", "training_resphys", "training_simfree", "motion"}
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(tmp_path):
     assert "no OpenGL here" in page.text
     assert page.text.count("libegl1") == 1
     written = {path.stem for path in stale.parent.iterdir()}
-    assert written == {"error_over_time", "tip_displacement", "training_resphys"}
+    assert written == {"error_over_time", "paths_worst", "paths_best", "training_resphys"}
 
 
 @pytest.mark.usefixtures("no_drawing")

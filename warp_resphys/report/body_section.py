@@ -26,6 +26,7 @@ _CALIBRATED: Final = {  # Source of prediction intervals.
     "folds": "the errors of the other folds",
 }
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
+_LOWEST: Final = 2.2  # Least height of all panels [in].
 _MOST_DOTS: Final = 75  # Dots along a time axis.
 _BAND: Final = 0.16  # Opacity of prediction intervals.
 _LEAST_SPAN: Final = 0.08  # Least span of a coordinate's axis, over the largest motion of the trial.
@@ -142,10 +143,11 @@ def _part_legend(figure: Figure, driven: Driven, used: Sequence[int]) -> None:
 
 
 def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Returns the coordinates of markers over time, in the trials of largest and least error, with their inputs."""
+    """Returns coordinates of the markers or the tip, in the trials of largest and least error, over the inputs."""
     trials, driven = data.trials, data.driven
-    if trials is None or not trials.labels or not trials.moves:
+    if trials is None or not trials.moves or not (trials.labels or len(data.tip)):
         return None
+    trials, of = (trials, "markers") if trials.labels else (trials.of_tip(data.tip), "tip")
     rows, blocks = best_and_worst(trials), []
     which = (("worst", "the last model of the table", "largest"), ("best", "the same model", "least"))
     for row, (place, model, error) in zip(rows, which, strict=False):
@@ -154,9 +156,9 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
         kept = np.sort(shown[np.argsort(-reach[shown])[:_MOST_MARKERS]]).tolist()
         models, start = [m for m in _DRAWN if m in trials.positions], trials.bound
         caption = f"Trial {name}{f', in which {model} has its {error} error' if len(rows) > 1 else ''}: "
-        alt = f"Coordinates of the markers over time in the trial {name}: measured as dots, the models as lines"
+        alt = f"Coordinates of the {of} over time in the trial {name}: observed as dots, the models as lines"
         if driven is None:
-            caption += "coordinates of the markers relative to where they were held."
+            caption += f"displacement of the {of} from the undeformed body."
         else:
             words, start = driven.quantity.plural, np.where(np.isfinite(target[0]), target[0], trials.bound)
             models = [m for m in models if m != "simulation"] or models
@@ -169,7 +171,7 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
         caption += f" The {hidden} markers that move least are not drawn." if hidden else ""
         figure = marker_paths(trials, row, kept, models, start, bands, driven)
         blocks.append(canvas.figure(f"paths_{place}", figure, f"{alt}.", caption))
-    return Part("Marker by marker", blocks)
+    return Part("Marker by marker" if of == "markers" else "The tip over time", blocks)
 
 
 def marker_paths(
@@ -196,11 +198,11 @@ def marker_paths(
         measured_and_simulated = [trials.target, *(trials.positions[model] for model in models)]
         target, *paths = (1e3 * (q[row] - start)[:, kept] for q in measured_and_simulated)  # [mm]
     times, ratios = trials.times[row], [1.0] * len(kept) + [1.3] * (driven is not None)
-    figure = figures.new_figure(0.9 + 1.25 * sum(ratios))
+    figure = figures.new_figure(0.9 + max(1.25 * sum(ratios), _LOWEST))
     panels = figure.subplots(len(ratios), len(trials.axes), sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
-    dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Measured"}
+    dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Observed"}
     for marker, of_marker in enumerate(panels[: len(kept)]):
         for axes, axis in zip(of_marker, trials.axes, strict=True):
             seen = target[:, marker, axis]

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -62,6 +62,14 @@ class TrialResults:
     def moves(self) -> bool:
         """Whether there are motions, rather than poses alone."""
         return self.target.shape[1] > 1
+
+    def of_tip(self, tip: IntArray) -> "TrialResults":
+        """Returns the same trials with the mean of some vertices (P,) as the only marker."""
+        target, bound, *own = (
+            q[..., tip, :].mean(-2, keepdims=True) for q in (self.target, self.bound, *self.positions.values())
+        )
+        positions = dict(zip(self.positions, own, strict=True))
+        return replace(self, labels=("tip",), target=target, bound=bound, positions=positions)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,6 +38,7 @@ _UNITS: Final = (  # By patterns of names, of which the first one that fits coun
     (rf"(.+_)?tension{_BAND}", "N", 1.0),
     (rf"(.+_)?contraction{_BAND}", "mm", 1e3),
 )
+_PROPER: Final = ("Young", "Poisson", "Prony", "Mooney", "Ogden")
 _WHOLE: Final = 99.5  # Deviation from which on a parameter is not determined at all [% of its range].
 _TIED: Final = 0.9  # Correlation from which on two parameters count as not separable.
 _UNINFORMED: Final = 0.8  # Deviation over that of the prior, from which on the data add almost nothing.
@@ -144,8 +145,12 @@ def parameter_wording(parameter: str) -> Wording:
 
 def in_sentence(parameter: str) -> str:
     """Returns the name of a parameter as it stands within a sentence."""
-    words = parameter_wording(parameter)[0]
-    return words if words.startswith(("Young", "Poisson", "Prony")) else words[0].lower() + words[1:]
+    return within_sentence(parameter_wording(parameter)[0])
+
+
+def within_sentence(words: str) -> str:
+    """Returns words without their capital, unless they begin with a proper name."""
+    return words if words.startswith(_PROPER) else words[0].lower() + words[1:]
 
 
 def with_unit(parameter: str, value: float) -> str:

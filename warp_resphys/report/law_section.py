@@ -21,11 +21,12 @@ from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from . import figures
 from .data import RunReport
-from .identification_section import Wording, identified_cell, parameter_wording
+from .identification_section import Wording, identified_cell, parameter_wording, within_sentence
 from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 from .sections import BEYOND
 from .wording import NONE, TONES, in_a_row, model_words, significant, unbroken
 
+_ISOTROPIC: Final = ("c10", "c20", "c30", "c01", "c02", "dilation", "bulk_1", "bulk_2")
 _NOT_FACTORS: Final = ("ms", "%", "°")  # Units of constants that multiply no term: times, slacks, directions.
 _NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
 _POINTS: Final = 81  # Of the curve of the stress.
@@ -136,12 +137,6 @@ def _terms_table(law: Mapping[str, Any]) -> PageTable:
     return PageTable("Term", ["Identified", "Unit", *(["At a bound"] if bounds else [])], rows)
 
 
-def _lower(words: str) -> str:
-    return (
-        words if words.startswith(("Young", "Poisson", "Prony", "Mooney", "Ogden")) else words[:1].lower() + words[1:]
-    )
-
-
 def outside_text(data: RunReport) -> str:
     """Returns a sentence on test trials outside of the stretches of the training; empty if they hardly are."""
     if data.outside is None or data.outside < BEYOND:
@@ -159,11 +154,11 @@ def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
     constants = law["constants"]
     names = [name for name in settings.terms if name not in constants]
     exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
-    absent = [_lower(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})]
+    absent = [within_sentence(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})]
     absent += (
         [f"Ogden's term{'s' if len(exponents) > 1 else ''} of exponent {in_a_row(exponents)}"] if exponents else []
     )
-    absent += [_lower(wording(name)[0][0]) for name in VISCOSITIES if name not in constants]
+    absent += [within_sentence(wording(name)[0][0]) for name in VISCOSITIES if name not in constants]
     if settings.branches and not any(name.startswith("prony") for name in constants):
         absent.append("relaxing branches")
     if settings.families and not families(constants):
@@ -296,10 +291,10 @@ class SmallStrain(NamedTuple):
 
 def small_strain(constants: Mapping[str, float]) -> SmallStrain:
     """Returns the moduli of a law without its fibres, from its constants by name."""
-    ogden, value = ogden_terms(constants), constants.get
-    mu = 2.0 * (value("c10", 0.0) + value("c01", 0.0)) + sum(ogden.values())
-    lame = 2.0 * (value("dilation", 0.0) + value("bulk_1", 0.0))
-    return SmallStrain(mu, lame + sum(2.0 * (1.0 + 2.0 / n) * own for n, own in ogden.items() if n < 0))
+    rest = torch.ones(3, dtype=torch.float64)
+    slopes = torch.autograd.functional.hessian(lambda s: _energy(constants, s, None), rest)
+    along, across = float(slopes[0, 0]), float(slopes[0, 1])  # lambda + 2 mu, and lambda.
+    return SmallStrain(0.5 * (along - across), across)
 
 
 def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
@@ -353,38 +348,33 @@ def _slopes(
     constants: Mapping[str, float], stretch: float, sides: FloatArray, direction: Sequence[float] | None
 ) -> FloatArray:
     """Derivatives (3,) [Pa] of the energy by the principal stretches."""
-    value = constants.get
-    s = np.array([stretch, *sides])
-    other = np.array([s[1] * s[2], s[0] * s[2], s[0] * s[1]])  # Derivatives of J.
-    j, squares = float(np.prod(s)) - 1.0, s * s
-    first, second = float(squares.sum()), float((other * other).sum())
-    a, b = first - 3.0 - 2.0 * j + j * j, second - 3.0 - 4.0 * j
-    a_slope, b_slope = 2.0 * s + 2.0 * (j - 1.0) * other, 2.0 * s * (first - squares) - 4.0 * other
-    slopes = a_slope * (value("c10", 0.0) + 2.0 * value("c20", 0.0) * a + 3.0 * value("c30", 0.0) * a * a)
-    slopes += b_slope * (value("c01", 0.0) + 2.0 * value("c02", 0.0) * b)
-    slopes += other * (2.0 * (value("dilation", 0.0) + value("bulk_1", 0.0)) * j + 4.0 * value("bulk_2", 0.0) * j**3)
+    s = torch.tensor([stretch, *sides], dtype=torch.float64, requires_grad=True)
+    (slopes,) = torch.autograd.grad(_energy(constants, s, direction), s)
+    return np.asarray(slopes.numpy())
+
+
+def _energy(constants: Mapping[str, float], s: torch.Tensor, direction: Sequence[float] | None) -> torch.Tensor:
+    """Energy density [Pa] at principal stretches (3,)."""
+    c10, c20, c30, c01, c02, dilation, bulk_1, bulk_2 = (constants.get(name, 0.0) for name in _ISOTROPIC)
+    j, first, second = s.prod() - 1.0, s.square().sum(), _pairs(s.square())
+    a, b = first - 3.0 - 2.0 * j + j**2, second - 3.0 - 4.0 * j
+    energy = c10 * a + c20 * a**2 + c30 * a**3 + c01 * b + c02 * b**2 + (dilation + bulk_1) * j**2 + bulk_2 * j**4
     for n, mu in ogden_terms(constants).items():
-        if n > 0:
-            own = n * s ** (n - 1) + n * (j - 1.0) * other
-        else:
-            powers = s ** (-n)
-            own = -n * s ** (-n - 1) * (powers.sum() - powers) + 2.0 * n * other
-        slopes += 2.0 * mu / n**2 * own
-    if direction is not None:
-        slopes += _fibre_slopes(constants, s, np.square(np.asarray(direction, dtype=np.float64)))
-    return slopes
-
-
-def _fibre_slopes(constants: Mapping[str, float], s: FloatArray, along: FloatArray) -> FloatArray:
-    """Derivatives (3,) [Pa] of the energy of the first family, with squared cosines of its direction (3,)."""
+        powers = s ** abs(n)
+        term = powers.sum() + n * (0.5 * j**2 - j) if n > 0 else _pairs(powers) + 2.0 * n * j
+        energy = energy + 2.0 * mu / n**2 * term
+    if direction is None:
+        return energy
     tension, stiffening, compression, slack, toe = (
         constants.get(f"fibre_{name}_1", 0.0) for name in ("tension", "stiffening", "compression", "slack", "toe")
     )
-    length = float(np.sqrt(along @ (s * s)))
-    q = length * length - 1.0
-    strain = max(length - 1.0 - slack, 0.0)
-    t = min(strain / toe, 1.0) if toe > 0.0 else 1.0
-    force = toe * t**3 * (1.0 - 0.5 * t) if t < 1.0 else strain - 0.5 * toe
-    by_length = tension * force
-    by_length += 2.0 * length * (3.0 * stiffening * max(q, 0.0) ** 2 - 2.0 * compression * max(-q, 0.0))
-    return by_length * along * s / length
+    length = (torch.tensor(direction, dtype=torch.float64) * s).norm()
+    q, strain = length**2 - 1.0, (length - 1.0 - slack).clamp_min(0.0)
+    t = strain / toe if toe > 0.0 else torch.ones(())
+    pull = toe**2 * (0.25 * t**4 - 0.1 * t**5) if t < 1.0 else 0.5 * strain**2 - 0.5 * toe * strain + 0.15 * toe**2
+    return energy + tension * pull + stiffening * q.clamp_min(0.0) ** 3 + compression * q.clamp_max(0.0) ** 2
+
+
+def _pairs(x: torch.Tensor) -> torch.Tensor:
+    """Sum of the products of two of three numbers (3,)."""
+    return 0.5 * (x.sum() ** 2 - x.square().sum())

@@ -1,4 +1,4 @@
-"""The section of the page of a run on the motion in a trial: a film, a view in space, pictures, and the tip.
+"""The section of the page of a run on the motion in a trial: a film, a view in space, and pictures.
 
 The view in space is turned and played in a browser (`view.js`). Vertices of a motion are stored for it in a reduced
 basis: rest positions, singular vectors of the displacements of all models, and their weights in each frame. Ten seconds
@@ -20,16 +20,15 @@ from matplotlib.colors import to_hex
 
 from ..data.camera import frame_of, motion_axes, upwards
 from ..io.arrays import FloatArray
-from ..learning.baselines import BASELINES
 from ..learning.metrics import mean_distance
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from . import figures
-from .data import Film, RunReport, TrialResults, at_times, shown_markers
+from .data import Film, RunReport, at_times, shown_markers
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
 from .motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
 from .page import Block, Canvas, Drawn, Part, ViewInSpace
 from .render import Pixels, draw, write_film
-from .wording import MODELS, TONES, largest_text, shown_models, unbroken
+from .wording import MODELS, TONES, shown_models, unbroken
 
 _MOST_POINTS: Final = 6  # Vertices of the tip that are shown, where every vertex is observed.
 _MOST_FRAMES: Final = 256  # Of the view in space.
@@ -87,7 +86,7 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
 
 
 def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
-    """Returns a film, a view in space and a few instants of a trial and, where vertices are observed, its tip."""
+    """Returns a film, a view in space and a few instants of a trial."""
     motion, trials = motion_of(data), data.trials
     if motion is None or trials is None:
         return None
@@ -112,7 +111,6 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
             )
         )
     blocks += _in_space(data, name)
-    blocks += [] if data.sees_markers else _tip_figure(data, trials, canvas)
     same = "The same trial" if blocks else f"The trial {name}"
     instants = canvas.rendered(
         "motion.png",
@@ -169,40 +167,6 @@ def _instants_figure(
     return canvas.figure("motion", figure, alt, caption)
 
 
-def _tip_figure(data: RunReport, trials: TrialResults, canvas: Canvas) -> list[Block]:
-    """Draws the tip over time and, below it, the distance of each model's tip from that of the target."""
-    if not trials.moves or not len(data.tip):
-        return []
-    row = trials.worst
-    drawn = [m for m in (*BASELINES, "simulation", "sysid", "law", "resphys") if m in trials.positions]
-    rest = data.mesh.vertices[data.tip].mean(axis=0)
-    every = [trials.target, *(trials.positions[m] for m in drawn)]
-    target, *paths = (1e3 * (q[row][:, data.tip].mean(axis=1) - rest) for q in every)  # (T, 3)
-    axis, time = int(np.argmax(np.ptp(target, axis=0))), trials.times[row]
-    figure = figures.new_figure(3.9)
-    motion, distance = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    motion.plot(time, target[:, axis], color=TONES["target"].light, linewidth=4.0, label="Target")
-    reached = []
-    for model, path in zip(drawn, paths, strict=True):
-        with np.errstate(over="ignore", invalid="ignore"):
-            gap = np.linalg.norm(path - target, axis=1)
-        motion.plot(time, path[:, axis], **figures.model_line(model))
-        distance.plot(time, figures.positive(gap), **figures.model_line(model))
-        largest = largest_text(np.where(np.isnan(gap), np.inf, gap))
-        reached.append(f"{MODELS[model].name} leaves the target by up to {largest}")
-    figures.keep_in_view(motion, target[:, axis], 0.8)
-    motion.set_ylabel(f"tip displacement\nalong {'xyz'[axis]} [mm]")
-    figures.few_ticks(motion.yaxis, 5)
-    figures.use_logarithm(distance)
-    distance.set(xlabel="time [s]", ylabel="off target\n[mm]", xlim=(0.0, np.nanmax(time)))
-    figures.legend_above(figure, motion)
-    caption = (
-        "Tip displacement from rest; the wide line is the target. Below: distance of the simulated tip from "
-        "the target’s, on a logarithmic axis."  # noqa: RUF001
-    )
-    return [canvas.figure("tip_displacement", figure, f"Tip displacement over time. {'; '.join(reached)}.", caption)]
-
-
 def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
     """Returns the view of all bodies of a motion.
 
@@ -230,10 +194,7 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
     largest, shares = _error_shares(simulated[:, :, compared], target[:, compared], places)
     models = [
         {
-            "name": MODELS[model].name,
-            "light": TONES[model].light,
-            "dark": TONES[model].dark,
-            "shown": model in shown,
+            **{"name": MODELS[model].name, **TONES[model]._asdict(), "shown": model in shown},
             "largest": float(f"{most:.4g}"),
             "means": [float(f"{mean:.4g}") if np.isfinite(mean) else None for mean in by_frame],
         }

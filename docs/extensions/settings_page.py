@@ -1,23 +1,17 @@
-"""Writes a reference of all settings, as a page and as a JSON Schema for editors.
+"""The page of all settings.
 
-    python -m warp_resphys.settings.reference docs/settings.md
-    python -m warp_resphys.settings.reference configs/settings.schema.json
-
-The first is the page of all keys. With the second, an editor completes and checks a YAML file that begins with
-``# yaml-language-server: $schema=settings.schema.json`` (a path from that file, or absolute).
+python docs/extensions/settings_page.py
 """
 
 import json
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-from ..io.safe_files import write_text
-from ..io.setting_errors import Schema, options
-from .body import BodySettings, TargetSettings
-from .run import RunSettings
+from warp_resphys.io.setting_errors import Schema, options
+from warp_resphys.settings.body import BodySettings, TargetSettings
+from warp_resphys.settings.run import RunSettings
 
 _HEAD: Final = """# Settings
 
@@ -26,9 +20,9 @@ All keys of a run: `key=default`, its meaning, and its values with their unit [i
 line, or in a file of `configs/experiment`; `warp-resphys --cfg job` shows the values of a run. `NAME` stands for any
 name. A key without a default is required. Keys of `simfree` that are left out are as in `network` and `trainer`.
 
-`python -m warp_resphys.settings.reference configs/settings.schema.json` writes a JSON Schema, with which editors
+`python -m warp_resphys.settings.editor_schema configs/settings.schema.json` writes a JSON Schema, with which editors
 complete and check YAML files that begin with `# yaml-language-server: $schema=../settings.schema.json`.
-`python -m warp_resphys.settings.reference docs/settings.md` writes this page.
+`python docs/extensions/settings_page.py` writes this page.
 """
 
 _REPLACED: Final = (
@@ -155,23 +149,5 @@ def _type(node: Schema, schema: Schema) -> str:
     return f"{name} {', '.join(given)}".strip()
 
 
-def editor_schema() -> dict[str, Any]:
-    """Returns the JSON Schema of a file of settings, in which keys may be missing, as it extends other options."""
-    schema: dict[str, Any] = _partial(RunSettings.model_json_schema())
-    schema["properties"] |= {"defaults": {"type": "array"}, "hydra": {"type": "object"}}
-    return schema
-
-
-def _partial(node: Any) -> Any:
-    """A JSON Schema without lists of required keys, in which groups may replace others."""
-    if isinstance(node, Mapping):
-        part = {key: _partial(value) for key, value in node.items() if key != "required" or not isinstance(value, list)}
-        replaces = {"properties": {**part.get("properties", {}), "_replace_": {"type": "boolean"}}}
-        return part | replaces if part.get("type") == "object" else part
-    return list(map(_partial, node)) if isinstance(node, list) else node
-
-
 if __name__ == "__main__":
-    for argument in map(Path, sys.argv[1:]):
-        text = page() if argument.suffix == ".md" else json.dumps(editor_schema(), indent=2)
-        write_text(argument, f"{text.rstrip()}\n")
+    Path(__file__).parents[1].joinpath("settings.md").write_text(f"{page().rstrip()}\n", encoding="utf-8")

@@ -20,34 +20,14 @@ from .control.control_files import BASELINES, plan_table, plans_file, reduced_fi
 from .control.control_stages import drive, fit_baselines, plan_motions, reduce_robot
 from .control.task import motions_of
 from .energies.catalogue import law_path
+from .experiment import files
 from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
+from .experiment.digests import digest_of, files_read
 from .experiment.duration import announcement
 from .experiment.evaluate import evaluate
 from .experiment.experiment import LEARNED, SIMFREE
-from .experiment.files import (
-    CONTROL,
-    DATASET,
-    DRIVEN,
-    ERRORS,
-    IDENTIFICATION,
-    LAW_FILE,
-    MESH_CHECK,
-    METRICS,
-    QUALITY,
-    REGISTRATION,
-    REPORT,
-    ROLLOUTS,
-    SCALED_DATASET,
-    SHAPES,
-    TIMES,
-    TRUTH,
-    fold_folder,
-    reconstruction_file,
-    training_file,
-    weights_file,
-)
 from .experiment.folds import Fold, run_folds, workers_for
 from .experiment.identify import identify
 from .experiment.identify_law import identify_law
@@ -63,7 +43,6 @@ from .experiment.simulate import simulate
 from .experiment.splits import folds_of, scaled_trials_of, split_of, test_groups, trials_of
 from .experiment.timing import time_models
 from .io.atomic import digest
-from .io.errors import DataFileError
 from .io.fan_out import ALONE, Workers
 from .io.kernel_cache import start_quietly
 from .io.progress import show
@@ -73,7 +52,7 @@ from .learning.metrics import summarise_folds
 from .report.control_section import tracking_table
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
-from .settings.body import BodySettings, TargetSettings
+from .settings.body import TargetSettings
 from .settings.control import ControlSettings
 from .settings.motions import Split, Trial
 from .settings.run import RunSettings
@@ -86,31 +65,6 @@ _SHORT = 60  # characters of advice beside which the path of the report is print
 _MOST_THREADS = 4  # that share the trials of a batch, as Python's part of a step runs in one at a time
 
 
-def files_read(run: RunSettings, *bodies: BodySettings | None) -> dict[str, str]:
-    """Returns the SHA-256 of the files of bodies and base motions, by path.
-
-    Args:
-        run: settings of the run.
-        bodies: of the simulator and of the simulation that plays the real body; None is left out.
-
-    Raises:
-        DataFileError: a file cannot be read.
-    """
-    folder = Path((run.recorded.folder if run.recorded is not None else None) or ".").expanduser()
-    moved = {motion.file for motion in run.motions().values() if motion.file is not None}
-    motions = {name: _digest(folder / name, "the file of base_motion or obstacle_motion") for name in sorted(moved)}
-    meshes = [mesh for body in bodies if body for mesh in (body.mesh, *(part.mesh for part in body.parts.values()))]
-    paths = [getattr(mesh, "path", None) for mesh in meshes]
-    return motions | {path: digest(path) for path in paths if path is not None}
-
-
-def _digest(path: Path, key: str) -> str:
-    try:
-        return digest(str(path))
-    except OSError as error:
-        raise DataFileError(f"cannot read {path} ({error.strerror}): check data.folder and {key}.") from error
-
-
 def acquisition_stages(run: RunSettings) -> list[Stage]:
     """Returns the stages that write dataset.h5: simulation of the trials, or import of (simulated) recordings.
 
@@ -120,29 +74,37 @@ def acquisition_stages(run: RunSettings) -> list[Stage]:
     Raises:
         DataFileError: a recording cannot be read.
     """
-    files, trials = files_read(run, run), trials_of(run)
+    digests, trials = files_read(run, run), trials_of(run)
     if run.recorded is None:
         keys = (*SIMULATOR, "target", "data")
         settings = StageSettings.reading(run, *keys, files=files_read(run, run, run.target), trials=trials)
-        return [Stage("simulate", simulate, (DATASET,), settings)]
+        return [Stage("simulate", simulate, (files.DATASET,), settings)]
     split = None if folds_of(run) is not None else split_of(run)
     learned = None if split is None else split.train + split.validation
 
     def imported(trials: Sequence[Trial]) -> StageSettings:
-        return StageSettings.reading(run, *IMPORTED, files=files, trials=trials, learned=learned)
+        return StageSettings.reading(run, *IMPORTED, files=digests, trials=trials, learned=learned)
 
-    outputs = (DATASET, QUALITY, REGISTRATION)
+    outputs = (files.DATASET, files.QUALITY, files.REGISTRATION)
     if not run.is_laboratory:
-        files |= {str(trial.file): _digest(Path(str(trial.file)), f"data.trials.{trial.name}.file") for trial in trials}
+        digests |= {
+            str(trial.file): digest_of(Path(str(trial.file)), f"data.trials.{trial.name}.file") for trial in trials
+        }
         return [Stage("import", import_recordings, outputs, imported(trials))]
     stages = [
-        _laboratory_stage("laboratory", run, trials, TRUTH),
+        _laboratory_stage("laboratory", run, trials, files.TRUTH),
         Stage("import", import_recordings, outputs, imported(trials), ("laboratory",)),
     ]
     if scaled := scaled_trials_of(run):
         stages += [
             replace(_laboratory_stage("laboratory_scaled", run, scaled), upstream=("laboratory",)),
-            Stage("import_scaled", import_scaled, (SCALED_DATASET,), imported(scaled), ("import", "laboratory_scaled")),
+            Stage(
+                "import_scaled",
+                import_scaled,
+                (files.SCALED_DATASET,),
+                imported(scaled),
+                ("import", "laboratory_scaled"),
+            ),
         ]
     return stages
 
@@ -187,12 +149,8 @@ class _SplitStages:
         self.run, self.split, self.workers = run, split, workers
         self.stages: list[Stage] = []
         self._identified: tuple[str, ...] = ()  # stages of the identification, which all others follow
-        self._common: dict[str, Any] = {
-            "files": files_read(run, run),
-            "shared": shared,
-            "acquired": acquired,
-            "split": split,
-        }
+        self._common: dict[str, Any] = {"files": files_read(run, run), "shared": shared, "split": split}
+        self._common["acquired"] = acquired
 
     def add(
         self,
@@ -221,18 +179,18 @@ class _SplitStages:
 
     def identification(self) -> None:
         """Adds the identification of parameters, of the law of the material, and its test on other bodies."""
-        run, files = self.run, self._common["files"]
+        run, digests = self.run, self._common["files"]
         if run.identify is not None:
-            self.add("identify", identify, (IDENTIFICATION,), ("seed",), run=run.model_copy(update={"law": None}))
+            self.add("identify", identify, (files.IDENTIFICATION,), ("seed",), run=run.model_copy(update={"law": None}))
             self._identified = ("identify",)
         if run.law is not None:
             law = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
-            self.add("identify_law", identify_law, (LAW_FILE,), ("name",), files=files | law)
+            self.add("identify_law", identify_law, (files.LAW_FILE,), ("name",), files=digests | law)
             self._identified += ("identify_law",)
         if run.shapes:
             bodies = [body for shape in run.shapes.values() for body in (shape, shape.target_body)]
             keys = ("target", "shapes", "data.steps")
-            self.add("shapes", try_shapes, (SHAPES,), keys, files=files | files_read(run, *bodies))
+            self.add("shapes", try_shapes, (files.SHAPES,), keys, files=digests | files_read(run, *bodies))
 
     def learning(self) -> None:
         """Adds the reconstruction of residual forces, and the training of the networks."""
@@ -244,14 +202,14 @@ class _SplitStages:
             if model not in run.models or model == SIMFREE:
                 continue
             self.add(
-                *(f"reconstruct_{model}", reconstruct, (reconstruction_file(model),), ("reconstruction",)),
+                *(f"reconstruct_{model}", reconstruct, (files.reconstruction_file(model),), ("reconstruction",)),
                 model=model,
                 reconstructed=reconstructed,
             )
-            outputs, training = (weights_file(model), training_file(model)), run.training_of(model)
+            outputs, training = (files.weights_file(model), files.training_file(model)), run.training_of(model)
             upstream = (f"reconstruct_{model}",)
             self.add(f"train_{model}", train, outputs, NETWORKS, upstream, model=model, training=training)
-        outputs, training = (weights_file(SIMFREE), training_file(SIMFREE)), run.training_of(SIMFREE)
+        outputs, training = (files.weights_file(SIMFREE), files.training_file(SIMFREE)), run.training_of(SIMFREE)
         needed = () if run.markers is None else ("reconstruct_resphys",)
         alone = run if run.markers is not None or run.target is None else _without_simulator(run, run.target)
         self.add("train_simfree", train, outputs, NETWORKS, needed, alone, model=SIMFREE, training=training)
@@ -262,19 +220,19 @@ class _SplitStages:
         calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
         learned = [stage.name for stage in self.stages if stage.name.startswith("train_")]
         self.add(
-            *("evaluate", evaluate, (ROLLOUTS, ERRORS)),
+            *("evaluate", evaluate, (files.ROLLOUTS, files.ERRORS)),
             (*NETWORKS, "published", "correct_uncorrected", "data.horizons"),
             (*learned, "reconstruct_resphys"),
             groups=groups,
             calibration=calibration,
         )
         if run.timing:
-            self.add("time", time_models, (TIMES,), (*NETWORKS, "target"), learned, groups=groups)
+            self.add("time", time_models, (files.TIMES,), (*NETWORKS, "target"), learned, groups=groups)
         played = run.laboratory if run.is_laboratory else None
         same = played is not None and (played.mesh, played.parts) == (run.mesh, run.parts)
         if run.mesh_check is not None and not same:
             first = {"1": groups["1"]}
-            self.add("mesh_check", check_mesh, (MESH_CHECK,), (*NETWORKS, "mesh_check"), groups=first)
+            self.add("mesh_check", check_mesh, (files.MESH_CHECK,), (*NETWORKS, "mesh_check"), groups=first)
 
     def control(self, control: ControlSettings) -> None:
         """Adds plans on the models, and with a simulated laboratory, driven motions."""
@@ -289,17 +247,19 @@ class _SplitStages:
             self.add(second, plan_motions, outputs, keys, (first,), model=model, must_reach=model == last)
         if self.run.laboratory is None:
             return
-        files = self._common["files"] | files_read(self.run, self.run.laboratory)
+        digests = self._common["files"] | files_read(self.run, self.run.laboratory)
         keys = (*PLAYED, *FIGURES, "control.feedback")
-        self.add("baselines", fit_baselines, (BASELINES,), keys, ("evaluate",), model=last, files=files)
-        self.add("drive", drive, (DRIVEN, CONTROL), (*PLAYED, "control"), (*planned, "baselines"), files=files)
+        self.add("baselines", fit_baselines, (BASELINES,), keys, ("evaluate",), model=last, files=digests)
+        self.add(
+            "drive", drive, (files.DRIVEN, files.CONTROL), (*PLAYED, "control"), (*planned, "baselines"), files=digests
+        )
 
     def with_report(self) -> list[Stage]:
         """Returns all stages, with that of the report, which shows the whole configuration."""
         shown = [
             stage.name for stage in self.stages if stage.name in ("shapes", "evaluate", "time", "mesh_check", "drive")
         ]
-        return [*self.stages, Stage("report", make_report, (REPORT,), self.run, tuple(shown))]
+        return [*self.stages, Stage("report", make_report, (files.REPORT,), self.run, tuple(shown))]
 
 
 def _without_simulator(run: RunSettings, target: TargetSettings) -> RunSettings:
@@ -332,7 +292,7 @@ def acquire(run: RunSettings, folder: Path, wait: bool = False) -> tuple[list[St
     if unfinished(stages, folder):  # Torch's first optimiser imports it for a second, in which kernels are compiled.
         Thread(target=import_module, args=("torch._dynamo",)).start()
     run_stages(stages, folder, wait)
-    (written,) = (stage.name for stage in stages if DATASET in stage.outputs)
+    (written,) = (stage.name for stage in stages if files.DATASET in stage.outputs)
     return stages, str(read_json(folder / "stages" / f"{written}.json")["fingerprint"])
 
 
@@ -362,11 +322,11 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
         metrics = collect_metrics(folder, run, [stage.name for stage in (*first, *stages)])
     else:
         metrics = _run_folds(run, folder, folds, first, acquired)
-    write_json(folder / METRICS, metrics)
+    write_json(folder / files.METRICS, metrics)
     if folds is not None:
         errors = {trial: fold["errors_mm"] for trial, fold in metrics["folds"].items()}
         reported = StageSettings.reading(run, *RunSettings.model_fields, folds=errors)
-        run_stages([*first, Stage("report", make_folds_report, (REPORT,), reported, (first[-1].name,))], folder)
+        run_stages([*first, Stage("report", make_folds_report, (files.REPORT,), reported, (first[-1].name,))], folder)
     _print(metrics, folder, run)
 
 
@@ -387,7 +347,7 @@ def _run_folds(
 ) -> dict[str, Any]:
     """Runs a cross-validation, each fold in its own folder; returns the content of metrics.json."""
     folds = {
-        name: Fold(name, folder / fold_folder(name), partial(learning_stages, run, split, "..", acquired))
+        name: Fold(name, folder / files.fold_folder(name), partial(learning_stages, run, split, "..", acquired))
         for name, split in splits.items()
     }
     left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
@@ -398,11 +358,11 @@ def _run_folds(
     metrics = {}
     for name, fold in folds.items():
         metrics[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
-        write_json(fold.folder / METRICS, metrics[name])
+        write_json(fold.folder / files.METRICS, metrics[name])
     return {
         "errors_mm": summarise_folds(_of_all([of_fold["errors_mm"] for of_fold in metrics.values()])),
         "folds": metrics,
-        **intervals_of_folds(folder / DATASET, {name: fold.folder for name, fold in folds.items()}),
+        **intervals_of_folds(folder / files.DATASET, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
@@ -422,6 +382,6 @@ def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
     tables += [tracking_table(tracking)] if tracking else []
     tables += [shapes_table(shapes)] if shapes else []
     said, *advice = (*verdict(metrics, run), "")
-    last = [" ".join(filter(None, advice)), f"Report: {folder / REPORT}"]
+    last = [" ".join(filter(None, advice)), f"Report: {folder / files.REPORT}"]
     lines = ["  ".join(filter(None, last))] if len(last[0]) < _SHORT else last
     show(*tables, *filter(None, (said, *lines)))

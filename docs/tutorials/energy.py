@@ -41,7 +41,7 @@ import warp as wp
 
 from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
-from warp_resphys.stepping.quantity import Quantity
+from warp_resphys.stepping.quantity import parameter
 
 wp.config.log_level = wp.LOG_WARNING
 
@@ -56,15 +56,11 @@ def floor_energy(x: wp.vec3d, values: wp.vec2d) -> wp.float64:
 class Floor(PointwiseEnergy):
     """A floor that pushes vertices up."""
 
-    parameters: ClassVar = (
-        Quantity("floor_stiffness", "N/m^2", 0.0, closed=True),  # zero or more
-        Quantity("floor_height", "m", typical=0.01),  # any
-    )
     density: ClassVar = floor_energy
     size: ClassVar = 1e-3  # metres; differences have steps of 3e-4 of it
     vertices: np.ndarray  # vertices that may touch the floor
-    floor_stiffness: float  # k [N/m^2]
-    floor_height: float  # z_0 [m]
+    stiffness: float = parameter(1e5, "floor_stiffness", "N/m^2", closed=True)  # k, zero or more
+    height: float = parameter(0.0, "floor_height", "m", -np.inf, typical=0.01)  # z_0, any
 
     def points(self, mesh):
         return (at_vertices(self.vertices),)
@@ -76,7 +72,7 @@ class Floor(PointwiseEnergy):
 # %%
 mesh = box_hexahedra(size=(0.04, 0.04, 0.04), divisions=(4, 4, 4))  # m
 bottom, top = select_vertices(mesh, z=0.0), select_vertices(mesh, z=0.04)
-body = Body(mesh, energies=[Floor(bottom, floor_stiffness=1e5, floor_height=-0.02)])
+body = Body(mesh, energies=[Floor(bottom, stiffness=1e5, height=-0.02)])
 silicone = Corotated(youngs_modulus=50e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
 simulator = Simulator(body, silicone, time_step=0.002, integrator="bdf2", relative_tolerance=1e-9)
 print("parameters:", ", ".join(simulator.parameters))
@@ -146,15 +142,11 @@ def spring_energy(x: wp.vec3d, values: wp.vec2d) -> wp.float64:
 class Spring(PointwiseEnergy):
     """Springs between pairs of vertices."""
 
-    parameters: ClassVar = (
-        Quantity("spring_stiffness", "N/m", 0.0, per="spring"),
-        Quantity("spring_length", "m", 0.0, per="spring"),
-    )
     density: ClassVar = spring_energy
     size: ClassVar = 0.01
     pairs: np.ndarray  # (S, 2)
-    spring_stiffness: float  # k [N/m]
-    spring_length: float  # L [m]
+    stiffness: float = parameter(20.0, "spring_stiffness", "N/m", per="spring")  # k
+    length: float = parameter(0.05, "spring_length", "m", per="spring")  # L
 
     @property
     def count(self):
@@ -165,7 +157,7 @@ class Spring(PointwiseEnergy):
 
 
 ends = np.array([[bottom[0], top[-1]]])  # a diagonal of the block, which is 69 mm long
-tied = Body(mesh, fixed=bottom, energies=[Spring(ends, spring_stiffness=20.0, spring_length=0.05)])
+tied = Body(mesh, fixed=bottom, energies=[Spring(ends, stiffness=20.0, length=0.05)])
 pulled = Simulator(tied, silicone).static_equilibrium().q[0]
 length = np.linalg.norm(pulled[ends[0, 0]] - pulled[ends[0, 1]])
 print(f"the spring is {1e3 * length:.2f} mm long and pulls with {20.0 * (length - 0.05):.3f} N")

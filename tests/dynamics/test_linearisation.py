@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from warp_resphys import Body, Corotated, Inputs, Rigid, Simulator, Tendons, select_vertices
-from warp_resphys.dynamics.energy_set import EnergySet
+from warp_resphys.dynamics.energy_set import EnergySet, place_energies
 from warp_resphys.dynamics.linearisation import Linearisation
-from warp_resphys.energies.body_energies import place_energies
 from warp_resphys.fem.coordinates import DeviceCoordinates
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.boxes import box_hexahedra

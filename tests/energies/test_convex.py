@@ -10,7 +10,7 @@ import torch
 from warp_resphys import Body, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies import MooneyRivlin
 from warp_resphys.energies.catalogue import make_material
-from warp_resphys.energies.materials import ConvexMaterial, FibreFamily
+from warp_resphys.energies.convex_material import ConvexMaterial, FibreFamily
 from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import check_gradients
 

@@ -7,9 +7,10 @@ import torch
 
 from warp_resphys import Body, Mesh, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.dynamics.assembly import BlockPattern, HessianAssembly
-from warp_resphys.energies.body_energies import PlacedEnergy
+from warp_resphys.energies.base import PlacedEnergy
 from warp_resphys.energies.catalogue import MATERIALS as ALL_MATERIALS
-from warp_resphys.energies.materials import ConvexMaterial, DensityMaterial
+from warp_resphys.energies.convex_material import ConvexMaterial
+from warp_resphys.energies.materials import DensityMaterial
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid
 from warp_resphys.linalg.choice import make_linear_solver

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from warp_resphys import Body, box_hexahedra, box_tetrahedra
-from warp_resphys.energies.body_energies import PlacedEnergy
+from warp_resphys.energies.base import PlacedEnergy
 from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.energies.solid import Solid, SolidTerm

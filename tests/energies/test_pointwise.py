@@ -12,7 +12,7 @@ from warp_resphys import Body, Corotated, Inputs, Muscles, Simulator, SolverSett
 from warp_resphys.energies import Muscle
 from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
 from warp_resphys.io.errors import InputError
-from warp_resphys.stepping.quantity import Quantity
+from warp_resphys.stepping.quantity import Quantity, parameter
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
@@ -34,9 +34,8 @@ def fibre(x: wp.vec3d, v: wp.vec3d) -> wp.float64:
 @dataclass(frozen=True)
 class Fibre(PointwiseEnergy):
     inputs: ClassVar = (Quantity("muscle_stress", "Pa"), Quantity("muscle_contraction", ""))
-    parameters: ClassVar = (Quantity("muscle_stiffness", "Pa", 0.0),)
     density: ClassVar = fibre
-    muscle_stiffness: float = 4e4
+    muscle_stiffness: float = parameter(4e4, "muscle_stiffness", "Pa")
 
     def points(self, mesh):
         return FIBRES.points(mesh)
@@ -52,15 +51,11 @@ def spring(x: wp.vec3d, v: wp.vec2d) -> wp.float64:
 class Spring(PointwiseEnergy):
     """Springs between vertices, pair after pair with values of its own."""
 
-    parameters: ClassVar = (
-        Quantity("spring_stiffness", "N/m", 0.0, per="spring"),
-        Quantity("spring_length", "m", 0.0, per="spring"),
-    )
     density: ClassVar = spring
     size: ClassVar[float] = 0.05
     pairs: list = field(default_factory=lambda: [[CLAMP[0], TIP[3]], [CLAMP[1], TIP[2]]])
-    spring_stiffness: float = 50.0
-    spring_length: float = 0.05
+    stiffness: float = parameter(50.0, "spring_stiffness", "N/m", per="spring")
+    length: float = parameter(0.05, "spring_length", "m", per="spring")
 
     @property
     def count(self):
@@ -80,10 +75,9 @@ def polynomial(x: wp.vec3d, v: wp.vec3d) -> wp.float64:
 class Hills(PointwiseEnergy):
     """A potential of the height of the tip, by an array of coefficients."""
 
-    parameters: ClassVar = (Quantity("coefficients", "J", shape=(3,)),)
     density: ClassVar = polynomial
     size: ClassVar[float] = 0.02
-    coefficients: tuple = (0.1, 2.0, 30.0)
+    coefficients: tuple = parameter((0.1, 2.0, 30.0), "coefficients", "J", -np.inf, shape=(3,))
 
     def points(self, mesh):
         return (at_vertices(TIP),)
@@ -118,7 +112,7 @@ def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
 
 def test_a_clamped_tangent_has_no_negative_eigenvalue():
     """Springs that push have a negative stiffness across; the clamped one is what is left without it."""
-    s = simulator(Spring(spring_length=0.2))
+    s = simulator(Spring(length=0.2))
     s.linearise(s.rest_state(2))
     p = s.workspace(2).potential
     p.positions.copy_(s.rest_positions)

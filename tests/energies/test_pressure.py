@@ -9,7 +9,7 @@ import torch
 from support.chambered import BRICK, KINDS, chambered, hollow_box
 from support.slopes import check_slopes
 from warp_resphys import Body, Corotated, Inputs, Pressure, Simulator, SolverSettings
-from warp_resphys.energies.body_energies import PlacedEnergy
+from warp_resphys.energies.base import PlacedEnergy
 from warp_resphys.energies.fibres import Fibres
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.io.errors import InputError, MeshError

@@ -9,7 +9,7 @@ import torch
 import warp_resphys
 from support.configured import settings
 from warp_resphys import Body, Corotated, Inputs, RobotScene, Simulator, SurfaceContact, box_hexahedra, select_vertices
-from warp_resphys.energies.materials import ConvexMaterial
+from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot

@@ -8,17 +8,20 @@ Mass damping is linear in the solution, so it is merged with inertia and target.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 
-from ..energies.base import BoundEnergy, EnergySite, EnergyStep, Memory
-from ..energies.body_energies import PlacedEnergy
+from ..energies.base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PlacedEnergy
 from ..energies.contact.barrier import ContactForces
 from ..energies.contact.obstacle_contact import BoundContact
 from ..energies.contact.obstacle_poses import ObstacleMotion
 from ..energies.contact.surface_contact import BoundSurfaceContact
+from ..energies.hysteresis import Hysteresis
+from ..energies.materials import Material
 from ..energies.potential import StepTerms
+from ..energies.rigid import PointInertia, rigid_energies
+from ..energies.solid import solids_of
 from ..energies.term import Term, Values
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
@@ -29,6 +32,7 @@ from ..stepping.quantity import Quantity
 from ..stepping.state import Constants, ImplicitStage, Mass, State
 
 T = TypeVar("T")
+Materials = Mapping[str, Any]  # by name of a region or body: a material, or the materials of its regions
 
 
 @dataclass(frozen=True)
@@ -162,7 +166,7 @@ class EnergySet:
             values[k] |= self._bound[k].begin_step(self._step(step, k))
         target = (stage.target + damping * stage.velocity_reference) / (1.0 + damping)
         inertia = (mass / h**2 * (1.0 + damping[..., 0])).expand(batch, -1)
-        if self._coordinates.depends:  # their inertia is the last energy (`body_energies.place_energies`)
+        if self._coordinates.depends:  # their inertia is the last energy (`place_energies`)
             dependent = self._coordinates.dependent
             values[-1] |= {"inertia": inertia[:, dependent], "target": target[:, dependent]}
         return StepTerms(target, inertia, self._coordinates.reduce(force.expand(batch, -1, -1)), values)
@@ -265,3 +269,56 @@ class EnergySet:
                     f"Unknown memory {name!r} of the state. The energies of this body remember {names}; leave it out."
                 )
             self.memory[name].check(values, batch, like)
+
+
+def joined_names(materials: Material | Materials) -> dict[str, Material]:
+    """Returns materials of bodies and regions by joined names, as ``finger_tip``; a single one has an empty name."""
+    if isinstance(materials, Material):
+        return {"": materials}
+    return {
+        f"{name}_{region}" if region else name: value
+        for name, own in materials.items()
+        for region, value in joined_names(own).items()
+    }
+
+
+def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEnergy]:
+    """Returns the energies of all bodies: solids and their hysteresis, rigid parts, and the bodies' own energies.
+
+    Args:
+        whole: a body, or a `fem.scene.Scene`.
+        material: one for all bodies, or by region of the mesh, or by body of a scene.
+
+    Raises:
+        InputError: a body or a cell without material.
+    """
+    placed: list[PlacedEnergy] = []
+    for name, body, first in whole.members:
+        prefix = f"{name}_" if name else ""
+        solids = solids_of(body, _material_of(material, body, name))
+        energies: list[tuple[Energy, str]] = [(solid, f"{prefix}{region}") for solid, region in solids]
+        sliding = [(Hysteresis(solid), f"{prefix}{region}") for solid, region in solids if solid.material.hysteresis]
+        energies += sliding
+        for part in body.controls:
+            energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
+        items: list[tuple[Energy, Any, str]] = [(energy, energy.points(body.mesh), own) for energy, own in energies]
+        given = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
+        items += [(energy, points, prefix) for energy, points in given]
+        placed += [PlacedEnergy.of(whole, body, first, *item) for item in items]
+    if (contact := getattr(whole, "contact", None)) is not None:
+        placed.append(PlacedEnergy.of(whole, whole, 0, contact, contact.points(whole.mesh)))
+    if whole.coordinates:
+        placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), "dependent_"))
+    return placed
+
+
+def _material_of(material: Material | Materials, body: Body, name: str) -> Material | Materials:
+    """Returns the material of a body, none for a rigid one, or raises InputError."""
+    if not name or isinstance(material, Material):
+        return material
+    if name not in material:
+        if body.soft_cells is not None and not len(body.soft_cells):
+            return {}
+        raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
+    own: Material | Materials = material[name]
+    return own

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..energies.body_energies import Materials, PlacedEnergy, place_energies
+from ..energies.base import PlacedEnergy
 from ..energies.launcher import lasting
 from ..energies.materials import Material
 from ..fem.bodies import Body
@@ -21,7 +21,7 @@ from ..stepping.integrators import make_integrator
 from ..stepping.quantity import Quantity
 from ..stepping.state import Constants, State
 from .assembly import BlockPattern
-from .energy_set import EnergySet
+from .energy_set import EnergySet, Materials, place_energies
 from .nonlinear_solver import SolverSettings
 from .workspace import Workspace
 

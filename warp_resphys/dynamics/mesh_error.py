@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 import scipy.sparse
 
-from ..energies.body_energies import PlacedEnergy
+from ..energies.base import PlacedEnergy
 from ..energies.solid import Solid
 from ..energies.term import Values
 from ..fem.bodies import Body

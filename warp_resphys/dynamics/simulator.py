@@ -6,7 +6,6 @@ from typing import Any
 
 import torch
 
-from ..energies.body_energies import Materials, joined_names
 from ..energies.contact.barrier import ContactForces
 from ..energies.materials import Corotated, Material
 from ..fem.bodies import Body
@@ -15,6 +14,7 @@ from ..io.machine import find_device
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.rollout import rollout
 from ..stepping.state import Constants, State
+from .energy_set import Materials, joined_names
 from .equations import EquationsOfMotion, check_count
 from .linearisation import Linearisation
 from .mesh_error import CHECKED, warn_of_cells

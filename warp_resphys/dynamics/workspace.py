@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from ..energies.body_energies import PlacedEnergy
+from ..energies.base import PlacedEnergy
 from ..energies.launcher import BLOCK, lasting
 from ..energies.potential import IncrementalPotential
 from ..energies.solid import Solid

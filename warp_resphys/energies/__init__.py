@@ -1,6 +1,7 @@
 """Energies of a body: materials, actuators, contact and surroundings."""
 
 from ..stepping.quantity import Quantity as Quantity
+from ..stepping.quantity import parameter as parameter
 from .base import Energy as Energy
 from .catalogue import make_material as make_material
 from .catalogue import share_outside_law as share_outside_law
@@ -9,9 +10,9 @@ from .contact.obstacles import Capsule as Capsule
 from .contact.obstacles import DistanceGrid as DistanceGrid
 from .contact.obstacles import Sphere as Sphere
 from .contact.surface_contact import FrictionPair as FrictionPair
-from .materials import ConvexMaterial as ConvexMaterial
+from .convex_material import ConvexMaterial as ConvexMaterial
+from .convex_material import FibreFamily as FibreFamily
 from .materials import DensityMaterial as DensityMaterial
-from .materials import FibreFamily as FibreFamily
 from .materials import Gent as Gent
 from .materials import Material as Material
 from .materials import MooneyRivlin as MooneyRivlin

@@ -28,7 +28,7 @@ from ..io.errors import InputError
 from ..mesh.volume_mesh import Mesh
 from ..stepping.inputs import check_tensor
 from ..stepping.integrators import Integrator
-from ..stepping.quantity import Parameter, Quantity
+from ..stepping.quantity import Parameter, Quantity, quantities_of
 from ..stepping.state import ImplicitStage, Mass, State
 from .launcher import Launcher
 from .term import PointSet, Term, Values, value_of
@@ -117,8 +117,8 @@ class Energy(ABC):
 
     @property
     def parameters(self) -> tuple[Quantity, ...]:
-        """Parameters of the energy."""
-        return ()
+        """Parameters of the energy, by default those of its fields that are made by `stepping.quantity.parameter`."""
+        return tuple(quantities_of(self).values())
 
     @property
     def count(self) -> int:
@@ -138,7 +138,13 @@ class Energy(ABC):
     @property
     def constants(self) -> Mapping[str, Parameter]:
         """Default values of the parameters."""
-        return {}
+        return {quantity.name: getattr(self, name) for name, quantity in quantities_of(self).items()}
+
+    def __post_init__(self) -> None:
+        """Raises InputError for a parameter out of range."""
+        constants = self.constants
+        for quantity in self.parameters:
+            quantity.check(constants[quantity.name])
 
     @abstractmethod
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
@@ -254,3 +260,32 @@ class BoundEnergy:
         """
         del step, x, q
         return {}
+
+
+@dataclass(frozen=True)
+class PlacedEnergy:
+    """An energy, its points in the simulator, and the prefix of its names there, such as ``tip_``."""
+
+    energy: Energy
+    points: tuple[Points, ...]  # points with operators on control vertices (`fem.coordinates`)
+    prefix: str = ""
+    all_points: tuple[Points, ...] | None = None  # points with operators on all vertices; None if they are the same
+    body: Body | None = None  # body of the energy
+    first: int = 0  # index of that body's first vertex in the simulator
+
+    @classmethod
+    def of(
+        cls, whole: Body, body: Body, first: int, energy: Energy, points: Sequence[Points], prefix: str = ""
+    ) -> "PlacedEnergy":
+        """Places an energy of a body in a simulator.
+
+        Args:
+            whole: the simulator's body or scene.
+            body: the body.
+            first: index of its first vertex in the simulator.
+            energy: the energy.
+            points: points of the energy, with the body's own vertex numbers.
+            prefix: prefix of the energy's names.
+        """
+        shifted = tuple(own.shifted(first) for own in points)
+        return cls(energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first)

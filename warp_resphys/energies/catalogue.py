@@ -12,7 +12,8 @@ from ..io.classes import imported
 from ..io.errors import DataFileError, InputError, listed
 from ..io.safe_files import read_json
 from ..mesh.volume_mesh import Mesh
-from .materials import MASS_DAMPING, ConvexMaterial, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
+from .convex_material import ConvexMaterial
+from .materials import MASS_DAMPING, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 
 MATERIALS: Final[dict[str, type[Material]]] = {
     kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial)

@@ -4,9 +4,8 @@ The operator g_a of a point is the derivative of a shape function along a fibre,
 unit fibre and its length the stretch.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +16,7 @@ from ..io.errors import InputError, MeshError
 from ..kernels.axial import THREAD
 from ..mesh.chambers import Chamber, face_rule
 from ..mesh.volume_mesh import Mesh
-from ..stepping.quantity import Parameter, Quantity
+from ..stepping.quantity import Parameter, parameter
 from .base import Energy
 from .launcher import Launcher
 from .pointwise import ReadingTerm
@@ -37,14 +36,13 @@ class Fibres(Energy):
     is zero for x < 0, and its derivative, the force, reaches its full slope at the strain `toe`.
     """
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("fibre_stiffness", "N/m", 0.0, closed=True, per="chamber"),)
-
     chambers: Sequence[Chamber]  # chambers with fibres
     angles: Sequence[float] = (0.0,)  # (A,) angle of each family to the circumference [deg]; +a and -a: double helix
     toe: float = 1e-3  # strain at which a fibre reaches its full stiffness
     # fibres are wound around the principal direction of a chamber nearest to this axis; None: around its longest one
     axis: Sequence[float] | None = None
-    stiffness: Parameter = 0.0  # k [N/m], parameter ``fibre_stiffness``: a number, (C,), (B, 1) or (B, C) values
+    # k [N/m]: a number, (C,), (B, 1) or (B, C) values
+    stiffness: Parameter = parameter(0.0, "fibre_stiffness", "N/m", closed=True, per="chamber")
 
     @override
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Fibres":
@@ -67,17 +65,12 @@ class Fibres(Energy):
             )
         if not (np.isfinite(self.toe) and self.toe > 0.0):
             raise InputError(f"the strain over which fibres tighten is {self.toe:g}: it must be positive.")
-        self.parameters[0].check(self.stiffness)
+        super().__post_init__()
 
     @property
     @override
     def count(self) -> int:
         return len(self.chambers)
-
-    @property
-    @override
-    def constants(self) -> Mapping[str, Parameter]:
-        return {"fibre_stiffness": self.stiffness}
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:

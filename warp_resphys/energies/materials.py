@@ -1,4 +1,4 @@
-r"""Elastic materials, isotropic but for `ConvexMaterial` with families of fibres.
+r"""Elastic materials, isotropic but for `convex_material.ConvexMaterial` with families of fibres.
 
 =======================  ==================================================  ====================================
 material                 shape terms                                         volume term
@@ -19,8 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
-from numbers import Integral
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final
 
 import torch
 from typing_extensions import override
@@ -28,25 +27,16 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels.laws import Law
 from ..kernels.materials import corotated, gent, mooney_rivlin
-from ..kernels.materials.convex import ISOTROPIC, convex_law
 from ..kernels.materials.density import density_law
-from ..stepping.quantity import Parameter, Quantity
-
-
-def constant(default: float, name: str, unit: str, lower: float = 0.0, **more: Any) -> Any:
-    """Returns a dataclass field for a material constant; `common` ones, such as `density`, are keyword-only."""
-    common = more.pop("common", False)
-    quantity = Quantity(name, unit, lower, **{"per": "element", **more})
-    return field(default=default, kw_only=common, metadata={"quantity": quantity})
-
+from ..stepping.quantity import Parameter, Quantity, parameter, quantities_of
 
 MASS_DAMPING: Final = "mass_damping"
 # constants of viscosity, whose names end so if they are those of a region
 VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
 PRONY_RATIOS: Final = ("prony_ratio", "prony_modulus")  # likewise, of relaxation, and of the times with their numbers
 PRONY_TIME: Final = "prony_time"
-_PRONY_TIME = Quantity(PRONY_TIME, "s", 0.0)
-_YIELD_STRAIN = Quantity("hysteresis_strain", "", 0.0)
+PRONY_TIME_QUANTITY = Quantity(PRONY_TIME, "s", 0.0)
+YIELD_STRAIN = Quantity("hysteresis_strain", "", 0.0)
 _ITEMS: Final = {"prony": "branch", "hysteresis": "slider", "fibres": "family"}  # of groups
 
 
@@ -67,15 +57,15 @@ class Material(ABC):
     curvature: ClassVar[tuple[float, ...]]
     # constants of each item of a field that is a sequence, such as a branch or a family of fibres, by the field
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
-        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), _PRONY_TIME),
-        "hysteresis": (Quantity("hysteresis_ratio", "", 0.0, closed=True), _YIELD_STRAIN),
+        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), PRONY_TIME_QUANTITY),
+        "hysteresis": (Quantity("hysteresis_ratio", "", 0.0, closed=True), YIELD_STRAIN),
     }
 
-    density: Parameter = constant(1070.0, "density", "kg/m^3", common=True)  # rho [kg/m^3]
+    density: Parameter = parameter(1070.0, "density", "kg/m^3", per="element", kw_only=True)  # rho [kg/m^3]
     # alpha [1/s] of the force -alpha M v
-    mass_damping: Parameter = constant(0.0, MASS_DAMPING, "1/s", closed=True, per="", common=True)
+    mass_damping: Parameter = parameter(0.0, MASS_DAMPING, "1/s", closed=True, kw_only=True)
     # Kelvin-Voigt retardation time beta [s]; at small strains the force -beta K v
-    stiffness_damping: Parameter = constant(0.0, "stiffness_damping", "s", closed=True, per="", common=True)
+    stiffness_damping: Parameter = parameter(0.0, "stiffness_damping", "s", closed=True, kw_only=True)
     # generalised Maxwell (Prony) branches: ratio of the shear modulus to the long-term modulus mu, and relaxation time
     # [s] (`energies.viscosity`)
     prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
@@ -97,8 +87,9 @@ class Material(ABC):
     @classmethod
     def own_quantities(cls) -> dict[str, Quantity]:
         """Returns the constants by name without those of groups, those of the law first."""
-        own = sorted((f for f in fields(cls) if f.metadata), key=lambda f: bool(f.kw_only))
-        return {f.name: f.metadata["quantity"] for f in own}
+        known = quantities_of(cls)
+        law = {f.name: replace(known[f.name], per="element") for f in fields(cls) if f.name in known and not f.kw_only}
+        return {**law, **{name: quantity for name, quantity in known.items() if name not in law}}
 
     @property
     def numbered(self) -> dict[str, tuple[Quantity, Parameter]]:
@@ -173,8 +164,8 @@ class _Hookean(Material):
     rules: ClassVar[tuple[str, ...]] = ("shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (2.0, 1.0)
 
-    youngs_modulus: Parameter = constant(264e3, "youngs_modulus", "Pa")  # E [Pa]
-    poissons_ratio: Parameter = constant(0.499, "poissons_ratio", "", lower=-1.0, upper=0.5)  # nu, between -1 and 0.5
+    youngs_modulus: Parameter = parameter(264e3, "youngs_modulus", "Pa")  # E [Pa]
+    poissons_ratio: Parameter = parameter(0.499, "poissons_ratio", "", lower=-1.0, upper=0.5)  # nu, between -1 and 0.5
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -219,9 +210,9 @@ class MooneyRivlin(Material):
     rules: ClassVar[tuple[str, ...]] = ("shape", "shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
 
-    c10: Parameter = constant(36e3, "c10", "Pa")  # coefficient of the first invariant [Pa]
-    c01: Parameter = constant(8e3, "c01", "Pa", closed=True)  # coefficient of the second invariant [Pa]
-    bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")  # [Pa]
+    c10: Parameter = parameter(36e3, "c10", "Pa")  # coefficient of the first invariant [Pa]
+    c01: Parameter = parameter(8e3, "c01", "Pa", closed=True)  # coefficient of the second invariant [Pa]
+    bulk_modulus: Parameter = parameter(44e6, "bulk_modulus", "Pa")  # [Pa]
 
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -280,146 +271,12 @@ class Gent(DensityMaterial):
     energy_density: ClassVar[Any] = gent.energy_density
     volume_energy: ClassVar[Any] = gent.volume_energy
 
-    shear_modulus: Parameter = constant(90e3, "shear_modulus", "Pa")  # mu [Pa]
-    limit: Parameter = constant(30.0, "limit", "")  # J_m, limit of I1 - 3
-    bulk_modulus: Parameter = constant(44e6, "bulk_modulus", "Pa")  # K [Pa]
+    shear_modulus: Parameter = parameter(90e3, "shear_modulus", "Pa")  # mu [Pa]
+    limit: Parameter = parameter(30.0, "limit", "")  # J_m, limit of I1 - 3
+    bulk_modulus: Parameter = parameter(44e6, "bulk_modulus", "Pa")  # K [Pa]
 
     @override
     def lame(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns mu and K - 2/3 mu."""
         mu = constants["shear_modulus"]
         return mu, constants["bulk_modulus"] - 2.0 / 3.0 * mu
-
-
-def _modulus(name: str) -> Quantity:
-    return Quantity(name, "Pa", 0.0, closed=True, per="element")
-
-
-class FibreFamily(NamedTuple):
-    """Fibres along e = (cos beta cos alpha, cos beta sin alpha, sin beta) at rest, of stretch l = |F e|, q = l^2 - 1.
-
-    Numbers, or a value for each element of a curved body. The axes are those of the mesh.
-
-    Args:
-        azimuth: alpha [rad].
-        elevation: beta [rad].
-        slack: strain up to which a fibre is wavy; it pulls beyond the stretch 1 + slack.
-        toe: strain beyond the slack over which the fibre tightens.
-        tension: coefficient [Pa] of (l - 1 - slack)^2 / 2.
-        stiffening: coefficient [Pa] of q^3 where q > 0.
-        compression: coefficient [Pa] of q^2 where q < 0; not convex.
-    """
-
-    azimuth: Parameter = 0.0
-    elevation: Parameter = 0.0
-    slack: Parameter = 0.0
-    toe: Parameter = 0.02
-    tension: Parameter = 0.0
-    stiffening: Parameter = 0.0
-    compression: Parameter = 0.0
-
-
-@dataclass(frozen=True)
-class ConvexMaterial(Material):
-    """Rubber of terms with non-negative coefficients: powers of invariants, Ogden's terms, and families of fibres.
-
-    With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993), with `ogden` alone
-    that of Ogden (1972). Viscosities, branches and sliders have moduli of their own, independent of the elastic
-    coefficients, so that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities, branches
-    and sliders are functions of the strain of Green, and outside of that argument. Coefficients are zero by default,
-    but for `bulk_1`.
-
-    Attributes:
-        c10, c20, c30: coefficients [Pa] of a, a^2 and a^3, with a of `kernels.materials.convex`, near I1 - 3.
-        c01, c02: coefficients [Pa] of b and b^2, near I2 - 3.
-        dilation: coefficient [Pa] of (J - 1)^2 at the points where shape is integrated.
-        bulk_1, bulk_2: coefficients [Pa] of (J - 1)^2 and (J - 1)^4 at the volume points.
-        shear_viscosity, bulk_viscosity: eta and zeta [Pa s] of the stress 2 eta E' + zeta tr(E') I, with the rate E' of
-            Green's strain; the pressure in a pure change of volume is (zeta + 2 eta / 3) tr(E').
-        ogden: shear moduli [Pa] of Ogden's terms at small strains, by exponent, a whole number.
-        fibres: families of fibres, see `FibreFamily`.
-        prony: moduli [Pa] and relaxation times [s] of branches.
-        hysteresis: moduli [Pa] and yield strains of sliders.
-    """
-
-    model = "law"
-    groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
-        "prony": (Quantity("prony_modulus", "Pa", 0.0, closed=True), _PRONY_TIME),
-        "hysteresis": (Quantity("hysteresis_modulus", "Pa", 0.0, closed=True), _YIELD_STRAIN),
-        "fibres": (
-            Quantity("fibre_azimuth", "rad", per="element"),
-            Quantity("fibre_elevation", "rad", per="element"),
-            Quantity("fibre_slack", "", 0.0, closed=True, per="element"),
-            Quantity("fibre_toe", "", 0.0, per="element"),
-            *map(_modulus, ("fibre_tension", "fibre_stiffening", "fibre_compression")),
-        ),
-    }
-
-    c10: Parameter = constant(0.0, "c10", "Pa", closed=True)
-    c20: Parameter = constant(0.0, "c20", "Pa", closed=True)
-    c30: Parameter = constant(0.0, "c30", "Pa", closed=True)
-    c01: Parameter = constant(0.0, "c01", "Pa", closed=True)
-    c02: Parameter = constant(0.0, "c02", "Pa", closed=True)
-    dilation: Parameter = constant(0.0, "dilation", "Pa", closed=True)
-    bulk_1: Parameter = constant(22e6, "bulk_1", "Pa", closed=True)
-    bulk_2: Parameter = constant(0.0, "bulk_2", "Pa", closed=True)
-    shear_viscosity: Parameter = constant(0.0, "shear_viscosity", "Pa s", closed=True, per="", common=True)
-    bulk_viscosity: Parameter = constant(0.0, "bulk_viscosity", "Pa s", closed=True, per="", common=True)
-    ogden: Mapping[int, Parameter] = field(default_factory=dict, kw_only=True)
-    fibres: Sequence[FibreFamily] = field(default=(), kw_only=True)
-    stiffness_damping: Parameter = field(default=0.0, init=False, repr=False)  # replaced by the viscosities
-
-    def __post_init__(self) -> None:
-        """Builds the law.
-
-        Raises:
-            InputError: a coefficient is negative or not finite, or an exponent is not a whole number of at least 3
-                in size.
-        """
-        wrong = [n for n in self.ogden if not isinstance(n, Integral) or -3 < n < 3]
-        if wrong:
-            raise InputError(f"ogden has the exponent {wrong[0]}: give whole numbers from 3 up or from -3 down.")
-        terms, families = len(self.ogden), len(self.fibres)
-        law = {
-            "law": convex_law(tuple(self.ogden), families),
-            "rules": (*("shape",) * 6, "volume", "volume", "shape", "volume", *("shape",) * terms)
-            + (*("mean",) * 5, *("shape",) * 3) * families,
-            "curvature": (4.0, 0.0, 0.0, 4.0, 0.0, 2.0, 2.0, 0.0, 0.0, 0.0, *(2.0,) * terms)
-            + (*(0.0,) * 5, 1.0, 0.0, 8.0) * families,
-        }
-        for name, value in law.items():
-            object.__setattr__(self, name, value)
-        super().__post_init__()
-
-    @property
-    @override
-    def numbered(self) -> dict[str, tuple[Quantity, Parameter]]:
-        """As of every material, and ``ogden_3``, ``ogden_m3`` for the exponent -3, ..."""
-        ogden = {name: (_modulus(name), self.ogden[n]) for n, name in self._ogden.items()}
-        return {**super().numbered, **ogden}
-
-    @property
-    def _ogden(self) -> dict[int, str]:
-        return {n: f"ogden_{n}".replace("-", "m") for n in self.ogden}
-
-    @override
-    @classmethod
-    def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
-        found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in constants}
-        ogden = {int(m[2]) * (-1 if m[1] else 1): constants[name] for name, m in found.items() if m}
-        return cls(**cls._arguments({name: value for name, value in constants.items() if not found[name]}), ogden=ogden)
-
-    @override
-    def viscosity(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        return constants["shear_viscosity"], constants["bulk_viscosity"]
-
-    @override
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns the coefficients, units of viscosity, Ogden's terms, and direction and constants of each family."""
-        moduli = [constants[name] for name in list(self.own_quantities())[:ISOTROPIC]]
-        moduli += [torch.ones_like(moduli[0])] * 2
-        moduli += [constants[name] for name in self._ogden.values()]
-        for azimuth, elevation, *own in self.group("fibres", constants):
-            level = elevation.cos()
-            moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *own]
-        return tuple(moduli)

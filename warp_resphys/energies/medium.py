@@ -10,9 +10,9 @@ of the layer of medium that moves with the surface [m]. The force acts at the en
 normals of its start, so that it derives from a convex potential and drag is dissipative.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from ..io.errors import InputError
 from ..kernels import fluid_drag as kernels
 from ..mesh.elements import FACES
 from ..mesh.volume_mesh import Mesh, boundary_faces
-from ..stepping.quantity import Parameter, Quantity
+from ..stepping.quantity import Parameter, parameter
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep
 from .launcher import Launcher
 from .term import Adjoint, PointSet, Term
@@ -50,32 +50,14 @@ class Medium(Energy):
         InputError: a value out of range, or faces that do not belong to the surface.
     """
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("medium_density", "kg/m^3", 0.0, closed=True),
-        Quantity("drag_linear", "N s/m^3", 0.0, closed=True),
-        Quantity("drag_normal", "", 0.0, closed=True),
-        Quantity("drag_tangential", "", 0.0, closed=True),
-        Quantity("added_layer", "m", 0.0, closed=True),
-    )
-
-    density: Parameter  # rho [kg/m^3]: like all parameters, a number or (B, 1) values
-    linear: Parameter = 0.0  # c [N s/m^3]
-    normal: Parameter = 0.0  # C_n
-    tangential: Parameter = 0.0  # C_t
-    layer: Parameter = 0.0  # l [m]
+    # rho, c, C_n, C_t and l: numbers or (B, 1) values
+    density: Parameter = parameter(MISSING, "medium_density", "kg/m^3", closed=True)
+    linear: Parameter = parameter(0.0, "drag_linear", "N s/m^3", closed=True)
+    normal: Parameter = parameter(0.0, "drag_normal", "", closed=True)
+    tangential: Parameter = parameter(0.0, "drag_tangential", "", closed=True)
+    layer: Parameter = parameter(0.0, "added_layer", "m", closed=True)
     buoyancy: bool = True  # whether buoyancy acts
     faces: NDArray[np.int64] | None = None  # (F, n) faces, among `boundary_faces`, that the medium acts on; None: all
-
-    def __post_init__(self) -> None:
-        """Checks the values."""
-        for quantity, value in zip(self.parameters, self.constants.values(), strict=True):
-            quantity.check(value)
-
-    @property
-    @override
-    def constants(self) -> Mapping[str, Parameter]:
-        values = (self.density, self.linear, self.normal, self.tangential, self.layer)
-        return dict(zip((quantity.name for quantity in self.parameters), values, strict=True))
 
     @override
     def points(self, mesh: Mesh) -> tuple[FacePoints, ...]:

@@ -10,7 +10,7 @@ chamber whose walls are not modelled. Without inputs the fibres are a reinforcem
 (Spencer, Continuum Theory of the Mechanics of Fibre-Reinforced Composites, 1984), but not in compression.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -23,7 +23,7 @@ from ..fem.integration_points import physical_gradients
 from ..io.errors import InputError
 from ..kernels.axial import MUSCLE
 from ..mesh.volume_mesh import Mesh
-from ..stepping.quantity import Parameter, Quantity
+from ..stepping.quantity import Parameter, Quantity, parameter
 from .base import Energy
 from .launcher import Launcher
 from .pointwise import ReadingTerm
@@ -64,12 +64,12 @@ class Muscles(Energy):
             negative stiffness.
     """
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("muscle_stiffness", "Pa", 0.0, closed=True, per="muscle"),)
     inputs: ClassVar[tuple[Quantity, ...]] = (STRESS, CONTRACTION)
     is_load: ClassVar[bool] = True
 
     muscles: Sequence[Muscle]
-    stiffness: Parameter = 0.0  # k [Pa], parameter ``muscle_stiffness``: a number, (A,), (B, 1) or (B, A) values
+    # k [Pa]: a number, (A,), (B, 1) or (B, A) values
+    stiffness: Parameter = parameter(0.0, "muscle_stiffness", "Pa", closed=True, per="muscle")
     toe: float = 1e-3  # strain at which a fibre reaches its full stiffness
 
     @override
@@ -98,7 +98,7 @@ class Muscles(Energy):
                 raise InputError(f"the muscle '{name}' has a direction that is zero or not finite.")
         if not (np.isfinite(self.toe) and self.toe > 0.0):
             raise InputError(f"the strain over which muscle fibres tighten is {self.toe:g}: it must be positive.")
-        self.parameters[0].check(self.stiffness)
+        super().__post_init__()
 
     @property
     @override
@@ -109,11 +109,6 @@ class Muscles(Energy):
     @override
     def names(self) -> tuple[str, ...]:
         return tuple(muscle.name or f"muscle_{number}" for number, muscle in enumerate(self.muscles, 1))
-
-    @property
-    @override
-    def constants(self) -> Mapping[str, Parameter]:
-        return {"muscle_stiffness": self.stiffness}
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:

@@ -3,7 +3,8 @@
 For example::
 
     class Spring(PointwiseEnergy):                       # k/2 (|x| - L)^2 between two vertices
-        parameters = (Quantity("spring_stiffness", "N/m", 0.0), Quantity("spring_length", "m", 0.0))
+        stiffness: float = parameter(20.0, "spring_stiffness", "N/m")
+        length: float = parameter(0.1, "spring_length", "m")
         density = spring                                 # a Warp function of x (vec3d) and the values (vec2d)
         ...
         def points(self, mesh):
@@ -30,7 +31,6 @@ from ..kernels.energy_functions import derived_law
 from ..kernels.laws import Law, point_kernels
 from ..kernels.points import PartValues
 from ..mesh.volume_mesh import Mesh
-from ..stepping.quantity import Parameter
 from .base import Energy
 from .launcher import Launcher, struct_of
 from .term import PartPoints, PartTerm, PointSet, Slope
@@ -112,8 +112,6 @@ class ReadingTerm(PartTerm):
 class PointwiseEnergy(Energy):
     """The sum over points of a weight times a function of the point's kinematic variable and values.
 
-    The default value of a parameter is the attribute of its name.
-
     Attributes:
         density: the Warp function e(f, v) [J over the unit of the weight], of a ``wp.vec3d`` or a ``wp.mat33d`` and a
             vector of float64.
@@ -127,11 +125,6 @@ class PointwiseEnergy(Energy):
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:
         """Returns a tuple with one set of points, from `at_vertices`, `between` or `in_cells` for example."""
-
-    @property
-    @override
-    def constants(self) -> Mapping[str, Parameter]:
-        return {quantity.name: getattr(self, quantity.name) for quantity in self.parameters}
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PointwiseTerm":

@@ -20,7 +20,7 @@ from ..fem.coordinates import Coordinates, DeviceCoordinates
 from ..io.errors import InputError
 from ..kernels import points as kernels
 from ..kernels import reductions
-from .body_energies import PlacedEnergy
+from .base import PlacedEnergy
 from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
 from .term import PairTangents, PointSet, Term, Values
 

@@ -11,8 +11,8 @@ that of a rigid body.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import MISSING, dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -26,7 +26,7 @@ from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.integration_points import Points, SolidPoints, volume_points
 from ..kernels import vertex_rotations as kernels
 from ..mesh.volume_mesh import Mesh
-from ..stepping.quantity import Parameter, Quantity
+from ..stepping.quantity import Parameter, parameter
 from ..stepping.state import Mass
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep
 from .launcher import Launcher
@@ -73,15 +73,8 @@ class BoundInertia(BoundEnergy):
 class RigidInertia(PointInertia):
     """Inertia and weight of a rigid part, with the parameter ``density`` [kg/m^3]."""
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (Quantity("density", "kg/m^3", 0.0),)
-
     cells: NDArray[np.int64]  # (m,)
-    density: Parameter
-
-    @property
-    @override
-    def constants(self) -> Mapping[str, Parameter]:
-        return {"density": self.density}
+    density: Parameter = parameter(MISSING, "density", "kg/m^3")
 
     @override
     def bind(self, site: EnergySite) -> "BoundRigidInertia":

@@ -16,8 +16,8 @@ perfectly inelastic impact.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import MISSING, dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -28,7 +28,7 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels.axial import STRING
 from ..mesh.volume_mesh import Mesh
-from ..stepping.quantity import Parameter, Quantity
+from ..stepping.quantity import Parameter, Quantity, parameter
 from ..stepping.state import ImplicitStage, State
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher
@@ -56,15 +56,13 @@ class Strings(Energy):
         InputError: no string, a string without vertices, or a length or compliance out of range.
     """
 
-    parameters: ClassVar[tuple[Quantity, ...]] = (
-        Quantity("string_length", "m", 0.0, per="string"),
-        Quantity("string_compliance", "m/N", 0.0, closed=True, per="string"),
-    )
     inputs: ClassVar[tuple[Quantity, ...]] = (PAYLOAD,)
 
     tied_to: Sequence[NDArray[np.int64]]  # vertices of each string, which is tied to their mean
-    length: Parameter  # L [m]: a number, (S,), (B, 1) or (B, S) values
-    compliance: Parameter = 0.0  # c [m/N], likewise
+    # L [m]: a number, (S,), (B, 1) or (B, S) values
+    length: Parameter = parameter(MISSING, "string_length", "m", per="string")
+    # c [m/N], likewise
+    compliance: Parameter = parameter(0.0, "string_compliance", "m/N", closed=True, per="string")
     toe: float = 1e-5  # elongation at which a string reaches its full stiffness [m]
 
     def __post_init__(self) -> None:
@@ -76,18 +74,12 @@ class Strings(Energy):
                 raise InputError(f"string {number} is tied to no vertex: give it one or more.")
         if not (np.isfinite(self.toe) and self.toe > 0.0):
             raise InputError(f"the toe of strings is {self.toe:g}: it must be positive, in m.")
-        for quantity, value in zip(self.parameters, (self.length, self.compliance), strict=True):
-            quantity.check(value)
+        super().__post_init__()
 
     @property
     @override
     def count(self) -> int:
         return len(self.tied_to)
-
-    @property
-    @override
-    def constants(self) -> Mapping[str, Parameter]:
-        return {"string_length": self.length, "string_compliance": self.compliance}
 
     @override
     def points(self, mesh: Mesh) -> tuple[PartPoints, ...]:

@@ -18,7 +18,8 @@ from ..dynamics.plausibility import mean_of, small_strain_stiffness
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.catalogue import read_law
-from ..energies.materials import ConvexMaterial, Material
+from ..energies.convex_material import ConvexMaterial
+from ..energies.materials import Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.bodies import Body
 from ..io.errors import InputError, naming

@@ -1,9 +1,9 @@
 """Search for the law of a material: the smallest class of convex terms that explains held-out motions.
 
-The terms are those of `energies.materials.ConvexMaterial`. Their forces are linear in their coefficients, so that the
-balance of forces of observed motions gives these. With the positions of all vertices at every step, the residual of a
-step (`Simulator.linearise`) at the observed solution is g_0 + sum_k theta_k a_k, where a_k is the force of coefficient
-k alone. The coefficients are the non-negative least-squares solution of
+The terms are those of `energies.convex_material.ConvexMaterial`. Their forces are linear in their coefficients, so that
+the balance of forces of observed motions gives these. With the positions of all vertices at every step, the residual of
+a step (`Simulator.linearise`) at the observed solution is g_0 + sum_k theta_k a_k, where a_k is the force of
+coefficient k alone. The coefficients are the non-negative least-squares solution of
 
     min sum || H^-1 (g_0 + sum_k theta_k a_k) ||^2
 

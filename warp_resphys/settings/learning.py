@@ -120,7 +120,7 @@ class IdentifySettings(IdentifiedSettings):
 
 
 class LawSettings(Settings):
-    """Identification of the material's law as a sum of convex terms, by `energies.materials.ConvexMaterial`.
+    """Identification of the material's law as a sum of convex terms, by `energies.convex_material.ConvexMaterial`.
 
     A path in place of the group, law=FILE, takes the law that another run has written in law.json.
     """

@@ -1,7 +1,7 @@
 """Parameters and inputs of a simulation: names, units and valid ranges."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -91,3 +91,23 @@ class Quantity:
         if not self.per:
             return values.reshape(-1, 1)
         return values.reshape(1, -1) if values.ndim < 2 else values
+
+
+def parameter(default: Any, name: str, unit: str, lower: float = 0.0, *, kw_only: bool = False, **more: Any) -> Any:
+    """Returns a field of a dataclass that holds the value of a parameter.
+
+    Args:
+        default: value of an omitted argument; ``dataclasses.MISSING`` without one.
+        name: of the `Quantity`, like the following.
+        unit: unit of the values.
+        lower: exclusive lower bound, inclusive with ``closed=True``; ``-numpy.inf`` for any number.
+        kw_only: whether the argument is keyword-only.
+        more: other fields of the quantity.
+    """
+    return field(default=default, kw_only=kw_only, metadata={"quantity": Quantity(name, unit, lower, **more)})
+
+
+def quantities_of(kind: Any) -> dict[str, Quantity]:
+    """Returns the quantities of a class's fields that are made by `parameter`, by field."""
+    known = getattr(kind, "__dataclass_fields__", {})
+    return {name: item.metadata["quantity"] for name, item in known.items() if "quantity" in item.metadata}

@@ -6,7 +6,7 @@ with the magnetisation M [A/m] along d at rest, and the field B [T], the input, 
 tests/test_magnet.py compares the deflection of a beam with beam theory, and gradients with differences.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import MISSING, dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from warp_resphys.energies.pointwise import PointwiseEnergy, in_cells
 from warp_resphys.io.settings import Positive
 from warp_resphys.mesh.selection import select_cells
 from warp_resphys.settings.mesh import BoxSettings, Direction
-from warp_resphys.stepping.quantity import Quantity
+from warp_resphys.stepping.quantity import Quantity, parameter
 
 FIELD = Quantity(
     "magnetic_field", "T", per="coil", typical=0.02, words="field", shown_unit="mT", shown_factor=1e3
@@ -34,15 +34,12 @@ def magnetic_energy(x: wp.vec3d, p: vec5) -> wp.float64:
 class Magnet(PointwiseEnergy):
     """Magnetised cells in the field of a coil."""
 
-    parameters: ClassVar = (
-        Quantity("magnetisation", "A/m", 0.0, closed=True),
-        Quantity("field_direction", "", shape=(3,)),
-    )
     inputs: ClassVar = (FIELD,)
     density: ClassVar = magnetic_energy
-    magnetisation: Positive  # M [A/m]
+    magnetisation: Positive = parameter(MISSING, "magnetisation", "A/m", closed=True)  # M
     along: Direction = (1.0, 0.0, 0.0)  # d, at rest; it is scaled to length one
-    field_direction: Direction = (0.0, 0.0, 1.0)  # b, in the world; it is scaled to length one
+    # b, in the world; it is scaled to length one
+    field_direction: Direction = parameter((0.0, 0.0, 1.0), "field_direction", "", -np.inf, shape=(3,))
     within: BoxSettings | None = None  # the cells that are magnetised; None: all
 
     def __post_init__(self):
@@ -50,6 +47,7 @@ class Magnet(PointwiseEnergy):
         for name in ("along", "field_direction"):
             direction = np.array(getattr(self, name))
             object.__setattr__(self, name, tuple(direction / np.linalg.norm(direction)))
+        super().__post_init__()
 
     def points(self, mesh):
         """Returns the quadrature points of the cells, with F d as the variable of the energy."""

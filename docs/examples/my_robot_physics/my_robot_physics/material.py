@@ -8,13 +8,12 @@ is constant. mu' follows from the shear modulus mu at rest. tests/test_material.
 uniaxial tension, and its gradients with differences.
 """
 
-# ruff: noqa: RUF009
 from dataclasses import dataclass
 
 import warp as wp
 
-from warp_resphys.energies.materials import DensityMaterial, constant
-from warp_resphys.stepping.quantity import Parameter
+from warp_resphys.energies.materials import DensityMaterial
+from warp_resphys.stepping.quantity import Parameter, parameter
 
 # Written in a function, quotients would be computed in single precision.
 C1, C2, C3, C4, C5 = (wp.constant(wp.float64(c)) for c in (1 / 2, 1 / 20, 11 / 1050, 19 / 7000, 519 / 673750))
@@ -55,9 +54,9 @@ class ArrudaBoyce(DensityMaterial):
     energy_density = shape_energy
     volume_energy = volume_energy
 
-    shear_modulus: Parameter = constant(60e3, "shear_modulus", "Pa")  # mu [Pa]
-    locking_stretch: Parameter = constant(2.0, "locking_stretch", "", lower=1.0)  # L
-    bulk_modulus: Parameter = constant(1e6, "bulk_modulus", "Pa")  # K [Pa]
+    shear_modulus: Parameter = parameter(60e3, "shear_modulus", "Pa")  # mu [Pa]
+    locking_stretch: Parameter = parameter(2.0, "locking_stretch", "", lower=1.0)  # L
+    bulk_modulus: Parameter = parameter(1e6, "bulk_modulus", "Pa")  # K [Pa]
 
     def lame(self, constants):
         """Returns mu and lambda at small strains [Pa]."""

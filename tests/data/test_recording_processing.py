@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.recordings.marker_quality import (
-    check_base,
     compare_base,
     find_jumps,
     find_swaps,
@@ -203,21 +202,21 @@ def test_quality_of_a_recording():
 def test_base_markers_that_were_moved():
     first, moved, bumped = swinging(), swinging(shift=0.005), swinging()
     bumped.positions[:, 3] += [0.0, 2e-3, 0.0]
-    check_base([first, moved], BASE)
-    np.testing.assert_allclose(compare_base([first, moved], BASE)[0].shift, 0.005 * np.sqrt(3.0), atol=1e-5)
-    np.testing.assert_allclose(compare_base([first, moved], BASE)[0].distortion, 0.0, atol=1e-5)
+    shift, distortion = compare_base([first, moved], BASE, 1e-3)
+    np.testing.assert_allclose(shift, [[0.005 * np.sqrt(3.0)] * 3], atol=1e-5)
+    np.testing.assert_allclose(distortion, [[0.0] * 3], atol=1e-5)
     with pytest.raises(DataFileError, match=r"base 1 stands 8\.66 mm from its place"):
-        check_base([first, moved], BASE, largest_shift=1e-3)
+        compare_base([first, moved], BASE, largest_shift=1e-3)
     with pytest.raises(
         DataFileError, match=r"swing\.c3d: base marker base 2 moved by 2\.00 mm against the other .*, check the unit,"
     ):
-        check_base([first, moved, bumped], BASE)
-    check_base([first, bumped], BASE, largest_distortion=5e-3)
+        compare_base([first, moved, bumped], BASE, 1e-3)
+    compare_base([first, bumped], BASE, 5e-3)
     with pytest.raises(InputError, match="two or more"):
-        check_base([first, moved], BASE[:1])
+        compare_base([first, moved], BASE[:1])
     bumped.positions[:, 3] = np.nan
     with pytest.raises(DataFileError, match="'base 2' is never seen"):
-        check_base([first, bumped], BASE)
+        compare_base([first, bumped], BASE)
 
 
 @pytest.mark.parametrize("release", [60.0, 60.5])

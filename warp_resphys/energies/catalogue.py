@@ -1,6 +1,7 @@
 """Materials by name, and files of identified laws: those of runs, and of silicones that come with the package."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -67,6 +68,12 @@ def law_path(name: str) -> Path:
     if name not in known:
         raise DataFileError(f"there is no law {name}: give the law.json of a run, or one of {listed(sorted(known))}.")
     return known[name]
+
+
+def law_content(model: str, constants: Mapping[str, float]) -> dict[str, Any]:
+    """Returns the content of a law's file, see `read_law`."""
+    units = {name: unit_of(name) for name in constants}
+    return {"format": LAW_FORMAT, "model": model, "constants": dict(constants), "units": units}
 
 
 def read_law(name: str) -> dict[str, Any]:

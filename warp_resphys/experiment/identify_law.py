@@ -18,7 +18,7 @@ import numpy as np
 
 from ..data.rigid_bodies import independent
 from ..dynamics.simulator import Simulator
-from ..energies.catalogue import LAW_FORMAT, read_law, unit_of
+from ..energies.catalogue import law_content, read_law
 from ..io.progress import Progress
 from ..io.resuming import StageContext, package_versions
 from ..io.safe_files import write_json
@@ -98,16 +98,12 @@ class _LawSearch(LawTrials):
             again = self._refine(best.law, whole=True)
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
         mass = {name: best.others.get(name, value) for name, value in self.mass.items()}
-        constants = mass | best.law.constants
         below, deviation = self.score_below(), _deviation(best.found)
         tried = [{**asdict(own), "validation": score} for own, score in zip(classes, scores, strict=True)]
         return {
-            "format": LAW_FORMAT,
-            "model": LAW,
+            **law_content(LAW, mass | best.law.constants),
             "accepted": best.score.beats(below),
             "groups": list(best.law.groups),
-            "constants": constants,
-            "units": {name: unit_of(name) for name in constants},
             "parameters": best.others,
             "deviation": {n: deviation[old] for n, old in best.names.items() if old in deviation},
             "at_bounds": [name for name, old in best.names.items() if old in best.found["at_bounds"]],

@@ -19,7 +19,6 @@ from ..data.recordings.marker_quality import (
     QUALITY_COLUMNS,
     MarkerQuality,
     Quality,
-    check_base,
     compare_base,
     quality,
     quality_table,
@@ -142,21 +141,22 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
     trials = [recording, *(read_recording(path, *configured) for path in settings.compare_with)]
-    motions = compare_base(trials, still) if len(trials) > 1 else []
+    moved = zip(trials[1:], *compare_base(trials, still), strict=True) if len(trials) > 1 else ()
+    motions = [(trial.source, _MILLI * shift, _MILLI * distortion) for trial, shift, distortion in moved]
     figure = recording_quality(recording, result)
     base = [
         {
-            "source": motion.source,
-            "shift_mm": dict(zip(still, _MILLI * motion.shift, strict=True)),
-            "distortion_mm": dict(zip(still, _MILLI * motion.distortion, strict=True)),
+            "source": source,
+            "shift_mm": dict(zip(still, shift, strict=True)),
+            "distortion_mm": dict(zip(still, distortion, strict=True)),
         }
-        for motion in motions
+        for source, shift, distortion in motions
     ]
     write_json(folder / "quality.json", {**asdict(result), "base": base})
     with atomic_path(folder / "quality.png") as partial:
         save_png(figure, partial)
     if len(trials) > 1:
-        check_base(trials, still, largest_distortion=settings.largest_distortion)
+        compare_base(trials, still, settings.largest_distortion)
     table = quality_table(asdict(result)["markers"])
     heads = ["marker", *(column.lower() for column in QUALITY_COLUMNS)]
     lines = [aligned([heads, *([label, *cells] for label, cells in table.items())])]
@@ -166,11 +166,11 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
         held = release.rest
         lines.append(f"Released in frame {release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
     lines += result.warnings
-    for motion in motions:
-        lines.append(
-            f"{motion.source}: the base is shifted by up to {_MILLI * motion.shift.max():.2f} mm; its markers moved by "
-            f"up to {_MILLI * motion.distortion.max():.2f} mm relative to each other."
-        )
+    lines += [
+        f"{source}: the base is shifted by up to {shift.max():.2f} mm; its markers moved by up to "
+        f"{distortion.max():.2f} mm relative to each other."
+        for source, shift, distortion in motions
+    ]
     return "\n".join(lines)
 
 

@@ -225,76 +225,57 @@ def find_swaps(recording: Recording, jumps: Mapping[str, Sequence[Jump]]) -> lis
     return swaps
 
 
-@dataclasses.dataclass(frozen=True)
-class BaseMotion:
-    """Displacement of the base markers of a recording relative to the first recording."""
+def compare_base(
+    recordings: Sequence[Recording],
+    labels: Sequence[str],
+    largest_distortion: float = np.inf,
+    largest_shift: float | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Compares the median positions of markers on a rigid base with those in the first of R recordings.
 
-    source: Path
-    shift: FloatArray  # (M,) [m] distances of the markers from their places in the first recording
-    distortion: FloatArray  # (M,) [m] median change of a marker's distances to the other ones
-    largest: float  # [m] largest change of a distance between two markers
-
-
-def compare_base(recordings: Sequence[Recording], labels: Sequence[str]) -> list[BaseMotion]:
-    """Compares the median positions of two or more markers on a rigid base in several recordings.
+    Args:
+        recordings: of one set-up.
+        labels: M markers, two or more.
+        largest_distortion: largest change of the distance between two markers [m].
+        largest_shift: largest distance of a marker from its place in the first recording [m]; anywhere if None, for
+            recordings that are registered separately.
 
     Returns:
-        One entry for every recording after the first.
+        Distances (R - 1, M) of the markers from their places in the first recording, and median changes of a marker's
+        distances to the other ones [m].
 
     Raises:
-        DataFileError: A marker is missing or never seen in a recording.
+        DataFileError: A marker is missing or never seen in a recording, or was moved between two.
         InputError: There are fewer than two markers to compare.
     """
     if len(labels) < 2:
         raise InputError(f"The base has {len(labels)} markers: name two or more that sit on the clamp.")
-    motions, first = list[BaseMotion](), None
+    places, shifts, distortions = list[FloatArray](), list[FloatArray](), list[FloatArray]()
     for recording in recordings:
         base = recording.select(labels)
         if absent := [label for label, seen in zip(labels, base.seen.T, strict=True) if not seen.any()]:
             raise DataFileError(
                 f"{recording.source}: {listed(absent)} is never seen; leave it out of the base markers."
             )
-        place = np.nanmedian(base.positions, axis=0)
-        if first is None:
-            first = place
-            continue
-        changes = np.abs(cdist(place, place) - cdist(first, first))[~np.eye(len(labels), dtype=np.bool_)]
-        distortion = np.median(changes.reshape(len(labels), -1), axis=1)
-        shift = np.linalg.norm(place - first, axis=1)
-        motions.append(BaseMotion(recording.source, shift, distortion, float(changes.max())))
-    return motions
-
-
-def check_base(
-    recordings: Sequence[Recording],
-    labels: Sequence[str],
-    *,
-    largest_distortion: float = 1e-3,
-    largest_shift: float | None = None,
-) -> None:
-    """Checks that no marker on the base of a set-up was moved between trials, see `compare_base`.
-
-    The distance between two markers may change by `largest_distortion` [m]. A marker may be `largest_shift` [m]
-    from its place in the first recording; anywhere if None, for recordings that are registered separately.
-
-    Raises:
-        DataFileError: A marker moved.
-    """
-    for motion in compare_base(recordings, labels):
-        worst = int(np.argmax(motion.distortion))
-        if motion.largest > largest_distortion:
+        places.append(np.nanmedian(base.positions, axis=0))
+        changes = np.abs(cdist(places[-1], places[-1]) - cdist(places[0], places[0]))
+        changes = changes[~np.eye(len(labels), dtype=np.bool_)].reshape(len(labels), -1)
+        distortions.append(np.median(changes, axis=1))
+        shifts.append(np.linalg.norm(places[-1] - places[0], axis=1))
+        if changes.max() > largest_distortion:
             raise DataFileError(
-                f"{motion.source}: base marker {labels[worst]} moved by {_MILLI * motion.largest:.2f} mm "
-                f"against the other base markers since {recordings[0].source}; put it back, check the unit, leave "
-                f"it out, or raise the limit of {_MILLI * largest_distortion:g} mm."
+                f"{recording.source}: base marker {labels[int(np.argmax(distortions[-1]))]} moved by "
+                f"{_MILLI * changes.max():.2f} mm against the other base markers since {recordings[0].source}; put it "
+                f"back, check the unit, leave it out, or raise the limit of {_MILLI * largest_distortion:g} mm."
             )
-        worst = int(np.argmax(motion.shift))
-        if largest_shift is not None and motion.shift[worst] > largest_shift:
+        if largest_shift is not None and shifts[-1].max() > largest_shift:
             raise DataFileError(
-                f"{motion.source}: base marker {labels[worst]} stands {_MILLI * motion.shift[worst]:.2f} mm from its "
-                f"place in {recordings[0].source}: the set-up or the cameras' frame was moved; register each recording "
-                f"by itself, or raise the limit of {_MILLI * largest_shift:g} mm."
+                f"{recording.source}: base marker {labels[int(np.argmax(shifts[-1]))]} stands "
+                f"{_MILLI * shifts[-1].max():.2f} mm from its place in {recordings[0].source}: the set-up or the "
+                "cameras' frame was moved; register each recording by itself, or raise the limit of "
+                f"{_MILLI * largest_shift:g} mm."
             )
+    return np.stack(shifts[1:]), np.stack(distortions[1:])
 
 
 def check_motion(recording: Recording, labels: Sequence[str]) -> None:

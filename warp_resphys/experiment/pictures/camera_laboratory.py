@@ -6,7 +6,7 @@ import shapely
 import torch
 from PIL import Image
 
-from ...data.camera import PlacedCamera
+from ...data.camera import PlacedCamera, view_axes
 from ...data.markers import bind_markers
 from ...io.arrays import BoolArray, FloatArray
 from ...io.atomic import atomic_path
@@ -83,11 +83,8 @@ def play_camera(context: StageContext) -> None:
 
 def looks(played: SimulatedCamera, gravity: tuple[float, float, float]) -> FloatArray:
     """Returns world_to_camera (4, 4) of an upright camera at a place that looks at a point."""
-    place, forward = np.array(played.place), np.array(played.looks_at) - np.array(played.place)
-    forward = forward / np.linalg.norm(forward)
-    down = np.array(gravity) - forward * (forward @ np.array(gravity))
-    down = down / np.linalg.norm(down)
-    axes = np.stack([np.cross(down, forward), down, forward])
+    place = np.array(played.place)
+    axes = view_axes(place - played.looks_at, -np.array(gravity)) * [[1.0], [-1.0], [-1.0]]
     return np.block([[axes, -(axes @ place)[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 

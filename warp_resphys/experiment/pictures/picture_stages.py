@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ...data.camera import CORRECTIONS, PlacedCamera
-from ...energies.catalogue import LAW_FORMAT, unit_of
+from ...energies.catalogue import law_content
 from ...io.errors import InputError
 from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
@@ -279,13 +279,7 @@ def identify_pictures(context: StageContext) -> None:
         pose = next(pose for pose in poses if pose.material == material)
         fitted = values_of(pose, found["parameters"])
         constants = {key: fitted.get(key, value) for key, value in plan.poses.material(pose.name).constants.items()}
-        law = {
-            "format": LAW_FORMAT,
-            "model": settings.simulation.model,
-            "constants": constants,
-            "units": {key: unit_of(key) for key in constants},
-        }
-        write_json(context.run_dir / law_file(material), law)
+        write_json(context.run_dir / law_file(material), law_content(settings.simulation.model, constants))
     kept.path.unlink(missing_ok=True)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...data.base_motion import followed, in_frame, prescribed, prescribed_all, rigid
 from ...data.input_response import NO_INPUT, check_inputs
-from ...data.recordings.marker_quality import check_base, check_motion
+from ...data.recordings.marker_quality import check_motion, compare_base
 from ...data.recordings.processing import Release, fill_gaps, release_of, resample, trim_to_release, valve_opening
 from ...data.recordings.recording import Recording
 from ...data.registration import Registration, register_markers
@@ -117,9 +117,9 @@ class RegisteredTrials(Reader):
         for trial, recording, release in zip(self.trials, self.measured, self.releases, strict=True):
             frames = (None,) if self._base_motion(trial) is None else (self._rest_frames(recording),)
             sessions[trial.session].append(recording.frames(slice(*(frames if release is None else release.rest))))
-        for still in sessions.values() if len(reference) > 1 else ():
-            limits = {"largest_distortion": self.markers.largest_distortion}
-            check_base(still, reference, **limits, largest_shift=self.markers.largest_shift)
+        for still in sessions.values():
+            if len(reference) > 1 and len(still) > 1:
+                compare_base(still, reference, self.markers.largest_distortion, self.markers.largest_shift)
 
     def _rest_frames(self, recording: Recording) -> int:
         return max(round(self.data.rest_seconds * recording.rate), 1)

@@ -6,7 +6,6 @@ the candidate motions carry a few markers, the anchors, onto their nominal place
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 
@@ -24,16 +23,6 @@ _CLEAR = 1.3  # least ratio of the residual of the next best pairs and that of t
 _LEAST = 1e-4  # m: smaller residuals of pairs count as this one
 
 
-@dataclass(frozen=True)
-class Assignment:
-    """Named markers."""
-
-    columns: IntArray  # (M,) index of the measured marker of every name
-    transform: RigidTransform  # from the frame of the recording to that of the body
-    rms: float  # root mean square distance of the pairs [m]
-    next_rms: float  # root mean square distance of the next best pairs [m]
-
-
 def assign(
     seen: ArrayLike,
     expected: ArrayLike,
@@ -42,7 +31,7 @@ def assign(
     source: str | Path,
     anchors: Sequence[int] | None = None,
     rotation: FloatArray | None = None,
-) -> Assignment:
+) -> tuple[IntArray, RigidTransform, float, float]:
     """Assigns names to measured markers.
 
     Args:
@@ -55,6 +44,10 @@ def assign(
             bent body; all if None.
         rotation: (3, 3) from the frame of the recording to that of the body, where known. Then one anchor is enough;
             otherwise it takes three that are not on a line.
+
+    Returns:
+        The index of the measured marker of every name (M,), the motion from the frame of the recording to that of the
+        body, and the root mean square distances of the pairs and of the next best ones [m].
 
     Raises:
         InputError: arrays of wrong shapes, or too few anchors.
@@ -88,7 +81,7 @@ def assign(
             f"{_MILLI * next_rms:.1f} mm with {listed(moved)} taken for others; correct their places in the "
             f"configuration or, if the first is right, give the recording labels: [{', '.join(labels)}]."
         )
-    return Assignment(visible[list(best)], motion, rms, next_rms)
+    return visible[list(best)], motion, rms, next_rms
 
 
 def _assignments(

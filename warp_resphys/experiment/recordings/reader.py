@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -63,7 +64,6 @@ class Reader:
         self.vertical = None if up is None or not gravity.any() else (unit_vector(up), -gravity)
         self.enough = standing_enough(self.data, settings.gravity)
         self._run_dir = context.run_dir
-        self._hanging: FloatArray | None = None
 
     def tracked_in(self, trial: Trial) -> list[str]:
         """Labels of the tracked markers of a trial."""
@@ -93,12 +93,10 @@ class Reader:
             [self.view(trial).of_arrays((self.hanging if places is None else places)[has]), self._reference]
         )
 
-    @property
+    @cached_property
     def hanging(self) -> FloatArray:
         """(M, 3) tracked markers on the body that hangs under its weight alone [m]."""
-        if self._hanging is None:
-            self._hanging = self._posed(Inputs())[0]
-        return self._hanging
+        return self._posed(Inputs())[0]
 
     def turned(self, trial: Trial) -> FloatArray:
         """(M, 3, 3) rotation of a rigid body from the undeformed body to the expected places; identity for markers."""
@@ -222,7 +220,7 @@ class Reader:
             still = slice(-_count(POSE_SECONDS, recording), None)
             if trial.begins != STATIC:
                 still = slice(_count(_HELD_SECONDS, recording))
-            pairs = assign(
+            columns, _, rms, next_rms = assign(
                 central_places(recording.positions[still], np.median),
                 expected,
                 labels,
@@ -232,9 +230,8 @@ class Reader:
             )
             log.info(
                 "import: the markers of %s are assigned by their places, to %.1f mm (next best assignment: %.1f mm)",
-                *(trial.name, _MILLI * pairs.rms, _MILLI * pairs.next_rms),
+                *(trial.name, _MILLI * rms, _MILLI * next_rms),
             )
-            columns = pairs.columns.tolist()
             rest = None if recording.rest is None else recording.rest[columns]
             positions = recording.positions[:, columns]
             labelled.append(replace(recording, labels=tuple(labels), positions=positions, rest=rest))

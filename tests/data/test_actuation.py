@@ -56,17 +56,15 @@ def test_bad_sequences(settings, message):
 
 def test_recorded_pressures_are_checked():
     good = np.full((4, 2), 1e4)
-    np.testing.assert_array_equal(check_inputs(good, PRESSURE, 2, 2e4, "a.h5"), good)
-    with pytest.raises(DataFileError, match=r"a\.h5 has pressures of 2 chambers, but the body has 6"):
-        check_inputs(good, PRESSURE, 6, 2e4, "a.h5")
+    np.testing.assert_array_equal(check_inputs(good, PRESSURE, 2e4, "a.h5"), good)
     high = good.copy()
     high[3, 1] = 2.5e4
     with pytest.raises(DataFileError, match=r"data\.input_limit"):
-        check_inputs(high, PRESSURE, 2, 2e4, "a.h5")
+        check_inputs(high, PRESSURE, 2e4, "a.h5")
 
 
 def test_a_small_zero_error_of_a_gauge_is_accepted_and_a_large_one_refused():
     tension = np.array([[-0.01, 1.0], [0.2, 0.5]])
-    np.testing.assert_array_equal(check_inputs(tension, TENSION, 2, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
+    np.testing.assert_array_equal(check_inputs(tension, TENSION, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
     with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):
-        check_inputs(np.array([[0.0], [-0.5]]), TENSION, 1, 2.0, "a.h5")
+        check_inputs(np.array([[0.0], [-0.5]]), TENSION, 2.0, "a.h5")

@@ -100,20 +100,15 @@ def wave_inputs(waves: WaveSettings, limit: float, steps: int, time_step: float)
     return np.asarray(rise * np.clip(waves.mean + waves.amplitude * np.sin(turns), 0.0, limit))
 
 
-def check_inputs(values: FloatArray, quantity: Quantity, parts: int, limit: float, source: str | Path) -> FloatArray:
-    """Checks recorded inputs (T, C) against a body with this number of parts, and returns them.
+def check_inputs(values: FloatArray, quantity: Quantity, limit: float, source: str | Path) -> FloatArray:
+    """Checks recorded inputs (T, C), and returns them.
 
     Values below the quantity's range by no more than the error of a gauge are clipped to it.
 
     Raises:
-        DataFileError: a different number of parts, or a value above the limit or below the quantity's range.
+        DataFileError: a value above the limit or below the quantity's range.
     """
     words, per = quantity.words, quantity.per
-    if values.shape[1] != parts:
-        raise DataFileError(
-            f"{source} has {quantity.plural} of {values.shape[1]} {per}s, but the body has {parts}: take the body of "
-            f"that robot, or set data.parts to the body's {per} of each column of the file."
-        )
     frame, part = np.unravel_index(np.abs(values).argmax(), values.shape)
     highest = float(values[frame, part])
     if abs(highest) > _SLACK * limit:

@@ -187,15 +187,15 @@ class Reader:
             driven = (begun - ended)[:, None] * np.asarray(trial.inputs, dtype=np.float64)
         if driven is None:
             return recording
-        parts, count = data.parts, len(drive.parts)
-        if driven.shape[1] != (count if parts is None else len(parts)):
-            names = "the body has" if parts is None else "data.parts names"
+        parts = range(1, len(drive.parts) + 1) if data.parts is None else data.parts
+        if driven.shape[1] != len(parts):
+            names = "the body has" if data.parts is None else "data.parts names"
             raise DataFileError(
                 f"{recording.source} has {drive.quantity.plural} of {driven.shape[1]} {drive.per}s, but {names} "
-                f"{count if parts is None else len(parts)}: name the body's {drive.per} of each column in data.parts."
+                f"{len(parts)}: name the body's {drive.per} of each column in data.parts."
             )
-        inputs = np.zeros((len(driven), count))
-        inputs[:, slice(None) if parts is None else np.array(parts) - 1] = driven
+        inputs = np.zeros((len(driven), len(drive.parts)))
+        inputs[:, np.array(parts) - 1] = driven
         if trial.input_delay:
             logged = frames - trial.input_delay * rate
             inputs = np.stack([np.interp(logged, frames, column) for column in inputs.T], axis=1)

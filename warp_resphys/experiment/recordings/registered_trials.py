@@ -186,16 +186,16 @@ class RegisteredTrials(Reader):
         return np.asarray(np.abs(driven).max(axis=1) <= NO_INPUT * (self.data.input_limit or np.inf))
 
     def _inputs(self, recording: Recording, trial: Trial, drive: Drive) -> FloatArray:
-        """(T, C) inputs of the body's parts; refuses a wrong number of parts and values beyond the limit."""
-        count, limit = len(drive.parts), self.data.input_limit or np.inf
+        """(T, C) inputs of the body's parts; refuses values beyond the limit."""
         if recording.actuation is None:
             if trial.is_released:
-                return np.zeros((len(recording.positions), count))
+                return np.zeros((len(recording.positions), len(drive.parts)))
             raise DataFileError(
                 f"{recording.source} has no array 'actuation' with the {drive.quantity.plural} of the {drive.per}s: "
                 "add it (docs/recordings.md)."
             )
-        values = check_inputs(recording.actuation, drive.quantity, count, trial.scale * limit, recording.source)
+        limit = trial.scale * (self.data.input_limit or np.inf)
+        values = check_inputs(recording.actuation, drive.quantity, limit, recording.source)
         if self.data.valve == "detected" and not trial.is_released:
             opening = valve_opening(recording, self.tracked_in(trial))
             # Inputs begin at the opening of the valve; they act during a part of that step.

@@ -199,10 +199,10 @@ def _unwrapped(vectors: FloatArray) -> FloatArray:
 
 
 def prescribed_all(
-    common: Mapping[str, Any], own: Mapping[str, MotionSettings], times: NDArray[Any], folder: str = "."
+    common: Mapping[str, Any], of_trial: Mapping[str, MotionSettings], times: NDArray[Any], folder: str = "."
 ) -> dict[str, FloatArray]:
     """Poses (T, 6) by obstacle at times (T,) [s] of a trial's given motions: its own, or common ones, none recorded."""
-    motions = {name: motion for name, motion in {**common, **own}.items() if isinstance(motion, MotionSettings)}
+    motions = {name: motion for name, motion in {**common, **of_trial}.items() if isinstance(motion, MotionSettings)}
     return {name: prescribed(motion, times, folder) for name, motion in motions.items()}
 
 
@@ -220,4 +220,4 @@ def contact_inputs(body: Body, motions: Mapping[str, FloatArray]) -> dict[str, F
             moved = rigid(poses.reshape(-1, 6)).apply(np.broadcast_to(place, (poses[..., 0].size, 1, 3)))[:, 0] - place
             turned = poses[..., 3:]
             values[..., number] = np.moveaxis(np.concatenate([moved.reshape(turned.shape), turned], -1), -1, 0)
-    return {quantity.name: own for quantity, own in zip(MOTION, values, strict=True)}
+    return {quantity.name: moved_by for quantity, moved_by in zip(MOTION, values, strict=True)}

@@ -222,13 +222,13 @@ class JoinedMarkers(Markers):
         if len(parts) == 1:
             return parts[0]
         flat, order = list[SurfaceMarkers | RigidMarkers](), list[int]()
-        for part, own in zip(parts, places, strict=True):
+        for part, rows in zip(parts, places, strict=True):
             if isinstance(part, JoinedMarkers):
                 flat += part.parts
-                order += [own[number] for number in torch.argsort(part.order).tolist()]
+                order += [rows[number] for number in torch.argsort(part.order).tolist()]
             else:
                 flat.append(part)
-                order += own
+                order += rows
         vertices = torch.cat([part.vertices.flatten() for part in flat])
         return cls(vertices, tuple(flat), torch.as_tensor(np.argsort(order)))
 

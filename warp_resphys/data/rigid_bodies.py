@@ -74,14 +74,14 @@ def with_axes(recording: Recording, lengths: Mapping[str, float]) -> Recording:
     """Returns a recording with the points that motion capture gives in place of those of `with_corners`."""
     labels, positions, rest = [*recording.labels], recording.positions.copy(), recording.rest
     rest = None if rest is None else rest.copy()
-    for name, own in corners_of(labels).items():
+    for name, rows in corners_of(labels).items():
         weights = ARM / (4.0 * np.sqrt(0.5) * lengths[name]) * _SIGNS.T
         for points in (positions, rest):
             if points is not None:
-                corners = points[..., own, :]
+                corners = points[..., rows, :]
                 place = corners.mean(axis=-2, keepdims=True)
-                points[..., own, :] = np.concatenate([place, place + weights @ corners], axis=-2)
-        labels[own] = [name, *(f"{name} +{axis}" for axis in "xyz")]
+                points[..., rows, :] = np.concatenate([place, place + weights @ corners], axis=-2)
+        labels[rows] = [name, *(f"{name} +{axis}" for axis in "xyz")]
     return replace(recording, labels=tuple(labels), positions=positions, rest=rest)
 
 
@@ -99,8 +99,8 @@ def owners(labels: Sequence[str]) -> tuple[str, ...]:
 def independent(labels: Sequence[str]) -> list[float] | None:
     """Share of the coordinates of each point that are independent: six of the twelve of a rigid body; None for all."""
     shares = np.ones(len(labels))
-    for own in corners_of(labels).values():
-        shares[own] = 0.5
+    for rows in corners_of(labels).values():
+        shares[rows] = 0.5
     return None if (shares == 1.0).all() else shares.tolist()
 
 

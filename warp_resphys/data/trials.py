@@ -181,12 +181,12 @@ class Trials:
             for name in ("times", "observed", "held", "payload", "initial", "smoothed", "velocity", "base")
         }
         inputs, obstacles = (
-            {name: np.concatenate([values, theirs[name]]) for name, values in own.items()}
-            for own, theirs in ((self.inputs, other.inputs), (self.obstacles, other.obstacles))
+            {name: np.concatenate([values, theirs[name]]) for name, values in mine.items()}
+            for mine, theirs in ((self.inputs, other.inputs), (self.obstacles, other.obstacles))
         )
         resting = {
             name: np.concatenate(
-                [own.resting.get(name, np.zeros_like(own.inputs[name][:, 0])) for own in (self, other)]
+                [mine.resting.get(name, np.zeros_like(mine.inputs[name][:, 0])) for mine in (self, other)]
             )
             for name in {**self.resting, **other.resting}
         }
@@ -223,7 +223,7 @@ class Trials:
         if not self.obstacles:
             return {}
         acting = [name for name, values in contact_inputs(body, self.obstacles).items() if values.any()]
-        poses = {name: self._poses_at(own, names, time_step) for name, own in self.obstacles.items()}
+        poses = {name: self._poses_at(motion, names, time_step) for name, motion in self.obstacles.items()}
         inputs = contact_inputs(body, poses)
         return {name: inputs[name] for name in acting}
 

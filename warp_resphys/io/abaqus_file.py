@@ -96,8 +96,8 @@ class _Deck:
             yield scope, content
         elif (scope, content) in trail:
             raise DecodingError(f"*ELSET: the element set '{content}' contains itself")
-        elif own := self.scopes()[scope].sets.get(content):
-            for inner in own:
+        elif found := self.scopes()[scope].sets.get(content):
+            for inner in found:
                 yield from self.members(scope, inner, *trail, (scope, content))
         elif "." in content:  # such as beam-1.tip or beam-1.12
             instance, _, name = content.rpartition(".")
@@ -236,8 +236,8 @@ def _arranged(deck: _Deck) -> tuple[FloatArray, list[Block]]:
         numbers = np.array([*scope.nodes], dtype=np.int64)
         for kind, dimension, rows in scope.blocks:
             nodes = first + rows_of(numbers, rows[:, 1:])
-            own = {name: np.concatenate(members) for (name, place), members in groups.items() if place == at}
-            cells = {name: np.flatnonzero(np.isin(rows[:, 0], members)) for name, members in own.items()}
+            of_scope = {name: np.concatenate(members) for (name, place), members in groups.items() if place == at}
+            cells = {name: np.flatnonzero(np.isin(rows[:, 0], members)) for name, members in of_scope.items()}
             blocks.append(Block(kind, dimension, nodes, cells))
             if dimension == 3:
                 solids.setdefault(at, []).append((kind, rows[:, 0], nodes))

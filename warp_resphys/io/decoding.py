@@ -162,10 +162,10 @@ def mesh_arrays(path: str, file_format: str | None = None) -> Arrays:
     suffix = {None: Path(path).suffix.lower(), "gmsh": ".msh", "abaqus": ".inp"}.get(file_format)
     with Path(path).open("rb") as file:
         of_fluent = suffix == ".msh" and file.read(1) == b"("  # which meshio writes by default
-    if of_fluent or (own := MESH_READERS.get(suffix or "")) is None:
+    if of_fluent or (reader := MESH_READERS.get(suffix or "")) is None:
         return mesh_arrays_of(*_read_by_meshio(path, file_format))
     try:
-        return mesh_arrays_of(*own(path))
+        return mesh_arrays_of(*reader(path))
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise DecodingError(f"the file is damaged or not whole ({error}); save the mesh again") from error
 
@@ -182,7 +182,7 @@ def _read_by_meshio(path: str, file_format: str | None) -> tuple[NDArray[np.floa
         raise DecodingError(printed.getvalue()) from error
     blocks = []
     for number, block in enumerate(content.cells):
-        sets = {name: own[number] for name, own in content.cell_sets.items() if own[number] is not None}
+        sets = {name: cells[number] for name, cells in content.cell_sets.items() if cells[number] is not None}
         groups = {name: np.asarray(cells, dtype=np.int64) for name, cells in sets.items()}
         nodes = block.data if isinstance(block.data, np.ndarray) else np.empty((len(block), 0))
         blocks.append(Block(block.type, block.dim, nodes.astype(np.int64), groups))

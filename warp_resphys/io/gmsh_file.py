@@ -109,8 +109,8 @@ def _version_4(sections: Mapping[str, _Numbers], version: float, names: Names) -
         name, _, nodes = _kind(kind)
         count = elements.count()
         cells = elements.rows(count, (1 + nodes) * ("q" if is_new else "i"))[:, 1:].astype(np.int64)
-        own = [names.get((dimension, abs(group))) for group in groups.get((dimension, entity), ())]
-        members = {group: np.arange(count) for group in own if group is not None}
+        named = [names.get((dimension, abs(group))) for group in groups.get((dimension, entity), ())]
+        members = {group: np.arange(count) for group in named if group is not None}
         cells = rows_of(numbers, cells)[:, _ORDERS.get(name, slice(None))]
         blocks.append(Block(name, int(dimension), cells, members))
     return points, blocks
@@ -187,7 +187,7 @@ def _version_2(
             cells.setdefault(kind, []).append([abs(group), *values[start : start + nodes]])
             at = start + nodes
         left -= count
-    return points, [_once(kind, np.array(own, dtype=np.int64), names, tags) for kind, own in cells.items()]
+    return points, [_once(kind, np.array(rows, dtype=np.int64), names, tags) for kind, rows in cells.items()]
 
 
 def _once(number: int, rows: IntArray, names: Names, tags: IntArray) -> Block:

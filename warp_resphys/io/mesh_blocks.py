@@ -42,10 +42,10 @@ def mesh_arrays_of(points: FloatArray, blocks: Sequence[Block]) -> dict[str, NDA
         first += len(block.nodes) if block.dimension == 3 else 0
     types = np.array([block.kind for block in blocks if len(block.nodes)], dtype=np.str_)
     arrays: dict[str, NDArray[Any]] = {"points": points, "types": types}
-    for name, own in parts.items():
+    for name, blocks_of in parts.items():
         if name.startswith("surface/"):  # of prisms, with triangles beside quadrilaterals
-            own = [np.pad(faces, ((0, 0), (0, 4 - faces.shape[1])), mode="edge") for faces in own]
-        arrays[name] = np.concatenate(own)
+            blocks_of = [np.pad(faces, ((0, 0), (0, 4 - faces.shape[1])), mode="edge") for faces in blocks_of]
+        arrays[name] = np.concatenate(blocks_of)
     return arrays
 
 

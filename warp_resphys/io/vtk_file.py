@@ -54,11 +54,11 @@ def read_vtk(path: str) -> tuple[NDArray[np.float64], list[Block]]:
     ends, nodes = vtk_to_numpy(cells.GetOffsetsArray()), vtk_to_numpy(cells.GetConnectivityArray())
     blocks = []
     for kind in np.unique(kinds).tolist():
-        own = np.flatnonzero(kinds == kind)
-        sizes = ends[own + 1] - ends[own]
+        chosen = np.flatnonzero(kinds == kind)
+        sizes = ends[chosen + 1] - ends[chosen]
         if kind in _KINDS and sizes.min() < sizes.max():
             raise DecodingError("the file is damaged: cells of one kind have different numbers of nodes")
-        rows = nodes[ends[own, None] + np.arange(sizes.min())].astype(np.int64)[:, _ORDERS.get(kind, slice(None))]
+        rows = nodes[ends[chosen, None] + np.arange(sizes.min())].astype(np.int64)[:, _ORDERS.get(kind, slice(None))]
         dimension = 2 if kind in _FACES else 1 if kind in _LOWER else 3
         blocks.append(Block(_KINDS.get(kind, f"VTK type {kind}"), dimension, rows, {}))
     return vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64), blocks

@@ -81,7 +81,7 @@ class Cloud:
         if not len(known):
             raise InputError("none of its points is in the view of its lens: check the lens (data.lens).")
         ends = np.percentile(known, [_STRAY, 100.0 - _STRAY], axis=0)
-        size, extent = (float(np.linalg.norm(np.ptp(own, axis=0))) for own in (ends, vertices))
+        size, extent = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (ends, vertices))
         if len(close) < _LEAST or not _SIZES[0] < size / extent < _SIZES[1]:
             raise InputError(
                 f"{len(close)} of its {len(places)} points are close enough to the clamp to be of the body; they are "

@@ -65,7 +65,7 @@ class Outline:
             raise InputError("the mask fills the picture: no outline of the body is in it.")
         region = shapely.build_area(shapely.geometrycollections([shapely.linestrings(line) for line in lines]))
         at = near.T[::-1] + 1.0  # rows and columns of the padded mask
-        slope = np.stack([scipy.ndimage.map_coordinates(own, at, order=1) for own in np.gradient(smooth)[::-1]], 1)
+        slope = np.stack([scipy.ndimage.map_coordinates(part, at, order=1) for part in np.gradient(smooth)[::-1]], 1)
         outward = -slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
         return cls(points, region, size, near, outward)
 

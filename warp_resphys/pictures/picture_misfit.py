@@ -105,13 +105,13 @@ class PictureMisfit(BoundedMisfit):
         owners = (*pose.owners, *(pose.lenses if parameter in CORRECTIONS else ()))
         return owner in owners and parameter in pose.parameter_names
 
-    def shape(self, number: int, own: Mapping[str, float]) -> torch.Tensor:
+    def shape(self, number: int, values: Mapping[str, float]) -> torch.Tensor:
         """Returns the shape of a pose with values of its parameters, from the last one (`SeenPose.shape`) [m].
 
         Raises:
             ConvergenceError: there is no equilibrium.
         """
-        physical, last = _physical(own), self._shapes[number]
+        physical, last = _physical(values), self._shapes[number]
         if last is not None and last[0] == physical:
             return last[1]
         q = self.poses[number].shape(physical, last)
@@ -124,18 +124,18 @@ class PictureMisfit(BoundedMisfit):
         share = 1.0 / sum(len(pose.photos) for pose in self.poses)
         for number, pose in enumerate(self.poses):
             known = {**self._known, **values}
-            own = values_of(pose, known)
+            seen_by = values_of(pose, known)
             try:
-                shapes, columns = self._shapes_by(number, unit, own, derivatives)
+                shapes, columns = self._shapes_by(number, unit, seen_by, derivatives)
                 series = dict[str, list[Linearised]]()  # of tracked points that move, by lens
                 for photo in pose.photos:
-                    own = values_of(pose, known, photo.lens)
-                    parts, points = self._of_photo(pose, photo, own, shapes, columns, share)
+                    seen_by = values_of(pose, known, photo.lens)
+                    parts, points = self._of_photo(pose, photo, seen_by, shapes, columns, share)
                     trials += parts
                     (series.setdefault(photo.lens, []) if pose.moves else trials).extend(points)
                 for frames in filter(None, series.values()):  # errors of the same points may be correlated in time
                     rows, jacobians, counts = zip(*frames, strict=True)
-                    joined = np.stack([own.ravel() for own in rows])
+                    joined = np.stack([row.ravel() for row in rows])
                     trials.append((joined, np.concatenate(jacobians), sum(counts)))
             except ConvergenceError:
                 return None
@@ -155,14 +155,14 @@ class PictureMisfit(BoundedMisfit):
         return losses
 
     def _shapes_by(
-        self, number: int, unit: FloatArray, own: Mapping[str, float], derivatives: bool
+        self, number: int, unit: FloatArray, values: Mapping[str, float], derivatives: bool
     ) -> tuple[torch.Tensor, list[int] | None]:
         """A pose's shape and its derivatives by K of the physical parameters, (1 + K, ...), and their K columns.
 
         Derivatives are differences into the range. Without any the columns are None.
         """
         if not derivatives:
-            return self.shape(number, own)[None], None
+            return self.shape(number, values)[None], None
         pose, moved, columns, steps = self.poses[number], list[dict[str, float]](), list[int](), list[float]()
         for column, (name, range_) in enumerate(self.bounds.items()):
             parameter = split_name(name)[0]
@@ -171,13 +171,13 @@ class PictureMisfit(BoundedMisfit):
                 continue
             step = (1.0 if unit[column] < 0.5 else -1.0) * (_DIFFERENCE_OF_MOTION if pose.moves else _DIFFERENCE)
             value = range_.from_unit(torch.tensor(unit[column] + step, dtype=torch.float64))
-            moved.append({**own, parameter: float(value)})
+            moved.append({**values, parameter: float(value)})
             columns.append(column)
             steps.append(step)
         if not columns:
-            return self.shape(number, own)[None], columns
-        physical = _physical(own)
-        shapes = pose.shapes([own, *moved], self._shapes[number])
+            return self.shape(number, values)[None], columns
+        physical = _physical(values)
+        shapes = pose.shapes([values, *moved], self._shapes[number])
         self._shapes[number] = (physical, shapes[0])
         change = shapes[1:] - shapes[:1]
         return torch.cat([shapes[:1], change / shapes.new_tensor(steps).view(-1, *[1] * (change.ndim - 1))]), columns
@@ -186,7 +186,7 @@ class PictureMisfit(BoundedMisfit):
         self,
         pose: SeenPose,
         photo: Photo,
-        own: Mapping[str, float],
+        values: Mapping[str, float],
         shapes: torch.Tensor,
         columns: Sequence[int] | None,
         share: float,
@@ -196,8 +196,8 @@ class PictureMisfit(BoundedMisfit):
         The outlines of all pictures by a standing camera, both ways, have nearly the same errors (correlated by 0.87 to
         0.997 between real pictures), so that they count as one set.
         """
-        corrections, parts, points = PlacedCamera.corrections(own), list[Linearised](), list[Linearised]()
-        vertices, velocities = pose.seen(photo, shapes, own)
+        corrections, parts, points = PlacedCamera.corrections(values), list[Linearised](), list[Linearised]()
+        vertices, velocities = pose.seen(photo, shapes, values)
         q, moved = vertices[0], torch.cat([vertices[1:], velocities[None]])
         share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
         if photo.outline is not None:
@@ -261,8 +261,8 @@ class PictureMisfit(BoundedMisfit):
         for column, (name, range_) in enumerate(self.bounds.items()):
             parameter, owner = split_name(name)
             if owner in (*pose.owners, photo.lens) and parameter in (*CORRECTIONS, RELEASE_DELAY):
-                own = late if parameter == RELEASE_DELAY else placed[CORRECTIONS.index(parameter)]
-                slopes[column] = own * range_.slope(0.5)
+                slope = late if parameter == RELEASE_DELAY else placed[CORRECTIONS.index(parameter)]
+                slopes[column] = slope * range_.slope(0.5)
         return slopes
 
 
@@ -298,8 +298,8 @@ def values_of(pose: SeenPose, values: Mapping[str, float], lens: str = "") -> di
 
     Values of a lens come before those of all, values of its material before these, and its own before all others.
     """
-    own: dict[str, float] = {}
+    result: dict[str, float] = {}
     everyone, *owners = pose.owners
     for owner in dict.fromkeys((everyone, lens, *owners)):
-        own |= {split_name(name)[0]: value for name, value in values.items() if split_name(name)[1] == owner}
-    return own
+        result |= {split_name(name)[0]: value for name, value in values.items() if split_name(name)[1] == owner}
+    return result

@@ -92,8 +92,8 @@ class ReleasedForce:
         names = identifiable_parameters(simulator)
         # A factor without effect, so that there are as many sets where only the force differs.
         parameters = {MASS_FACTOR: simulator.tensor([1.0] * len(values))}
-        parameters |= {name: simulator.tensor([own[name] for own in values]) for name in values[0] if name in names}
-        added = [[own.get(name, 0.0) for name in RELEASE_FORCES] for own in values]
+        parameters |= {name: simulator.tensor([row[name] for row in values]) for name in values[0] if name in names}
+        added = [[row.get(name, 0.0) for name in RELEASE_FORCES] for row in values]
         held = simulator.tensor(np.zeros((len(values), len(near), 3)))
         held[:, self.vertices] = (simulator.tensor(self.force) + simulator.tensor(added))[:, None] / len(self.vertices)
         seconds = simulator.tensor([[max(last - self.at(values[0]), 0.0)]])

@@ -144,7 +144,7 @@ def read_scene(path: Path, scanned: bool = False) -> SceneFile:
         image = entry.image or entry.depth
         if image is None:
             raise DataFileError(f"{path}: frame {number} has no 'image', the name of a file beside it.")
-        mask, depth = (None if own is None else path.parent / own for own in (entry.mask, entry.depth))
+        mask, depth = (None if name is None else path.parent / name for name in (entry.mask, entry.depth))
         pose = None if entry.world_to_camera is None else _rigid(entry.world_to_camera, path)
         time = number / scene.frame_rate if entry.time is None and scene.frame_rate else entry.time
         frames.append(Frame(number, path.parent / image, pose, mask, depth, entry.lens, time))

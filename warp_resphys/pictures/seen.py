@@ -64,7 +64,7 @@ class Photo:
     @property
     def kinds(self) -> int:
         """Number of kinds of measurements: outline, tracked points, cloud."""
-        return sum(own is not None for own in (self.outline, self.tracked, self.cloud))
+        return sum(kind is not None for kind in (self.outline, self.tracked, self.cloud))
 
     @property
     def last(self) -> float:
@@ -72,7 +72,7 @@ class Photo:
         rows = [self.rows] if self.camera.lens is None else [self.rows, 2.0 * float(self.camera.lens.matrix[1, 2])]
         rows += [] if self.outline is None else [self.outline.size[1]]
         measured = (self.tracked, None if self.cloud is None else self.cloud.measured)
-        rows += [float(np.nanmax(own[:, 1], initial=0.0)) for own in measured if own is not None]
+        rows += [float(np.nanmax(pixels[:, 1], initial=0.0)) for pixels in measured if pixels is not None]
         return self.time + max(self.row_time * max(rows), 0.0)
 
 
@@ -159,8 +159,8 @@ class SeenPose:
         if self.release is not None:
             return 1
         lensless = photo.camera.lens is None
-        mine = [own for own in self.photos if own.lens == photo.lens and (own.camera.lens is None) == lensless]
-        return len(mine) if all(torch.equal(own.camera.pose, photo.camera.pose) for own in mine) else 1
+        mine = [other for other in self.photos if other.lens == photo.lens and (other.camera.lens is None) == lensless]
+        return len(mine) if all(torch.equal(other.camera.pose, photo.camera.pose) for other in mine) else 1
 
     @property
     def owners(self) -> tuple[str, ...]:
@@ -176,8 +176,8 @@ class SeenPose:
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters that shape and pictures depend on."""
         clamps = (CLAMP_TURN, CLAMP_SHIFT) if len(self.clamps) > 1 else ()
-        own = clamps if self.release is None else OF_RELEASE
-        return (*identifiable_parameters(self.simulator), *own, *(CORRECTIONS if self.lenses else PLACES))
+        of_clamps = clamps if self.release is None else OF_RELEASE
+        return (*identifiable_parameters(self.simulator), *of_clamps, *(CORRECTIONS if self.lenses else PLACES))
 
     def shape(self, values: Mapping[str, float], near: Shape | None = None) -> torch.Tensor:
         """Returns the vertices (N, 3) of the body at rest, or (K + 1, N, 3) of its motion from the release on [m]."""
@@ -199,7 +199,7 @@ class SeenPose:
             last = max(photo.last for photo in self.photos)
             return self.release.motions(self.simulator, values, last, guess[0])
         first = self._at_rest(values[0], near)
-        return torch.stack([first, *(self._at_rest(own, (values[0], first)) for own in values[1:])]).double().cpu()
+        return torch.stack([first, *(self._at_rest(more, (values[0], first)) for more in values[1:])]).double().cpu()
 
     def seen(
         self, photo: Photo, shapes: torch.Tensor, values: Mapping[str, float]
@@ -234,10 +234,10 @@ class SeenPose:
         sim = self.simulator
         if not self.deforms:
             return sim.rest_state(1).q[0]
-        own = {name: sim.tensor([v]) for name, v in values.items() if name in identifiable_parameters(sim)}
-        constants = sim.prepare(constants_of(sim, own))
+        parameters = {name: sim.tensor([v]) for name, v in values.items() if name in identifiable_parameters(sim)}
+        constants = sim.prepare(constants_of(sim, parameters))
         before, q = ({}, sim.rest_state(1).q[0]) if near is None else (near[0], near[1].to(sim.rest_state(1).q))
-        first, last = ([own.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)] for own in (before, values))
+        first, last = ([known.get(name, 0.0) for name in (CLAMP_TURN, CLAMP_SHIFT)] for known in (before, values))
         parts, inputs = max(math.ceil(abs(last[0] - first[0]) / _TURNED), 1), None
         with torch.no_grad():
             for turn, shift in np.linspace(first, last, parts + 1)[1:]:
@@ -250,7 +250,7 @@ class SeenPose:
     def _between(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Centre of the second clamp, direction from the first to it, and share (N,) of its motion along the body."""
         rest = self.simulator.rest_state(1).q[0]
-        first, second = (torch.as_tensor(own).to(self.simulator.fixed) for own in self.clamps[:2])
+        first, second = (torch.as_tensor(clamp).to(self.simulator.fixed) for clamp in self.clamps[:2])
         centre = rest[second].mean(0)
         axis = torch.nn.functional.normalize(centre - rest[first].mean(0), dim=0)
         along = rest @ axis
@@ -326,8 +326,10 @@ class SeenPose:
             pixels = float(0.5 * (there + back))
             millimetres = pixels * float(depth.mean()) * photo.camera.millimetres(corrections)
             drawn = photo.camera.pixels(q, corrections).numpy()
-            hidden = shapely.union_all([shapely.convex_hull(shapely.multipoints(drawn[own])) for own in self.clamps])
-            body, mask = (shapely.difference(own, hidden) for own in (self.surface.region(drawn), photo.outline.region))
+            hidden = shapely.union_all([shapely.convex_hull(shapely.multipoints(drawn[ids])) for ids in self.clamps])
+            body, mask = (
+                shapely.difference(area, hidden) for area in (self.surface.region(drawn), photo.outline.region)
+            )
             overlap = shapely.intersection(body, mask).area / shapely.union(body, mask).area
             result = replace(result, outline_mm=millimetres, outline_px=pixels, overlap=overlap)
         if photo.cloud is not None:

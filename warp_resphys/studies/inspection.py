@@ -163,12 +163,12 @@ def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
         return f"not compared: they have {finer.vertices.size:,} degrees of freedom"
     connected = connected_parts(mesh.cells)
     pieces = [np.unique(mesh.cells[connected == number]) for number in np.unique(connected)]
-    if held.all() or not all(_spans_area(mesh.vertices[own[held[own]]]) for own in pieces):
+    if held.all() or not all(_spans_area(mesh.vertices[piece[held[piece]]]) for piece in pieces):
         return "not compared: a piece is not held, or all of it"
     # Nodes between held vertices are held, too.
     between = quadratic(Mesh(np.repeat(held[:, None], 3, axis=1).astype(np.float64), mesh.cells)).vertices[:, 0] == 1.0
-    for own, still in ((mesh, held), (finer, between)):
-        simulator = Simulator(Body(own, fixed=np.flatnonzero(still)), _SILICONE)
+    for compared, still in ((mesh, held), (finer, between)):
+        simulator = Simulator(Body(compared, fixed=np.flatnonzero(still)), _SILICONE)
         step = simulator.linearise_equilibrium()
         step.factorise(simulator.rest_positions[None])
         masses = simulator.prepare().load_mass[0]

@@ -241,7 +241,7 @@ def _recordings(files: Sequence[str]) -> Iterator[Path]:
         if not path.is_dir() or is_bag(path):
             yield path
             continue
-        inside = sorted(own for own in path.iterdir() if own.suffix.lower() in READERS or is_bag(own))
+        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in READERS or is_bag(file))
         if not inside:
             raise DataFileError(f"{path} has no recordings that can be read: name a folder with recordings.")
         yield from inside

@@ -83,8 +83,8 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     moved = np.stack([_at_frames(*source.series(late), times, rate) for source in markers], 1)
     held = []
     for source in inputs:
-        own, values = source.series(late)
-        held.append(values[np.clip(np.searchsorted(own, times, side="right") - 1, 0, None), 0])
+        stamps, values = source.series(late)
+        held.append(values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0])
     poses = None if base is None else _at_frames(*base.series(late), times, rate)
     return Recording(
         (*bag.markers,),
@@ -140,7 +140,7 @@ class _Source:
         if value is None:
             return
         if hasattr(message, "transforms"):
-            message = next((own for own in message.transforms if own.child_frame_id == self.member), message)
+            message = next((tf for tf in message.transforms if tf.child_frame_id == self.member), message)
         header = getattr(message, "header", None)
         stamp = 0.0 if header is None else header.stamp.sec + 1e-9 * header.stamp.nanosec
         self.stamps.append(float(stamp or np.nan))
@@ -185,7 +185,7 @@ def _pose(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
             "table."
         )
     if kind == "tf2_msgs/msg/TFMessage":
-        message = next((own for own in message.transforms if own.child_frame_id == source.member), None)
+        message = next((tf for tf in message.transforms if tf.child_frame_id == source.member), None)
         if message is None:
             return None
     if hasattr(message, "transform"):
@@ -210,7 +210,7 @@ def _point(source: _Source, message: Any) -> Sequence[float]:
     """Returns a point of a cloud, whose points must come in a fixed order, without a rotation."""
     if source.number > message.width * message.height:
         return (np.nan,) * 7
-    fields = {own.name: own for own in message.fields}
+    fields = {field.name: field for field in message.fields}
     if not {"x", "y", "z"} <= {*fields} or any(fields[axis].datatype not in _CLOUD_TYPES for axis in "xyz"):
         raise DataFileError(f"{source.path}: the cloud {source.topic} has no x, y and z as floating-point numbers.")
     row, column = divmod(source.number - 1, message.width)
@@ -256,7 +256,7 @@ def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tupl
             raise DataFileError(f"{path}: the first marker has a single message, which has no rate: set data.bag.rate.")
         rate = 1.0 / float(np.median(np.diff(times[0])))
         rate = round(rate) if abs(rate - round(rate)) < 5e-3 * rate else rate
-    start, stop = max(own[0] for own in times), min(own[-1] for own in times)
+    start, stop = max(stamps[0] for stamps in times), min(stamps[-1] for stamps in times)
     if stop - start < 1.0 / rate:
         raise DataFileError(
             f"{path}: its markers have no messages at the same time; check the clocks of their headers."

@@ -117,7 +117,7 @@ def quality(
         path, drift = recording.positions[seen, column], None
         if label in still:
             part = max(1, round(_DRIFT_PART * len(path)))
-            ends = [np.median(own, axis=0) for own in (path[:part], path[-part:])] if len(path) else [np.nan, np.nan]
+            ends = [np.median(end, axis=0) for end in (path[:part], path[-part:])] if len(path) else [np.nan, np.nan]
             drift = _MILLI * float(np.linalg.norm(ends[1] - ends[0]))
         counts = (len(hidden), max(hidden, default=0), sum(masked), tuple(jumps[label]))
         noise_mm = _MILLI * float(noise[column])

@@ -174,8 +174,8 @@ def _read_table(
         elif unit is not None and unit in channel_units:
             channels[column] = SI_PER_ACTUATION_UNIT[unit]
         elif column != clock and any(number(row[column]) is not None for row in rows[first:] if len(row) > column):
-            kept = {*coordinates, clock, *(other for other, (_, own) in columns.items() if own in channel_units)}
-            heads = {other: own if unit is None else f"{own} [{unit}]" for other, (own, unit) in columns.items()}
+            kept = {*coordinates, clock, *(other for other, (_, u) in columns.items() if u in channel_units)}
+            heads = {other: head if unit is None else f"{head} [{unit}]" for other, (head, unit) in columns.items()}
             read = [f'"{heads[other]}"' if other in kept else "null" for other in range(width)]
             raise DataFileError(
                 f"{path}: column {column + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
@@ -301,7 +301,7 @@ def _quaternions_of_qualisys(numbers: FloatArray) -> FloatArray:
         by_rows = seen[:, :9].reshape(-1, 3, 3)
         by_columns = by_rows.swapaxes(1, 2)
         if seen.shape[1] == 12:
-            columns_err, rows_err = (np.abs(own - by_angles.as_matrix()).max() for own in (by_columns, by_rows))
+            columns_err, rows_err = (np.abs(turn - by_angles.as_matrix()).max() for turn in (by_columns, by_rows))
             by_columns = by_rows if rows_err < 0.01 < columns_err else by_columns
         return Rotation.from_matrix(by_columns)
 

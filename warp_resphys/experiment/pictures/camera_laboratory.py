@@ -55,7 +55,7 @@ def play_camera(context: StageContext) -> None:
         shape = seen.shape(played.corrections)
         random = np.random.default_rng([settings.seed, number])
         path, tracks, frames = scene_file(data, pose, context.run_dir), list[FloatArray](), list[dict[str, object]]()
-        for photo, own in zip(photos, files, strict=True):
+        for photo, names in zip(photos, files, strict=True):
             q = seen.vertices(photo, shape, played.corrections)
             pixels = camera.pixels(q, corrections).numpy()
             mask = noisy_mask(surface.region(pixels), played.size, played.noise, random)
@@ -66,9 +66,9 @@ def play_camera(context: StageContext) -> None:
                 noisy = np.where(depth > 0.0, depth + played.depth * random.normal(size=depth.shape), 0.0)
                 drawings["depth"] = np.rint(noisy / data.cloud.depth_unit).astype(np.uint16)
             for key, drawn in drawings.items():
-                with atomic_path(path.parent / own[key]) as partial:
+                with atomic_path(path.parent / names[key]) as partial:
                     Image.fromarray(drawn).save(partial, format="png")
-            frames.append({**own, "time": photo.time, "world_to_camera": looking.tolist()})
+            frames.append({**names, "time": photo.time, "world_to_camera": looking.tolist()})
             if pose.points is not None:
                 places = bind_markers(body.mesh, [*data.points.values()], [*data.points])(q[None])[0]
                 there = camera.pixels(places, corrections).numpy()
@@ -118,7 +118,7 @@ def noisy_mask(region: shapely.Geometry, size: tuple[int, int], noise: float, ra
     for part in shapely.get_parts(region):
         holes = [hole for hole in part.interiors if shapely.polygons(hole).area > 1.0]
         outer, *inner = (
-            shapely.make_valid(shapely.polygons(_moved(own, noise, random))) for own in (part.exterior, *holes)
+            shapely.make_valid(shapely.polygons(_moved(ring, noise, random))) for ring in (part.exterior, *holes)
         )
         area = shapely.union(area, shapely.difference(outer, shapely.union_all(inner)))
     columns, rows = np.meshgrid(np.arange(size[0]), np.arange(size[1]))

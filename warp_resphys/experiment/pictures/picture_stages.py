@@ -76,9 +76,9 @@ def picture_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     keys = (*SIMULATOR, "simulation", "seed", "data")
     settings = StageSettings.reading(run, *keys, files=files)
     if data.folder is None:
-        of_poses = {own.folder: [SCENE, own.points] for own in data.poses.values()}
-        for own in data.poses.values():
-            of_poses[own.folder] += [file for files in frame_files(data, own) for file in files.values()]
+        of_poses = {pose.folder: [SCENE, pose.points] for pose in data.poses.values()}
+        for pose in data.poses.values():
+            of_poses[pose.folder] += [file for files in frame_files(data, pose) for file in files.values()]
         written = tuple(f"recordings/{folder}/{file}" for folder, files in of_poses.items() for file in files if file)
         stages, upstream = [Stage("laboratory", play_camera, written, settings)], ("laboratory",)
     stages.append(Stage("import", import_pictures, (PICTURES,), settings, upstream))
@@ -141,8 +141,8 @@ class _Plan:
     def __init__(self, settings: StageSettings, run_dir: Path, cameras: Mapping[str, Any] | None = None) -> None:
         self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
         self._cameras = {
-            name: {lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in own.items()}
-            for name, own in (cameras or {}).items()
+            name: {lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in by_lens.items()}
+            for name, by_lens in (cameras or {}).items()
         }
 
     def bounds(self, poses: Sequence[SeenPose], chosen: Callable[[str, str], bool]) -> dict[str, Bounds]:
@@ -215,20 +215,20 @@ class _Plan:
 
     def _best_camera(self, pose: SeenPose, lens: str, shape: torch.Tensor, values: Values) -> torch.Tensor:
         """The camera (4, 4) of the frames by a lens from which a shape is seen best."""
-        seen, failure, own = list[tuple[float, torch.Tensor]](), None, values_of(pose, values, lens)
+        seen, failure, known = list[tuple[float, torch.Tensor]](), None, values_of(pose, values, lens)
         for camera in self.poses.cameras_of(pose.name, lens):
             tried = pose.before({lens: camera})
             try:
                 photos = [photo for photo in tried.photos if photo.camera.lens is not None and photo.lens == lens]
                 photos = photos[:: math.ceil(len(photos) / _TRIED)]
-                bodies = [tried.vertices(photo, shape, own) for photo in photos]
-                distances = (tried.difference(*pair, own).distance for pair in zip(photos, bodies, strict=True))
+                bodies = [tried.vertices(photo, shape, known) for photo in photos]
+                distances = (tried.difference(*pair, known).distance for pair in zip(photos, bodies, strict=True))
                 seen.append((sum(distances), camera))
             except InputError as error:
                 failure = error
         if failure is not None and not seen:
             raise failure
-        return min(seen, key=lambda own: own[0])[1]
+        return min(seen, key=lambda pair: pair[0])[1]
 
     def fitted(self, name: str, model: str, identified: Values, near: Shape | None) -> tuple[SeenPose, Values, Shape]:
         """A pose with a model, the values of parameters, and its shape.
@@ -247,8 +247,8 @@ class _Plan:
             search = ParameterSearch(PictureMisfit([pose], bounds, given, [near]))
             fitted = search.run([guess], wanted.max_evaluations, tolerance=wanted.tolerance).parameters
         values = {**given, **fitted}
-        own = values_of(pose, values)
-        return pose, values, (own, pose.shape(own, near))
+        shared = values_of(pose, values)
+        return pose, values, (shared, pose.shape(shared, near))
 
 
 def identify_pictures(context: StageContext) -> None:
@@ -303,11 +303,11 @@ def compare_pictures(context: StageContext) -> None:
             for model in reversed(MODELS):
                 pose, values, near = plan.fitted(name, model, shared, near)
                 for number, photo in enumerate(pose.photos):
-                    own = values_of(pose, values, photo.lens)
+                    seen_by = values_of(pose, values, photo.lens)
                     row = {"pose": name, "picture": number, "model": model, "tested": name in settings.data.test}
-                    q = pose.vertices(photo, near[1], own)
-                    rows.append({**row, **asdict(pose.difference(photo, q, own)), "values": own})
-                    corrections = PlacedCamera.corrections(own)
+                    q = pose.vertices(photo, near[1], seen_by)
+                    rows.append({**row, **asdict(pose.difference(photo, q, seen_by)), "values": seen_by})
+                    corrections = PlacedCamera.corrections(seen_by)
                     if photo.outline is not None:
                         rim, weights, _ = pose.outlines(photo, q, corrections)
                         create(file, f"{name}/{number}/{model}", rim.pixels, "px")
@@ -330,12 +330,12 @@ def summary_of(rows: Sequence[Mapping[str, Any]], data: PictureData) -> list[Pic
     """Returns the results of each pose: means over its pictures, by model."""
     results = []
     for name in (*data.train, *data.test):
-        own, means = [row for row in rows if row["pose"] == name], dict[str, dict[str, float | None]]()
+        of_pose, means = [row for row in rows if row["pose"] == name], dict[str, dict[str, float | None]]()
         for key in ("outline_mm", "outline_px", "overlap", "cloud_mm", "points_mm"):
             for model in MODELS:
-                known = [row[key] for row in own if row["model"] == model and row[key] is not None]
+                known = [row[key] for row in of_pose if row["model"] == model and row[key] is not None]
                 means.setdefault(key, {})[model] = float(np.mean(known)) if known else None
-        count = len({row["picture"] for row in own})
+        count = len({row["picture"] for row in of_pose})
         results.append(PictureResult(name, data.poses[name].material or "", name in data.test, count, **means))
     return results
 
@@ -350,8 +350,8 @@ def report_pictures(context: StageContext) -> None:
     identified = read_json(context.run_dir / IDENTIFICATION)["sysid"]
     start = dict(run.simulation.constants)
     for name in data.train:
-        material, own = data.poses[name].material or "", poses.material(name).constants
-        start |= {own_name(key, material): value for key, value in own.items()} if material else {}
+        material, constants = data.poses[name].material or "", poses.material(name).constants
+        start |= {own_name(key, material): value for key, value in constants.items()} if material else {}
     write_pictures_report(
         context.run_dir / REPORT,
         picture_metrics(context.run_dir, run),

@@ -69,9 +69,9 @@ def picture_files(data: PictureData) -> dict[str, str]:
     paths = [Path(data.folder).expanduser() / lens.file for lens in data.lenses.values() if lens.file is not None]
     for pose in data.poses.values():
         scene = scene_of(data, pose, Path())
-        own = [pose.mesh, pose.points, pose.cloud]
+        beside = [pose.mesh, pose.points, pose.cloud]
         paths += [scene.path] if scene.path.exists() else []
-        paths += [scene.path.parent / name for name in own if name is not None]
+        paths += [scene.path.parent / name for name in beside if name is not None]
         paths += [path for frame in scene.frames for path in frame.files]
     result = {}
     for path in paths:
@@ -100,7 +100,7 @@ def scene_of(data: PictureData, pose: PoseSettings, run_dir: Path) -> SceneFile:
         raise InputError(f"data.lens is not set, and {scene.path} has frames: give the lens of the camera.")
     for frame in frames:
         if frame.lens not in data.lenses:
-            names = listed([own for own in data.lenses if own])
+            names = listed([lens for lens in data.lenses if lens])
             raise InputError(
                 f"{scene.path}: frame {frame.number} has the lens '{frame.lens}', and data.lens has the names {names}: "
                 "name the lens of a frame, as 'lens', where data.lens has several, and only there."
@@ -228,12 +228,12 @@ def _cameras(path: Path, frames: Sequence[Frame], data: PictureData) -> FloatArr
     else:
         tag, lenses = data.tag, read_lenses(data)
         poses = [tag_poses(tag, read_picture(frame.image), lenses[frame.lens]) for frame in frames]
-        if hidden := [frame.image for frame, own in zip(frames, poses, strict=True) if not own]:
+        if hidden := [frame.image for frame, pair in zip(frames, poses, strict=True) if not pair]:
             raise DataFileError(
                 f"{hidden[0]} does not show the tag {tag.number} of {tag.dictionary}: check data.tag, leave the frame "
                 "out, or give its world_to_camera."
             )
-    cameras = np.array([[own[0], own[-1]] for own in poses]).reshape(-1, 2, 4, 4)
+    cameras = np.array([[pair[0], pair[-1]] for pair in poses]).reshape(-1, 2, 4, 4)
     places = cameras[:, 0, :3, 3]
     first = {frame.lens: place for frame, place in reversed([*zip(frames, places, strict=True)])}
     moved = [float(np.linalg.norm(place - first[f.lens])) for f, place in zip(frames, places, strict=True)]
@@ -298,36 +298,36 @@ class SeenPoses:
         """Returns a pose by its name, with a camera for each frame; of a tag, the one that fits better."""
         if name in self._poses:
             return self._poses[name]
-        settings, own, loaded = self.settings, self.data.poses[name], self._loaded[name]
+        settings, wanted, loaded = self.settings, self.data.poses[name], self._loaded[name]
         mesh, clamps = self._mesh(name)
         fixed = np.unique(np.concatenate(clamps))
         material = self.material(name)
-        if own.gravity is not None:
-            settings = settings.model_copy(update={"gravity": own.gravity})
+        if wanted.gravity is not None:
+            settings = settings.model_copy(update={"gravity": wanted.gravity})
         simulator = build_simulator(settings, material, Body(mesh, fixed=fixed, **dict(settings.physics)))
         points = None
-        if own.points is not None:
+        if wanted.points is not None:
             points = bind_markers(mesh, [*self.data.points.values()], [*self.data.points])
         centre = torch.as_tensor(mesh.vertices[fixed].mean(0))
-        scene, photos, surface = scene_of(self.data, own, self.run_dir), list[Photo](), ClosedSurface.of(mesh)
+        scene, photos, surface = scene_of(self.data, wanted, self.run_dir), list[Photo](), ClosedSurface.of(mesh)
         for number, frame in enumerate(self._frames(name)):
             camera = PlacedCamera(
                 self.lenses[frame.lens], torch.as_tensor(loaded["world_to_camera"][number, 0]), centre
             )
-            outline = Outline.of_mask(loaded[f"masks/{frame.number}"]) if own.outline else None
+            outline = Outline.of_mask(loaded[f"masks/{frame.number}"]) if wanted.outline else None
             tracked = loaded["tracked"][number] if "tracked" in loaded else None
             cloud, depth = None, loaded.get(f"depths/{frame.number}")
             if depth is not None:
                 cloud = self._cloud(frame.files[0], Cloud.of_depth(depth), camera, mesh, fixed)
             row_time = self.data.lenses[frame.lens].row_time
-            title, time = f"{own.folder}/{frame.image.name}", frame.time or 0.0
+            title, time = f"{wanted.folder}/{frame.image.name}", frame.time or 0.0
             photos.append(Photo(title, camera, outline, tracked, cloud, frame.lens, time, row_time))
         if (scan := loaded.get("scan")) is not None:
             camera = PlacedCamera(None, torch.as_tensor(scene.scan_pose), centre)
             outside = scan + loaded["scan_normals"] if "scan_normals" in loaded else None
-            cloud = self._cloud(scene.path.parent / str(own.cloud), Cloud(scan, outside), camera, mesh, fixed)
-            photos.append(Photo(f"{own.folder}/{own.cloud}", camera, cloud=cloud))
-        release, material_name = released_force(name, own, mesh), own.material or ""
+            cloud = self._cloud(scene.path.parent / str(wanted.cloud), Cloud(scan, outside), camera, mesh, fixed)
+            photos.append(Photo(f"{wanted.folder}/{wanted.cloud}", camera, cloud=cloud))
+        release, material_name = released_force(name, wanted, mesh), wanted.material or ""
         pose = SeenPose(name, simulator, surface, clamps, tuple(photos), material_name, points, release=release)
         self._poses[name] = pose
         return pose
@@ -341,19 +341,19 @@ class SeenPoses:
 
     def _mesh(self, name: str) -> tuple[Mesh, tuple[IntArray, ...]]:
         """Mesh of a pose, and the vertices in its clamps."""
-        own = self.data.poses[name]
-        scene = scene_of(self.data, own, self.run_dir)
-        if own.mesh is None:
+        pose = self.data.poses[name]
+        scene = scene_of(self.data, pose, self.run_dir)
+        if pose.mesh is None:
             mesh = build_mesh(self.settings.mesh)
         else:
-            mesh = read_mesh(scene.path.parent / own.mesh, self.data.units)
+            mesh = read_mesh(scene.path.parent / pose.mesh, self.data.units)
         corners = len(mesh.vertices)
         if wrong := [clamp for clamp in scene.clamps if clamp.min() < 0 or clamp.max() >= corners]:
             raise DataFileError(
                 f"{scene.path}: 'fixed' has vertices from {wrong[0].min()} to {wrong[0].max()}, but the mesh has those "
                 f"from 0 to {corners - 1}."
             )
-        if own.mesh is not None and self.data.order == 2:
+        if pose.mesh is not None and self.data.order == 2:
             mesh = quadratic(mesh)
         clamps = tuple(_with_midpoints(mesh, clamp) for clamp in scene.clamps)
         if clamps:
@@ -381,6 +381,6 @@ def read_lenses(data: PictureData) -> dict[str, Lens]:
     """
     folder = Path(data.folder or ".").expanduser()
     return {
-        name: Lens(torch.tensor(own.matrix, dtype=torch.float64)) if own.file is None else Lens.read(folder / own.file)
-        for name, own in data.lenses.items()
+        name: Lens(torch.tensor(one.matrix, dtype=torch.float64)) if one.file is None else Lens.read(folder / one.file)
+        for name, one in data.lenses.items()
     }

@@ -208,7 +208,7 @@ def _verticals(recorded: RegisteredTrials) -> tuple[FloatArray | None, FloatArra
     up, configured = recorded.data.up, np.asarray(recorded.settings.gravity, dtype=np.float64)
     if up is None:
         return None, configured
-    verticals = np.stack([own.transform.rotation @ unit_vector(up) for own in recorded.registrations])
+    verticals = np.stack([fit.transform.rotation @ unit_vector(up) for fit in recorded.registrations])
     for recording, measured in zip(recorded.measured, verticals, strict=True):
         if configured.any() and _angle(measured, -configured) > _LARGEST_LEAN:
             down = ", ".join(f"{-x:.2f}" for x in measured)
@@ -231,25 +231,23 @@ def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, 
     trials, settings = recorded.trials, recorded.settings
     begins = ["released" if trial.is_released else trial.begins for trial in trials]
     begins = [UNDER_INPUTS if word == SLACK else word for word in begins]
-    resting = [len(own.positions) for own, word in zip(recorded.moving, begins, strict=True) if word in RESTING]
+    resting = [len(r.positions) for r, word in zip(recorded.moving, begins, strict=True) if word in RESTING]
     steps = settings.data.steps
     if resting:
         steps = steps or max(*resting, 2) - 1
     times, observed, smoothed, held = _series(recorded, bound, shifts, steps, steps + 1 if resting and steps else 1)
     at_steps = settings.time_step * np.arange(round(np.ceil(times.max() / settings.time_step - 1e-6)) + 1)
-    moved, driven, drive = any(own.base is not None for own in recorded.moving), dict[str, Any](), recorded.drive
+    moved, driven, drive = any(r.base is not None for r in recorded.moving), dict[str, Any](), recorded.drive
     if drive is not None:
         name = drive.quantity.name
         inputs = _inputs(recorded, steps or 1, len(drive.parts))
         driven = {"inputs": {name: inputs}, "channels": {name: drive.parts}, "units": {name: drive.quantity.unit}}
         if UNDER_INPUTS in begins:
-            first = [own.actuation[0] for own in recorded.moving if own.actuation is not None]
+            first = [r.actuation[0] for r in recorded.moving if r.actuation is not None]
             driven["resting"] = {name: np.array(first)}
     obstacles = {
-        name: _motion(
-            recorded, f"the obstacle {name!r}", [own.obstacles.get(name) for own in recorded.moving], at_steps
-        )
-        for name in dict.fromkeys(name for own in recorded.moving for name in own.obstacles)
+        name: _motion(recorded, f"the obstacle {name!r}", [r.obstacles.get(name) for r in recorded.moving], at_steps)
+        for name in dict.fromkeys(name for r in recorded.moving for name in r.obstacles)
     }
     sessions = tuple(trial.session or "" for trial in trials)
     return Trials(
@@ -264,7 +262,7 @@ def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, 
         time_step=settings.time_step,
         bound=bound,
         smoothed=smoothed if settings.data.cutoff is not None or {*begins} <= {*RESTING} else None,
-        base=_motion(recorded, "the base", [own.base for own in recorded.moving], at_steps) if moved else None,
+        base=_motion(recorded, "the base", [r.base for r in recorded.moving], at_steps) if moved else None,
         obstacles=obstacles,
         sessions=sessions if any(sessions) else (),
         **driven,
@@ -284,7 +282,7 @@ def _series(
         least: least number T of frames.
     """
     trials, cutoff, step = recorded.trials, recorded.data.cutoff, recorded.settings.time_step
-    lengths = [len(own.positions) if t.is_released else 1 for t, own in zip(trials, recorded.moving, strict=True)]
+    lengths = [len(moving.positions) if t.is_released else 1 for t, moving in zip(trials, recorded.moving, strict=True)]
     frames = max(*lengths, least)
     shape = (len(trials), frames, len(recorded.tracked), 3)
     observed, smoothed = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -330,10 +328,10 @@ def _motion(
 ) -> FloatArray:
     """(R, K + 1, 6) motion of the base or of an obstacle at the steps (K + 1,), from the poses at the frames."""
     motion, points = np.zeros((len(poses), len(at_steps), 6)), recorded.simulator.body.mesh.vertices
-    for row, (trial, moving, own) in enumerate(zip(recorded.trials, recorded.moving, poses, strict=True)):
-        if own is not None:
+    for row, (trial, moving, at_frames) in enumerate(zip(recorded.trials, recorded.moving, poses, strict=True)):
+        if at_frames is not None:
             zero = 0.0 if trial.is_released else moving.start  # of the simulation
-            motion[row] = at_times(own, moving.time - zero, at_steps)
+            motion[row] = at_times(at_frames, moving.time - zero, at_steps)
             check_steps(motion[row], points, moving.source, what)
     return motion
 

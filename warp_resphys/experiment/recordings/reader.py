@@ -102,8 +102,8 @@ class Reader:
         """(M, 3, 3) rotation of a rigid body from the undeformed body to the expected places; identity for markers."""
         turns = np.tile(np.eye(3), (len(self.tracked), 1, 1))
         if not trial.is_released:
-            for own in corners_of(self.tracked).values():
-                turns[own] = motion_between(self.nominal[own], self.hanging[own]).rotation
+            for corners in corners_of(self.tracked).values():
+                turns[corners] = motion_between(self.nominal[corners], self.hanging[corners]).rotation
         return turns
 
     def _posed(self, inputs: Inputs) -> FloatArray:
@@ -129,18 +129,18 @@ class Reader:
             if absent := [label for label in self.tracked if label not in labels]:
                 unused = [label for label in trial.labels or () if label not in owners(labels)]
                 lacking.setdefault((listed(owners(absent)), listed(unused) if unused else ""), []).append(trial.name)
-            own, unseen = recording.select(labels), self.view(trial).unseen
+            chosen, unseen = recording.select(labels), self.view(trial).unseen
             if unseen is not None:
                 assert self.rotation is not None  # A plane needs data.axes.
                 axis = self.rotation[unseen]
                 deep = np.concatenate([self.nominal[trial.tracked(self.tracked)], self._reference])[:, unseen]
                 positions, rest = (
                     None if points is None else points + (deep - points @ axis)[..., None] * axis
-                    for points in (own.positions, own.rest)
+                    for points in (chosen.positions, chosen.rest)
                 )
                 assert positions is not None
-                own = replace(own, positions=positions, rest=rest)
-            result.append(own)
+                chosen = replace(chosen, positions=positions, rest=rest)
+            result.append(chosen)
         for (markers, others), names in lacking.items():
             log.log(
                 logging.WARNING if others else logging.INFO,
@@ -207,7 +207,7 @@ class Reader:
         static = [(t, r) for t, r in zip(trials, recordings, strict=True) if t.begins == STATIC and t.labels is None]
         if static:
             posed = self._posed(self._held(*zip(*static, strict=True)))
-            places |= {trial.name: own for (trial, _), own in zip(static, posed, strict=True)}
+            places |= {trial.name: posed_places for (trial, _), posed_places in zip(static, posed, strict=True)}
         labelled = []
         for trial, recording in zip(trials, recordings, strict=True):
             if trial.labels is not None:

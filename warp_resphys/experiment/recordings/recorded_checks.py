@@ -29,9 +29,9 @@ def check_recorded(run: RunSettings, data: RecordedData, markers: MarkerSettings
     if run.is_laboratory and run.laboratory is not None and not run.laboratory.trials and not data.sequences:
         raise InputError("laboratory.trials is empty: name the trials, or set data.sequences.")
     files: dict[str, str] = {}
-    for name, own in data.trials.items():
-        if own.file is not None and (other := files.setdefault(own.file, name)) != name:
-            raise InputError(f"the trials '{other}' and '{name}' have the same file, {own.file}: use it once.")
+    for name, one in data.trials.items():
+        if one.file is not None and (other := files.setdefault(one.file, name)) != name:
+            raise InputError(f"the trials '{other}' and '{name}' have the same file, {one.file}: use it once.")
     if folds_of(run) is None:
         split_of(run)
     trials = trials_of(run)

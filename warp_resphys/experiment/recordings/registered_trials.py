@@ -57,11 +57,11 @@ class RegisteredTrials(Reader):
         super().__init__(context)
         self.trials: Sequence[Trial] = context.settings.trials
         timed = [self._timed(*pair) for pair in zip(self.trials, self.read(self.trials), strict=True)]
-        self.measured, self.releases = [own for own, _ in timed], [release for _, release in timed]
+        self.measured, self.releases = [recording for recording, _ in timed], [release for _, release in timed]
         self._check_reference()
         begun = [self._begun(*row) for row in zip(self.trials, self.measured, self.releases, strict=True)]
         self.rests, self.shows_places = [rest for _, rest, _ in begun], [shows for *_, shows in begun]
-        self.moving = [own for own, *_ in begun]
+        self.moving = [recording for recording, *_ in begun]
         self.registrations = self._registered()
         rows = range(len(self.trials))
         self.moving = [
@@ -288,7 +288,7 @@ class RegisteredTrials(Reader):
         obstacles = prescribed_all(self.data.obstacle_motion, trial.obstacle_motion, moving.time, folder or ".")
         obstacles |= {name: in_frame(poses, frame) for name, poses in moving.obstacles.items()}
         moved = {} if base is None else {"the base moves the body": base}
-        for what, poses in (moved | {f"the obstacle {name!r} moves": own for name, own in obstacles.items()}).items():
+        for what, poses in (moved | {f"the obstacle {name!r} moves": path for name, path in obstacles.items()}).items():
             early = poses[: 1 if trial.is_released else self._rest_frames(whole)]
             shift = rigid(early).apply(np.broadcast_to(self.nominal, (len(early), *self.nominal.shape))) - self.nominal
             if (furthest := float(np.linalg.norm(shift, axis=-1).max())) > self.markers.largest_residual:

@@ -79,28 +79,28 @@ def _squared(coefficients):
 
 def test_an_equilibrium_lasts(model):
     state = model.rest(np.array([3.0, 1.5]), count=2)
-    motion = model.move(state, np.tile([3.0, 1.5], (20, 2, 1)))
-    np.testing.assert_allclose(motion.end.z, state.z, atol=1e-6)
-    np.testing.assert_allclose(model.observe(motion.end)[0], model.rest_observed(np.array([[3.0, 1.5]]))[0], atol=1e-5)
+    end = model.move(state, np.tile([3.0, 1.5], (20, 2, 1)))[2]
+    np.testing.assert_allclose(end.z, state.z, atol=1e-6)
+    np.testing.assert_allclose(model.observe(end)[0], model.rest_observed(np.array([[3.0, 1.5]]))[0], atol=1e-5)
 
 
 def test_a_transition_of_states_that_are_moved_with_their_past_is_linearised(model):
     """By differences over small changes, for the first of two models; the second only goes on."""
     random, inputs = np.random.default_rng(6), np.array([2.5, 1.0])
-    start = model.move(model.rest(np.full(PARTS, 2.0), 2), np.tile(inputs, (4, 2, 1))).end
+    start = model.move(model.rest(np.full(PARTS, 2.0), 2), np.tile(inputs, (4, 2, 1)))[2]
     weights, way = random.standard_normal(2 * MODES), random.standard_normal((3, MODES))
     bias = np.stack([np.full(MODES, 1e-2), np.zeros(MODES)])
-    end, slopes, _ = model.transition(start, inputs, bias)
+    end, slopes = model.transition(start, inputs, bias)
     for number, slope in enumerate(np.split(slopes, 3, axis=1)):
 
         def after(x, number=number):
             z, v, b = (x * way * (np.arange(3) == number)[:, None])[:, None]
-            state = model.move(start.select([0]).moved(z, v, model.time_step), inputs[None, None], bias[0] + b).end
+            state = model.move(start.select([0]).moved(z, v, model.time_step), inputs[None, None], bias[0] + b)[2]
             return float(weights @ np.concatenate([state.z[0], state.v[0]]))
 
         difference, doubt = central_difference(after)
         assert abs(weights @ slope @ way[number] - difference) < 1e-3 * abs(difference) + 10.0 * doubt
-    np.testing.assert_allclose(end.z[1], model.move(start, np.tile(inputs, (1, 2, 1))).end.z[1], atol=1e-12)
+    np.testing.assert_allclose(end.z[1], model.step(start, np.tile(inputs, (2, 1))).z[1], atol=1e-12)
 
 
 def test_a_command_that_never_varies_changes_nothing(model):
@@ -149,7 +149,7 @@ def test_models_at_once_do_not_see_each_other_and_begin_again_by_themselves(mode
     for number, now in enumerate(inputs):
         if number == 4:
             batch = first.where(np.array([False, True, False]), batch)
-        batch = model.move(batch, now[None]).end
+        batch = model.step(batch, now)
     for row, since in enumerate((0, 4, 0)):
         wanted = model.respond(model.rest(rest), inputs[since:, row : row + 1])[-1, 0]
         np.testing.assert_allclose(model.observe(batch)[row], wanted, atol=1e-12)

@@ -1,9 +1,9 @@
 """Files of the control stages in a run folder: reduced models, plans, driven motions, baselines."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -25,6 +25,10 @@ _KINDS: Final = {"damping": SquaredPolynomial, "branches": SquaredPolynomial}
 _BASELINES: Final = "baselines"
 _UNITS: Final = {"path": "m", "points": "m", "markers": "m", "errors_mm": "mm", "seconds": "s"}
 _PLAIN: Final = ("time_step", "validation_mm")  # of a linear model
+PLANNED: Final = "plans"  # kinds of files
+PLAYED: Final = DRIVEN.removesuffix(".h5")
+
+Arrays = Mapping[str, FloatArray]
 
 
 def reduced_file(model: str) -> str:
@@ -84,62 +88,30 @@ def read_quality(path: Path) -> Mapping[str, Any]:
     return quality
 
 
-@dataclass(frozen=True)
-class PlannedMotion:
-    """A motion planned on a model.
+def write_motions(path: Path, kind: str, motions: Mapping[str, Arrays], **more: Any) -> None:
+    """Writes motions by name, and what they have in common.
 
-    Attributes:
-        path: (T, d) reference of the point after each step [m].
-        inputs: (T, n) during each step.
-        points: (T, d) predicted by the model [m].
-        markers: (T + 1, 3 M) predicted by the model, at the beginning and after each step [m].
-        errors_mm: mean distances of points and path, of the first plan and after each correction by the robot.
+    Args:
+        path: path of the file.
+        kind: ``plans``, or ``driven`` by C controllers.
+        motions: arrays by name. Of every motion: ``path`` (T, d), reference of the point after each step [m]. Of plans:
+            ``inputs`` (T, n) during each step; ``points`` (T, d) and ``markers`` (T + 1, 3 M) predicted by the model
+            [m]; ``errors_mm``, mean distances of points and path, of the first plan and after each correction by the
+            robot. Of driven motions: ``points`` (C, T, d) measured [m], ``inputs`` (C, T, n), and ``seconds`` (C, T),
+            computing time of the commands.
+        more: attributes of the file.
     """
-
-    path: FloatArray
-    inputs: FloatArray
-    points: FloatArray
-    markers: FloatArray
-    errors_mm: FloatArray
-
-
-@dataclass(frozen=True)
-class DrivenMotion:
-    """A motion that C controllers have driven.
-
-    Attributes:
-        path: (T, d) reference of the point after each step [m].
-        points: (C, T, d) measured [m].
-        inputs: (C, T, n) commanded.
-        seconds: (C, T) computing time of the commands.
-    """
-
-    path: FloatArray
-    points: FloatArray
-    inputs: FloatArray
-    seconds: FloatArray
-
-
-PLANNED: Final = ("plans", PlannedMotion)  # kinds of files, and of motions in them
-PLAYED: Final = (DRIVEN.removesuffix(".h5"), DrivenMotion)
-
-Motion = TypeVar("Motion", PlannedMotion, DrivenMotion)
-
-
-def write_motions(path: Path, kind: tuple[str, type[Motion]], motions: Mapping[str, Motion], **more: Any) -> None:
-    """Writes motions by name, and what they have in common."""
-    with atomic_hdf5(path, kind[0], {"names": list(motions), **more}) as file:
+    with atomic_hdf5(path, kind, {"names": list(motions), **more}) as file:
         for name, motion in motions.items():
             group = file.create_group(name)
-            for key, values in vars(motion).items():
-                time_axis = int(kind[1] is DrivenMotion and key != "path")
-                create(group, key, values, _UNITS.get(key, "1"), time_axis)
+            for key, values in motion.items():
+                create(group, key, values, _UNITS.get(key, "1"), int(kind == PLAYED and key != "path"))
 
 
-def read_motion(path: Path, kind: tuple[str, type[Motion]], motion: str) -> Motion:
-    """Reads one motion."""
-    with read_hdf5(path, kind[0]) as file:
-        return kind[1](*(read_array(file, f"{motion}/{key.name}").astype(np.float64) for key in fields(kind[1])))
+def read_motion(path: Path, kind: str, motion: str) -> dict[str, FloatArray]:
+    """Reads the arrays of one motion by name (`write_motions`)."""
+    with read_hdf5(path, kind) as file:
+        return {key: read_array(file, f"{motion}/{key}").astype(np.float64) for key in file[motion]}
 
 
 def write_baselines(path: Path, linear: LinearModel, jacobian: FloatArray) -> None:
@@ -157,5 +129,5 @@ def read_baselines(path: Path) -> tuple[LinearModel, FloatArray]:
     return LinearModel(**values), jacobian
 
 
-def _tensors(arrays: Mapping[str, FloatArray]) -> dict[str, torch.Tensor]:
+def _tensors(arrays: Arrays) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}

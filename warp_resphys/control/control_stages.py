@@ -27,8 +27,6 @@ from .control_files import (
     BASELINES,
     PLANNED,
     PLAYED,
-    DrivenMotion,
-    PlannedMotion,
     plan_table,
     plans_file,
     read_baselines,
@@ -40,6 +38,7 @@ from .control_files import (
     write_motions,
     write_reduced,
 )
+from .control_files import Arrays as MotionArrays
 from .controllers import Controller, JacobianFeedback, LinearRecedingHorizon, RecedingHorizon
 from .linear_model import fit_linear
 from .plan import follow, tracked_of
@@ -83,7 +82,7 @@ def plan_motions(context: StageContext) -> None:
         task.check_reach(reduced, plan.reach)
     # The point starts where the recordings have it before anything moved.
     start = task.tracked @ np.nanmean(Trials.read(context.run_dir / DATASET).held, axis=0).ravel()
-    plans = dict[str, PlannedMotion]()
+    plans = dict[str, MotionArrays]()
     total = (plan.corrections + 1) * sum(map(task.steps, settings.control.seconds))
     with Progress(context.name, total, "steps") as progress:
         for seconds in settings.control.seconds:
@@ -93,8 +92,8 @@ def plan_motions(context: StageContext) -> None:
     write_motions(context.run_dir / plans_file(model), PLANNED, plans)
     driven = driven_input(robot)
     for name, motion in plans.items():
-        columns = input_columns(driven.name, driven.parts, driven.unit, motion.inputs)
-        markers = motion.markers.reshape(len(motion.markers), -1, 3)
+        columns = input_columns(driven.name, driven.parts, driven.unit, motion["inputs"])
+        markers = motion["markers"].reshape(len(motion["markers"]), -1, 3)
         times = robot.time_step * np.arange(len(markers), dtype=np.float64)
         write_csv(context.run_dir / plan_table(model, name), times, robot.labels, markers, columns)
 
@@ -164,9 +163,9 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     motions = {}
     for part in cut_up:
         (name,) = part.names
-        points, inputs, took = (parts.read(part, key) for key in ("points", "inputs", "seconds"))
-        path = read_motion(context.run_dir / plans_file(control.models[-1]), PLANNED, name).path
-        motions[name] = DrivenMotion(path, points, inputs, took)
+        path = read_motion(context.run_dir / plans_file(control.models[-1]), PLANNED, name)["path"]
+        driven = {key: parts.read(part, key) for key in ("points", "inputs", "seconds")}
+        motions[name] = {"path": path, **driven}
     common = {"controllers": controllers, "time_step": robot.time_step}
     write_motions(context.run_dir / DRIVEN, PLAYED, motions, **common)
     write_json(context.run_dir / CONTROL, _summary(context.run_dir, control, controllers, motions))
@@ -190,7 +189,7 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
     laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
     plans = {model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models}
-    rest, path = laboratory.rest(), plans[control.models[-1]].path
+    rest, path = laboratory.rest(), plans[control.models[-1]]["path"]
     linear, jacobian = read_baselines(folder / BASELINES)
     controllers = list[Controller]()
     for model in control.receding:
@@ -207,7 +206,7 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     for step in range(steps):
         seen = laboratory.seen(step)
         acting, took = np.zeros((count, task.parts)), np.zeros(count)
-        acting[: len(plans)] = [plan.inputs[step] for plan in plans.values()]
+        acting[: len(plans)] = [plan["inputs"][step] for plan in plans.values()]
         for row, controller in enumerate(controllers, len(plans)):
             began = time.perf_counter()
             acting[row] = controller(step, seen[row])
@@ -222,13 +221,13 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
 
 
 def _summary(
-    folder: Path, control: ControlSettings, controllers: Sequence[str], motions: Mapping[str, DrivenMotion]
+    folder: Path, control: ControlSettings, controllers: Sequence[str], motions: Mapping[str, MotionArrays]
 ) -> dict[str, Any]:
     """Content of control.json: errors [mm] by speed and controller, computing times, quality of the reduced models."""
     by_speed: dict[str, Any] = {}
     for seconds in control.seconds:
         names = [motion_name(shape, seconds) for shape in control.shapes]
-        errors = {name: 1e3 * np.linalg.norm(motions[name].points - motions[name].path, axis=2) for name in names}
+        errors = {name: 1e3 * np.linalg.norm(motions[name]["points"] - motions[name]["path"], axis=2) for name in names}
         by_speed[f"{seconds:g}"] = {
             controller: {
                 "mean_mm": float(np.mean([of_motion[row].mean() for of_motion in errors.values()])),
@@ -237,9 +236,9 @@ def _summary(
             }
             for row, controller in enumerate(controllers)
         }
-    times = np.concatenate([motion.seconds for motion in motions.values()], axis=1)
+    times = np.concatenate([motion["seconds"] for motion in motions.values()], axis=1)
     planned = {
-        model: {name: read_motion(folder / plans_file(model), PLANNED, name).errors_mm.tolist() for name in motions}
+        model: {name: read_motion(folder / plans_file(model), PLANNED, name)["errors_mm"].tolist() for name in motions}
         for model in control.models
     }
     models = {model: read_quality(folder / reduced_file(model)) for model in control.models}
@@ -295,13 +294,13 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     _check("controllers", controllers, names)
     robot = load(folder, control.models[-1], settings.device)
     driven, rows = read_motion(folder / DRIVEN, PLAYED, motion), [names.index(name) for name in controllers]
-    steps = max(int(min(len(driven.path), seconds / robot.time_step)), 1)
+    steps = max(int(min(len(driven["path"]), seconds / robot.time_step)), 1)
     laboratory = Laboratory(settings, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control.tracked)
     bodies, points = [laboratory.bodies()[1]], [laboratory.markers()]
     with Progress("laboratory", steps, "steps") as progress:
         for number in range(steps):
-            laboratory.step(driven.inputs[rows, number])
+            laboratory.step(driven["inputs"][rows, number])
             bodies.append(laboratory.bodies()[1])
             points.append(laboratory.markers())
             progress.advance()
@@ -311,7 +310,7 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
         laboratory.bodies()[0],
         dict(zip(controllers, np.stack(bodies, 1), strict=True)),
         dict(zip(controllers, markers.reshape(*markers.shape[:2], -1) @ tracked.T, strict=True)),
-        driven.path,
+        driven["path"],
         np.array([control.right, control.up], dtype=np.float64),
         np.asarray(robot.simulator.gravity, dtype=np.float64),
     )

@@ -62,7 +62,7 @@ class Estimator:
     def predict(self, inputs: FloatArray) -> None:
         """Advances the estimate by one step under inputs (n,)."""
         transition = np.eye(3 * self.model.modes)
-        self.state, transition[: 2 * self.model.modes], _ = self.model.transition(self.state, inputs, self.bias[None])
+        self.state, transition[: 2 * self.model.modes] = self.model.transition(self.state, inputs, self.bias[None])
         self._covariance = transition @ self._covariance @ transition.T + np.diag(self._wander)
 
     def correct(self, markers: FloatArray) -> None:

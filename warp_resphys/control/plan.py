@@ -19,7 +19,6 @@ from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.robot import Robot
 from ..settings.control import LimitsOfInputs
-from .control_files import PlannedMotion
 from .linear_model import LinearModel
 from .polynomials import around
 from .reduced_model import ReducedModel
@@ -173,8 +172,8 @@ def follow(
     paths: FloatArray,
     corrections: int,
     on_progress: OnProgress = lambda steps: None,
-) -> list[PlannedMotion]:
-    """Returns the best plans for paths.
+) -> list[dict[str, FloatArray]]:
+    """Returns the best plans for paths, as arrays by name (`control_files.write_motions`).
 
     Args:
         robot: whose point follows the paths.
@@ -206,7 +205,10 @@ def follow(
                 shares[row] *= _SHORTER
         inputs = kept + shares[:, None, None] * (wanted - kept)
     rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
-    return [PlannedMotion(path, own, markers[1:] @ tracked.T, markers, mm) for path, own, markers, mm in rows]
+    return [
+        {"path": path, "inputs": own, "points": markers[1:] @ tracked.T, "markers": markers, "errors_mm": mm}
+        for path, own, markers, mm in rows
+    ]
 
 
 def _planned(model: ReducedModel, planner: Planner, offset: FloatArray) -> FloatArray:
@@ -215,7 +217,7 @@ def _planned(model: ReducedModel, planner: Planner, offset: FloatArray) -> Float
     steps = max(planner.steps // _PLAYED, 1)
     for number in range(0, len(planner.path), steps):
         now = planner.plan(number, state, offset=offset, played=steps)[: min(steps, len(planner.path) - number)]
-        state = model.move(state, now[:, None]).end
+        state = model.move(state, now[:, None])[2]
         inputs.append(now)
     return np.concatenate(inputs)
 

@@ -63,6 +63,7 @@ class ReducedState:
         memory: of the inputs' response, entries (..., B, n).
         previous: (2, B, r) coordinates and rates one step earlier.
         looks_back: (B,) whether the integrator may use ``previous``; false before the first step.
+        left: (B,) whether the learned force was ever evaluated outside its training range.
     """
 
     z: FloatArray
@@ -72,6 +73,7 @@ class ReducedState:
     memory: Mapping[str, FloatArray]
     previous: FloatArray
     looks_back: BoolArray
+    left: BoolArray
 
     def moved(self, z: FloatArray, v: FloatArray, time_step: float) -> "ReducedState":
         """Returns the state with its coordinates (B, r) and rates changed at once, and a past that fits them."""
@@ -191,8 +193,8 @@ class ReducedModel:
         u = self._moving(self.response.scaled(commands))
         z = np.repeat(self._equilibrium(Monomials(u[:1])), count, axis=0)
         still, relaxed = np.stack([z, np.zeros_like(z)]), np.zeros((len(self.times), *z.shape))
-        memory, begins = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
-        return ReducedState(still[0], still[1], relaxed, u, memory, still, begins)
+        memory, no = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
+        return ReducedState(still[0], still[1], relaxed, u, memory, still, no, no)
 
     def _equilibrium(self, u: Monomials) -> FloatArray:
         """Coordinates (S, r) with A (z - z_0) = learned force, by Newton's method with step halving."""
@@ -258,13 +260,22 @@ class ReducedModel:
         bent = (off @ self.curved.reshape(r, -1)).reshape(len(z), r, -1)
         return np.asarray(self.shown(u) + 2.0 * bent.swapaxes(1, 2))
 
-    def move(self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None) -> "ReducedMotion":
-        """Advances B models by T steps.
+    def step(self, state: ReducedState, inputs: FloatArray) -> ReducedState:
+        """Returns the state of B models after a step under commands (B, n)."""
+        return self.move(state, inputs[None])[2]
+
+    def move(
+        self, start: ReducedState, inputs: FloatArray, bias: FloatArray | None = None
+    ) -> tuple[FloatArray, Monomials, ReducedState]:
+        """Advances B models by T steps, whose matrices are computed at once.
 
         Args:
             start: their state.
             inputs: (T, B, n) commanded during each step, in their unit.
             bias: (r,) or (B, r), added to the equilibria z_0.
+
+        Returns:
+            Coordinates (T, B, r) after each step, monomials of the (T B, n') moving inputs, and the last state.
         """
         acting, means, memory = self.response(start.memory, inputs)
         acting, means = self._moving(acting), self._moving(means)
@@ -283,7 +294,7 @@ class ReducedModel:
         pull = (a @ shifted[..., None])[..., 0]
         force = self._force(u, means.reshape(len(means), len(u.points), n))
         now, before, states = np.stack([start.z, start.v]), start.previous, list[FloatArray]()
-        strain, left = start.strains, np.zeros(batch, dtype=np.bool_)
+        strain, left = start.strains, start.left
         for k in range(steps):
             rows = slice(k * batch, (k + 1) * batch)
             at, rate = (1.0 + share[rows]) * now - share[rows] * before
@@ -291,13 +302,13 @@ class ReducedModel:
             right += (held[rows] @ now[0, ..., None])[..., 0] - np.einsum("bkrq,kbq->br", carried[rows], strain)
             if force is not None:
                 right += force(rows, now)
-                left |= force.left
+                left = left | force.left
             z = (inverse[rows] @ right[..., None])[..., 0]
             strain = self.relaxed(strain, z - now[0])
             now, before = np.stack([z, (z - at) / step[rows]]), now
             states.append(z)
-        end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, np.ones(batch, dtype=np.bool_))
-        return ReducedMotion(self, u, np.stack(states), left, end)
+        end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, np.ones(batch, dtype=np.bool_), left)
+        return np.stack(states), u, end
 
     def relaxed(self, strains: FloatArray, change: FloatArray) -> FloatArray:
         """Returns y_k after a step in which the coordinates change; (K, ...) and (...)."""
@@ -308,11 +319,13 @@ class ReducedModel:
         """Predicts the observed points (T, B, 3 M) of B motions over T steps [m].
 
         Args:
-            start: state of one model.
+            start: state of B models, or of one.
             inputs: (T, B, n) commanded during each step, in their unit.
             bias: (r,) added to the equilibria z_0.
         """
-        return self.move(start.select([0] * inputs.shape[1]), inputs, bias).y
+        batch = inputs.shape[1]
+        z, u, _ = self.move(start.select([0] * batch) if len(start.z) == 1 else start, inputs, bias)
+        return self.points(z.reshape(-1, self.modes), u).reshape(len(z), batch, -1)
 
     @cached_property
     def amounts(self) -> FloatArray:
@@ -321,9 +334,7 @@ class ReducedModel:
         stiffness = self.stiffness(np.zeros((1, len(self.moving))))[0]
         return np.concatenate([moved, moved * np.sqrt(np.abs(np.diag(stiffness))), moved])
 
-    def transition(
-        self, start: ReducedState, inputs: FloatArray, bias: FloatArray
-    ) -> tuple[ReducedState, FloatArray, bool]:
+    def transition(self, start: ReducedState, inputs: FloatArray, bias: FloatArray) -> tuple[ReducedState, FloatArray]:
         """Advances B models by a step, and the first also from other states.
 
         Args:
@@ -332,38 +343,14 @@ class ReducedModel:
             bias: (B, r), added to the equilibria z_0.
 
         Returns:
-            Their state after it; derivatives (2 r, 3 r) of that of the first model by z, v and the bias, where z and v
-            are moved with their past (`ReducedState.moved`); and whether its force left its training range.
+            Their state after it, and derivatives (2 r, 3 r) of that of the first model by z, v and the bias, where z
+            and v are moved with their past (`ReducedState.moved`).
         """
         count, r = len(bias), self.modes
         rows = [*range(count), *([0] * 3 * r)]
         z, v, b = np.split(np.concatenate([np.zeros((count, 3 * r)), np.diag(self.amounts)]), 3, axis=1)
         states = start.select(rows).moved(z, v, self.time_step)
-        motion = self.move(states, np.tile(inputs, (1, len(rows), 1)), bias[rows] + b)
-        after = np.concatenate([motion.end.z, motion.end.v], axis=1)
+        end = self.move(states, np.tile(inputs, (1, len(rows), 1)), bias[rows] + b)[2]
+        after = np.concatenate([end.z, end.v], axis=1)
         slopes = ((after[count:] - after[0]) / self.amounts[:, None]).T
-        return motion.end.select(range(count)), slopes, bool(motion.left[0])
-
-
-@dataclass(frozen=True)
-class ReducedMotion:
-    """T steps of B models.
-
-    Attributes:
-        model: the reduced model.
-        u: monomials of the (T B, n) inputs.
-        z: (T, B, r) coordinates after each step.
-        left: (B,) whether the learned force was evaluated outside its training range.
-        end: the last state.
-    """
-
-    model: ReducedModel
-    u: Monomials
-    z: FloatArray
-    left: BoolArray
-    end: ReducedState
-
-    @property
-    def y(self) -> FloatArray:
-        """Observed points (T, B, 3 M) after each step [m]."""
-        return self.model.points(self.z.reshape(-1, self.model.modes), self.u).reshape(*self.z.shape[:2], -1)
+        return end.select(range(count)), slopes

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -191,68 +191,62 @@ def _equilibria(source: Source, asked: int, seed: int, on_progress: OnProgress) 
     return _Statics(q, y, commands, source.acting(commands), np.concatenate(outputs) if outputs else None)
 
 
-def _assembled(
-    source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions
-) -> tuple[ReducedModel, FloatArray, FloatArray, FloatArray]:
-    """Fits the dynamics of the model, without y_0 and H.
+class _Subspace(NamedTuple):
+    """The coordinates of a model, and those of its samples."""
 
-    The deviation of the network's outputs from c_0 at an equilibrium is subtracted through the model's own linear
-    response, so that z_0 and p are smooth functions of the inputs even if the network is not.
+    basis: torch.Tensor  # Psi, (3 N, r)
+    shapes: torch.Tensor  # (S', 3 N, r) vibrations about S' of the equilibria
+    turned: FloatArray  # T, (S', r, r) of these
+    statics: FloatArray  # (S, r) of the equilibria
+    z: FloatArray  # (T + 1, B, r) of the motions
+    rates: FloatArray  # (T + 1, B, r) [1/s]
 
-    Returns:
-        The model, coordinates (S, r) of the equilibria, and coordinates and rates (T + 1, B, r) of the motions.
-    """
-    unit = statics.u
-    shapes = torch.stack([tangent.shapes for tangent in tangents])  # (S', 3 N, r)
+
+def _subspace(source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions) -> _Subspace:
+    """Returns the common subspace of vibrations, and the samples in its coordinates."""
+    shapes = torch.stack([tangent.shapes for tangent in tangents])
     basis = _common(shapes, source.mass)
     projector = source.mass[:, None] * basis
-    turned = torch.einsum("dr,sdk->srk", projector, shapes).cpu().numpy()
-    left, _, right = np.linalg.svd(turned)
-    turned = left @ right  # T is nearly orthogonal, but singular where a vibration leaves the subspace.
-    back = turned.mT
+    left, _, right = np.linalg.svd(torch.einsum("dr,sdk->srk", projector, shapes).cpu().numpy())
     z_statics = ((statics.q - source.rest).flatten(1).double() @ projector).cpu().numpy()
     z, rates = (
         torch.einsum("tbd,dr->tbr", field.flatten(2).double(), projector).cpu().numpy()
         for field in (motions.q - source.rest.float(), motions.v)
     )
+    # T is nearly orthogonal, but singular where a vibration leaves the subspace.
+    return _Subspace(basis, shapes, left @ right, z_statics, z, rates)
 
-    stiff = turned @ np.stack([tangent.stiffness for tangent in tangents]) @ back
-    order = best_order(unit, statics.y, STATIC_ORDER)
-    tangent_order = best_order(unit[: len(tangents)], stiff, TANGENT_ORDER)
+
+def _assembled(
+    source: Source, tangents: Sequence[Tangent], statics: _Statics, motions: Motions
+) -> tuple[ReducedModel, FloatArray, FloatArray, FloatArray]:
+    """Fits the dynamics of the model, without y_0 and H.
+
+    Returns:
+        The model, coordinates (S, r) of the equilibria, and coordinates and rates (T + 1, B, r) of the motions.
+    """
+    space, u = _subspace(source, tangents, statics, motions), statics.u
+    turned, known = space.turned, u[: len(tangents)]
+    stiff = turned @ np.stack([tangent.stiffness for tangent in tangents]) @ turned.mT
+    order, tangent_order = best_order(u, statics.y, STATIC_ORDER), best_order(known, stiff, TANGENT_ORDER)
 
     def fitted(values: FloatArray) -> Polynomial:
-        return Polynomial.fitted(unit[: len(tangents)], values, tangent_order)
-
-    stiffness = fitted(stiff)
+        return Polynomial.fitted(known, values, tangent_order)
 
     def squared(values: FloatArray) -> SquaredPolynomial:
-        """Fits matrices (S, ..., r, r) of the vibrations."""
+        """Fits matrices (S', ..., r, r) of the vibrations."""
         turn = turned.reshape(len(tangents), *np.ones(values.ndim - 3, dtype=int), *turned.shape[1:])
-        return SquaredPolynomial.fitted(
-            unit[: len(tangents)], turn @ values @ turn.mT, max(tangent_order, STATIC_ORDER)
-        )
+        return SquaredPolynomial.fitted(known, turn @ values @ turn.mT, max(tangent_order, STATIC_ORDER))
 
-    z_usual, force = z_statics, None
-    if statics.outputs is not None and source.learned is not None:
-        network = source.learned.network
-        push = fitted(turned @ np.stack([tangent.push for tangent in tangents if tangent.push is not None]))
-        usual = Polynomial.fitted(unit, statics.outputs, USUAL_ORDER)
-        moved = np.linalg.solve(stiffness(unit), push(unit) @ (statics.outputs - usual(unit))[..., None])[..., 0]
-        z_usual = z_statics - moved
-        both = [_modes_seen(coder, shapes, back) for coder in (network.position, network.velocity)]
-        seen = fitted(np.stack([scipy.linalg.block_diag(*pair) for pair in zip(*both, strict=True)]))
-        places = network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
-        places = np.pad(places, ((0, 0), (0, both[1].shape[1])))  # The rates are zero.
-        places = places - (seen(unit)[..., : shapes.shape[2]] @ moved[..., None])[..., 0]
-        at_rest = Polynomial.fitted(unit, places, order)
-        force = ReducedForce(network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push)
-    modes, labels = shapes.shape[2], source.robot.labels
-    static, psi = Polynomial.fitted(unit, z_usual, order), basis.cpu().numpy()
-    shape = (statics.q - source.rest).flatten(1).double().cpu().numpy() - (z_statics - static(unit)) @ psi.T
+    stiffness = fitted(stiff)
+    force, moved = _reduced_force(source, tangents, statics, space, stiffness, order, fitted)
+    static, psi = Polynomial.fitted(u, space.statics - moved, order), space.basis.cpu().numpy()
+    shape = (statics.q - source.rest).flatten(1).double().cpu().numpy() - (space.statics - static(u)) @ psi.T
+    modes, points = psi.shape[1], 3 * len(source.robot.labels)
     model = ReducedModel(
         source.robot.time_step,
         source.robot.simulator.integrator,
-        labels,
+        source.robot.labels,
         source.input.name,
         source.scale,
         source.range,
@@ -260,17 +254,47 @@ def _assembled(
         source.filters,
         source.times,
         static,
-        Polynomial(np.zeros((1, 3 * len(labels))), 0),
+        Polynomial(np.zeros((1, points)), 0),
         stiffness,
         squared(np.stack([tangent.damping for tangent in tangents])),
-        fitted(np.stack([tangent.shown for tangent in tangents]) @ back),
+        fitted(np.stack([tangent.shown for tangent in tangents]) @ turned.mT),
         squared(np.stack([tangent.branches for tangent in tangents])),
-        Polynomial.fitted(unit, shape, order),
+        Polynomial.fitted(u, shape, order),
         psi,
-        np.zeros((modes, modes, 3 * len(labels))),
+        np.zeros((modes, modes, points)),
         force,
     )
-    return model, z_statics, z, rates
+    return model, space.statics, space.z, space.rates
+
+
+def _reduced_force(
+    source: Source,
+    tangents: Sequence[Tangent],
+    statics: _Statics,
+    space: _Subspace,
+    stiffness: Polynomial,
+    order: int,
+    fitted: Callable[[FloatArray], Polynomial],
+) -> tuple[ReducedForce | None, FloatArray]:
+    """Returns the learned force of a model, and by how much (S, r) the deviation of its outputs moves the equilibria.
+
+    This deviation from c_0 is subtracted through the model's linear response, so that z_0 and p are smooth functions of
+    the inputs even if the network is not.
+    """
+    if statics.outputs is None or source.learned is None:
+        return None, np.zeros_like(space.statics)
+    u, network, back = statics.u, source.learned.network, space.turned.mT
+    push = fitted(space.turned @ np.stack([tangent.push for tangent in tangents if tangent.push is not None]))
+    usual = Polynomial.fitted(u, statics.outputs, USUAL_ORDER)
+    off = push(u) @ (statics.outputs - usual(u))[..., None]
+    moved: FloatArray = np.asarray(np.linalg.solve(stiffness(u), off)[..., 0], dtype=np.float64)
+    both = [_modes_seen(coder, space.shapes, back) for coder in (network.position, network.velocity)]
+    seen = fitted(np.stack([scipy.linalg.block_diag(*pair) for pair in zip(*both, strict=True)]))
+    places = network.position.encode((statics.q - network.rest.to(statics.q)).double()).cpu().numpy()
+    places = np.pad(places, ((0, 0), (0, both[1].shape[1])))  # The rates are zero.
+    places = places - (seen(u)[..., : moved.shape[1]] @ moved[..., None])[..., 0]
+    at_rest = Polynomial.fitted(u, places, order)
+    return ReducedForce(network, source.learned.range_, at_rest, seen, *source.conditions(), usual, push), moved
 
 
 def _modes_seen(coder: Coder, shapes: torch.Tensor, back: FloatArray) -> FloatArray:
@@ -328,11 +352,11 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
     off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)
     for at in range(2, len(commands) - steps, max(steps // 3, 1)):
         before = np.stack([z[at - 1], rates[at - 1]])
-        start = ReducedState(z[at], rates[at], strains[at], acting[at - 1], memories[at], before, looks)
-        predicted, true = model.move(start, commands[at : at + steps]).y, y[at + 1 : at + steps + 1]
+        start = ReducedState(z[at], rates[at], strains[at], acting[at - 1], memories[at], before, looks, ~looks)
+        predicted, true = model.respond(start, commands[at : at + steps]), y[at + 1 : at + steps + 1]
         off.append(_distances(predicted, true).mean())
         moved.append(_distances(np.broadcast_to(y[at], true.shape), true).mean())
-    whole = model.move(model.rest(count=z.shape[1]), commands).y
+    whole = model.respond(model.rest(), commands)
     return {
         "window_s": _WINDOW,
         "window_error_mm": float(np.mean(off)),

@@ -25,6 +25,7 @@ from ..robot.description import Description
 from ..robot.robot import Robot
 from ..settings.observed import MarkerSettings
 from ..settings.stage_keys import StageSettings
+from ..stepping.rollout import states
 from ..stepping.state import State
 from .reduced_model import ReducedModel
 
@@ -45,8 +46,11 @@ class World(ABC):
         parts: number n of its values.
         noise: standard deviation of observed markers [m]; None if the caller chooses it.
         travel: (3,) way by which commands may move a body as a whole [m].
+        state: of the bodies.
     """
 
+    state: Any
+    _rest: Any  # state from which bodies begin
     count: int
     time_step: float
     input: str
@@ -54,9 +58,9 @@ class World(ABC):
     noise: float | None = None
     travel: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    @abstractmethod
     def begin(self, chosen: BoolArray) -> None:
         """Brings the chosen bodies (B,) back to rest without inputs."""
+        self.state = self._rest.where(chosen, self.state)
 
     @abstractmethod
     def step(self, commands: FloatArray) -> BoolArray:
@@ -90,9 +94,6 @@ class RobotWorld(World):
         mixed: (k, n) from k commands to the n values of the input; the identity if omitted.
         shown: numbers of the observed points among all markers or vertices; all if omitted.
         time_step: h [s], a multiple of the robot's; that of the robot if omitted.
-
-    Attributes:
-        state: of the robots.
 
     Raises:
         InputError: there is no such input, or the run has no standard deviations of its parameters.
@@ -147,14 +148,10 @@ class RobotWorld(World):
             return self.robot.begin(self.count)
 
     @override
-    def begin(self, chosen: BoolArray) -> None:
-        self.state = self._rest.where(torch.as_tensor(chosen, device=self._rest.q.device), self.state)
-
-    @override
     @torch.no_grad()
     def step(self, commands: FloatArray) -> BoolArray:
-        for _ in range(self._substeps):
-            self.state = self.robot.step(self.state, **{self.input: commands @ self._mixed})
+        inputs = {self.input: commands @ self._mixed}
+        *_, self.state = states(lambda state, _: self.robot.step(state, **inputs), self.state, range(self._substeps))
         return np.asarray(self.state.lost.cpu().numpy())
 
     @override
@@ -262,23 +259,24 @@ class ReducedWorld(World):
     def __init__(self, model: ReducedModel, count: int) -> None:
         self._model, self.count, self.time_step = model, count, model.time_step
         self.input, self.parts = model.name, model.parts
-        self._rest = self._batch = model.rest(count=count)
+        self._rest = self.state = model.rest(count=count)
         self._furthest = _FURTHEST * np.abs(model.static.coefficients).max()
         self._lost = np.zeros(count, dtype=np.bool_)
 
     @override
     def begin(self, chosen: BoolArray) -> None:
-        self._batch, self._lost = self._rest.where(chosen, self._batch), self._lost & ~chosen
+        super().begin(chosen)
+        self._lost = self._lost & ~chosen
 
     @override
     def step(self, commands: FloatArray) -> BoolArray:
         with np.errstate(over="ignore", invalid="ignore"):
-            self._batch = self._model.move(self._batch, commands[None]).end
-        self._lost = self._lost | ~(np.abs(self._batch.z) < self._furthest).all(axis=1)
+            self.state = self._model.step(self.state, commands)
+        self._lost = self._lost | ~(np.abs(self.state.z) < self._furthest).all(axis=1)
         if self._lost.any():
-            self._batch = self._rest.where(self._lost, self._batch)
+            super().begin(self._lost)
         return self._lost
 
     @override
     def markers(self) -> FloatArray:
-        return self._model.observe(self._batch).reshape(self.count, -1, 3)
+        return self._model.observe(self.state).reshape(self.count, -1, 3)

@@ -28,6 +28,8 @@ from ..robot.actuation import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
+from ..stepping.rollout import states
+from ..stepping.state import State
 from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
 from .vector import ActionMapping, RobotVectorEnv
 
@@ -91,34 +93,36 @@ class GraspWorld(World):
         self._substeps = round(time_step / robot.time_step)
         self._height = np.zeros(count)
         with torch.no_grad():
-            self._state = self._rest = self._scene.begin(count)
+            self.state = self._rest = self._scene.begin(count)
 
     @override
     def begin(self, chosen: BoolArray) -> None:
+        super().begin(chosen)
         self._height = np.where(chosen, 0.0, self._height)
-        self._state = self._rest.where(torch.as_tensor(chosen, device=self._rest.q.device), self._state)
 
     @override
     @torch.no_grad()
     def step(self, commands: FloatArray) -> BoolArray:
-        height = self._height
-        for part in range(1, self._substeps + 1):
-            pose = np.zeros((self.count, 6))  # of the base, alike in the frames of both fingers
-            pose[:, 2] = height + (commands[:, 1] - height) * part / self._substeps
+        poses = np.zeros((self._substeps, self.count, 6))  # of the base, alike in the frames of both fingers
+        poses[..., 2] = np.linspace(self._height, commands[:, 1], self._substeps + 1)[1:]
+
+        def step(state: State, pose: FloatArray) -> State:
             inputs = {self.input: commands[:, :1], BASE: pose}
-            self._state = self._scene.step(self._state, dict.fromkeys(FINGERS, inputs))
+            return self._scene.step(state, dict.fromkeys(FINGERS, inputs))
+
+        *_, self.state = states(step, self.state, poses)
         self._height = commands[:, 1].copy()
-        return np.asarray(self._state.lost.cpu().numpy())
+        return np.asarray(self.state.lost.cpu().numpy())
 
     @override
     def markers(self) -> FloatArray:
-        fingers = torch.cat(list(self._scene.observe(self._state).values()), 1)
-        ball = self._state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
+        fingers = torch.cat(list(self._scene.observe(self.state).values()), 1)
+        ball = self.state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
         return np.asarray(torch.cat([fingers, ball], 1).double().cpu().numpy())
 
     @override
     def bodies(self) -> tuple[IntArray, FloatArray]:
-        return boundary_triangles(self._scene.scene.mesh), self._state.q.double().cpu().numpy()
+        return boundary_triangles(self._scene.scene.mesh), self.state.q.double().cpu().numpy()
 
     @override
     def obstacles(self) -> ObstacleSurface:

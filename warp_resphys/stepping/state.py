@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
+from ..io.arrays import BoolArray
 from ..io.errors import InputError
 from .inputs import check_tensor, shapes
 
@@ -95,8 +96,9 @@ class State:
         """Returns the state with all environments repeated several times."""
         return self.map(lambda tensor: torch.cat([tensor] * times))
 
-    def where(self, chosen: torch.Tensor, other: "State") -> "State":
+    def where(self, chosen: torch.Tensor | BoolArray, other: "State") -> "State":
         """Joins two states: this one where chosen (B,) bool, the other one elsewhere."""
+        chosen = torch.as_tensor(chosen, device=self.q.device)
         if bool(chosen.all()):
             return self
         mine, theirs = ({"previous_q": state.q, "previous_v": state.v} | state.tensors() for state in (self, other))

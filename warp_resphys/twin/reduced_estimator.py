@@ -28,11 +28,9 @@ class ReducedBelief(Belief):
 
     Attributes:
         state: of two models: the estimate, and the one without markers.
-        outside: whether the learned force was ever evaluated outside its training range.
     """
 
     state: ReducedState
-    outside: bool = False
 
 
 class ReducedEstimator(TwinEstimator[ReducedBelief]):
@@ -100,12 +98,12 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
     @override
     def advance(self, belief: ReducedBelief, inputs: Mapping[str, Given], renew: bool = True) -> ReducedBelief:
         bias = np.stack([belief.bias, np.zeros_like(belief.bias)])
-        end, transition, left = self.model.transition(belief.state, self._held(inputs), bias)
+        end, transition = self.model.transition(belief.state, self._held(inputs), bias)
         off = end.z - self.model.static(end.acting)
         far = np.linalg.norm((off @ self.model.basis.T).reshape(2, -1, 3), axis=2).max()
         if not far < DIVERGENCE_DISTANCE * self.size:
             raise ConvergenceError("the reduced model has diverged.", end.z, None)
-        return replace(self._propagated(belief, transition), state=end, outside=belief.outside or left)
+        return replace(self._propagated(belief, transition), state=end)
 
     @override
     def robot_state(self, belief: ReducedBelief) -> State:
@@ -113,7 +111,7 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
         simulator, (rate, *_) = self.robot.simulator, belief.state.v
         moved, faster = self.model.positions(belief.state)[:1], (self.model.basis @ rate).reshape(1, -1, 3)
         state = self.robot.state(simulator.rest_positions + simulator.tensor(moved), simulator.tensor(faster))
-        memory = {**state.memory_of(), "left": torch.full_like(state.left, belief.outside)}
+        memory = {**state.memory_of(), "left": torch.full_like(state.left, bool(belief.state.left[0]))}
         for key, value in belief.state.memory.items():
             memory[f"{self.model.name}.{key}"] = simulator.tensor(np.moveaxis(value[..., :1, :], -2, 0).copy())
         return state.with_memory(memory)

@@ -173,6 +173,37 @@ def make_vector(
         InputError: an unknown task or world, or a robot without the input that the task needs.
         DataFileError: the run is missing, unfinished or changed.
     """
+    robot, frames = _loaded(task, run, model, world, device, action_time)
+    actions, up = max(round(seconds / action_time), 1), _up(robot)
+    shown = None if robot.labels else _spread_vertices(robot)
+    where = robot, Path(run).expanduser(), num_envs, world
+    if task == "grasp":
+        bodies, mapping = _grippers(*where, frames)
+    else:
+        bodies, mapping = _bodies(*where, spread, axis if task == "swing_up" else None, shown, seed, frames)
+    rest = bodies.markers()[0]
+    goals: RobotTask
+    if task in ("reach", "follow"):
+        point = _tip(robot, rest, tracked, shown)
+        reach = _reach(robot, mapping, point, shown, seed) if reach is None else reach
+        follows = task == "follow"
+        goals = FollowTask(num_envs, actions, reach, action_time) if follows else ReachTask(num_envs, actions, reach)
+    else:
+        point = np.eye(3, rest.size, rest.size - 3) if task == "grasp" else _tip(robot, rest, tracked, shown)
+        goals = _lift(robot, num_envs, up, point @ rest.ravel(), task == "grasp")
+    deviation = noise if bodies.noise is None else bodies.noise
+    return RobotVectorEnv(bodies, goals, mapping, point, actions, deviation, autoreset_mode, render_mode, up)
+
+
+def _lift(robot: Robot, count: int, up: FloatArray, place: FloatArray, grasps: bool) -> SwingTask:
+    """The task to lift a point (3,) from where it rests [m]: a ball, or the tip by the length of the body."""
+    return SwingTask(count, up, place, RISE if grasps else float(np.linalg.norm(place - _fixed(robot))))
+
+
+def _loaded(
+    task: str, run: str | Path, model: str | None, world: str, device: str, action_time: float
+) -> tuple[Robot, int]:
+    """Returns the robot of a run, which must suit the task, and the number of steps of an action."""
     if task not in TASKS:
         raise InputError(f"the task is {task!r}: choose {', '.join(TASKS)}.")
     if world not in WORLDS:
@@ -183,45 +214,44 @@ def make_vector(
         raise InputError(
             f"action_time is {action_time:g} s: it must be a multiple of the step of {robot.time_step:g} s."
         )
-    swings = task == "swing_up"
-    if swings and (BASE not in robot.inputs or world != "simulator"):
+    if task == "swing_up" and (BASE not in robot.inputs or world != "simulator"):
         raise InputError("swing_up moves the base of a simulated robot: choose a robot with fixed vertices.")
-    actions, up = max(round(seconds / action_time), 1), _up(robot)
+    return robot, frames
+
+
+def _bodies(
+    robot: Robot,
+    run: Path,
+    count: int,
+    world: str,
+    spread: float,
+    axis: Sequence[float] | None,
+    shown: list[int] | None,
+    seed: int,
+    frames: int,
+) -> tuple[World, ActionMapping]:
+    """Robots that are driven as in the trials of their run, or whose base moves along an axis, and the map to inputs.
+
+    Worlds begin without inputs.
+    """
     bodies: World
-    goals: RobotTask
-    if task == "grasp":
-        bodies, mapping = _grippers(robot, Path(run).expanduser(), num_envs, world, frames)
-        markers = bodies.markers()[0]
-        goals, point = SwingTask(num_envs, up, markers[-1], RISE), np.eye(3, markers.size, markers.size - 3)
-        return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
-    shown = None if robot.labels else _spread_vertices(robot)
-    if world == "simulator":
+    if axis is not None:
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
-        name, mixed = (BASE, along) if swings else (driven_input(robot).name, None)
-        bodies = RobotWorld(robot, name, num_envs, spread, mixed, shown)
-    elif world == "reduced":
-        bodies = ReducedWorld(reduced_of(robot), num_envs)
+        bodies = RobotWorld(robot, BASE, count, spread, along, shown)
+        most = np.full(1, _BASE)
+        return bodies, ActionMapping(-most, most, np.full(1, _BASE_SPEED), np.zeros(1), frames)
+    driven = driven_input(robot)
+    if world == "reduced":
+        bodies = ReducedWorld(reduced_of(robot), count)
+    elif world == "simulator":
+        bodies = RobotWorld(robot, driven.name, count, spread, shown=shown)
     else:
-        folder = Path(run).expanduser()
-        bodies = Laboratory(laboratory_settings(folder), folder, driven_input(robot).name, num_envs, seed, "count")
-    point = _tip(robot, bodies.markers()[0], tracked, shown)
-    if swings:
-        rest = point @ bodies.markers()[0].ravel()
-        goals = SwingTask(num_envs, up, rest, float(np.linalg.norm(rest - _fixed(robot))))
-        mapping = ActionMapping(np.full(1, -_BASE), np.full(1, _BASE), np.full(1, _BASE_SPEED), np.zeros(1), frames)
-    else:
-        driven = driven_input(robot)
-        low, high = np.array(driven.low), np.array(driven.high)
-        reach = _reach(robot, driven.name, low, high, point, shown, seed) if reach is None else reach
-        follows = task == "follow"
-        goals = FollowTask(num_envs, actions, reach, action_time) if follows else ReachTask(num_envs, actions, reach)
-        # Worlds begin without inputs.
-        mapping = ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
-    noise = noise if bodies.noise is None else bodies.noise
-    return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
+        bodies = Laboratory(laboratory_settings(run), run, driven.name, count, seed, "count")
+    low, high = np.array(driven.low), np.array(driven.high)
+    return bodies, ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
 
 
-def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> tuple[GraspWorld, ActionMapping]:
+def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> tuple[World, ActionMapping]:
     """Grippers of two fingers each, and the map from actions to their input and height."""
     driven = driven_input(robot)
     if world == "reduced":
@@ -239,14 +269,14 @@ def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> t
     return GraspWorld(robot, driven.name, count, time_step), ActionMapping(low, high, rate, np.zeros(2), frames)
 
 
-def _reach(
-    robot: Robot, name: str, low: FloatArray, high: FloatArray, point: FloatArray, shown: list[int] | None, seed: int
-) -> Reach:
+def _reach(robot: Robot, mapping: ActionMapping, point: FloatArray, shown: list[int] | None, seed: int) -> Reach:
     """Samples equilibria of the robot under random inputs within their range."""
+    low, high = mapping.low, mapping.high
     shares = np.random.default_rng(seed).random((_PLACES, len(low)))
     shares[0] = 0.0
     with torch.no_grad():
-        q, settled = robot.settle_some(len(shares), **{name: low + shares * (high - low)})
+        inputs = {driven_input(robot).name: low + shares * (high - low)}
+        q, settled = robot.settle_some(len(shares), **inputs)
         markers = robot.observe(robot.state(q[settled])).double().cpu().numpy()
     markers = markers if shown is None else markers[:, shown]
     return Reach(markers.reshape(len(markers), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0)

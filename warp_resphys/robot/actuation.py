@@ -132,6 +132,24 @@ class InputReader:
             return self.read(name, value, batch)[None]
         return torch.stack([self.read(name, now, batch) for now in self._tensor(value, name)])
 
+    def by_step(self, inputs: Mapping[str, Given], steps: int | None, batch: int) -> list[dict[str, torch.Tensor]]:
+        """Returns the values of constant inputs and series in every step; the last ones of a shorter series stay.
+
+        Args:
+            inputs: by name.
+            steps: number of steps T; the length of the longest series if omitted.
+            batch: B.
+
+        Raises:
+            InputError: as `read`, or no number of steps.
+        """
+        series = {name: self.series(name, value, batch) for name, value in inputs.items()}
+        lengths = [len(series[name]) for name, value in inputs.items() if self.is_series(name, value)]
+        if steps is None and not lengths:
+            raise InputError("the number of steps is unknown: give `steps`, or an input with a value for each step.")
+        count = max(lengths, default=0) if steps is None else steps
+        return [{name: value[min(k, len(value) - 1)] for name, value in series.items()} for k in range(count)]
+
     def field(self, values: Any, name: str) -> torch.Tensor:
         """Returns vectors of the vertices (B, N, 3), given as (N, 3) or (B, N, 3).
 

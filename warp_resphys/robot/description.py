@@ -1,28 +1,31 @@
 """The description of a robot as plain data and tensors: read from a run folder, written to one safe file and back."""
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import torch
+from numpy.typing import ArrayLike
 
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
+from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
 from ..experiment.experiment import LEARNED, SIMFREE, Experiment, network_of
 from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
+from ..io.arrays import FloatArray
 from ..io.classes import check_packages
-from ..io.errors import DataFileError, InputError, listed
+from ..io.errors import DataFileError, InputError, listed, number_of
 from ..io.resuming import finished_record, planned
 from ..io.safe_files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
 from ..learning.correction import Learned, Range
 from ..learning.intervals import LEVEL, Intervals
-from ..learning.networks import restore
+from ..learning.networks import NextState, restore
 from ..learning.placement import PlacedMarkers, Placement
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
@@ -33,6 +36,7 @@ from ..settings.stage_keys import StageSettings
 
 log = logging.getLogger(__name__)
 
+SUFFIX: Final = ".safetensors"
 _KIND: Final = "robot"
 _EVALUATE: Final = "evaluate"
 # By simulator: the stage after which it can be loaded.
@@ -117,8 +121,10 @@ class Description:
             body: settings of the body that differ.
 
         Raises:
-            InputError: an unknown or wrong setting.
+            InputError: an unknown or wrong setting, or a network in place of the simulator.
         """
+        if self.learned is not None and isinstance(self.learned.network, NextState):
+            raise InputError(f"{self.model} has no simulator, only a network for its mesh: load another model.")
         given = {key: value.plain() if isinstance(value, Settings) else value for key, value in body.items()}
         settings = parse(SimulatorSettings, {**self.settings.plain(), **given})
         material = MaterialSettings.model_validate({**self.material.plain(), MASS_DAMPING: None})
@@ -133,16 +139,37 @@ class Description:
         placed = self.placement
         return seen if placed is None else PlacedMarkers.of(seen, Placement.from_plain(placed, self.labels))
 
+    def half_widths(self, markers: FloatArray, since: ArrayLike | None) -> FloatArray | None:
+        """Half-widths (..., M) of prediction intervals, as for `Robot.half_widths`, of markers (..., M, 3) [m]."""
+        if self.intervals is None or self.bound is None:
+            return None
+        return self.intervals.half_widths(markers, self.bound.numpy(), since)
+
+    def summary(self, time_step: float, inputs: Sequence[str]) -> str:
+        """Returns a short description: vertices, markers, time step, lines of the inputs, parameters, error."""
+        bodies = len(corners_of(self.labels))
+        counts = {"marker": len(owners(self.labels)) - bodies, "rigid body": bodies}
+        seen = " and ".join(number_of(count, what) for what, count in counts.items() if count) or "no markers"
+        vertices = f"{len(self.mesh.vertices)} vertices"
+        lines = [f"Robot {self.name}, {self.model}: {vertices}, {seen}, steps of {1e3 * time_step:g} ms", *inputs]
+        lines += [f"  identified {name}: {value:.6g}" for name, value in self.parameters.items()]
+        if self.errors_mm.get("mean") is not None:
+            lines.append(f"  mean error in the test trials: {self.errors_mm['mean']:.3g} mm")
+        return "\n".join(lines)
+
     def _network(self) -> NetworkSettings | None:
         """Settings of the network."""
         return None if self.learned is None else NetworkSettings(**self.learned.network.architecture)
 
-    def write(self, path: Path) -> None:
+    def write(self, path: Path) -> Path:
         """Writes one safetensors file with JSON metadata.
 
         Raises:
+            InputError: the name has another extension.
             DataFileError: the file cannot be written.
         """
+        if path.suffix != SUFFIX:
+            raise InputError(f"{path} does not end in {SUFFIX}: give such a name.")
         metadata: dict[str, Any] = {key: getattr(self, key) for key in _PLAIN}
         metadata["packages"] = packages_of([self.settings, self.material, self.markers, self._network()])
         metadata["intervals"] = None if self.intervals is None else self.intervals.plain()
@@ -154,6 +181,7 @@ class Description:
             tensors |= {f"{_NETWORK}{name}": weights for name, weights in network.state_dict().items()}
             metadata["network"] = {**network.description(), **self.learned.description()}
         write_checkpoint(path, _KIND, tensors, metadata)
+        return path
 
     @classmethod
     def read(cls, path: Path) -> "Description":

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -11,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
 from ..data.driving import time_since_change
-from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.frames import BaseFrame, VertexFrames
+from ..dynamics.simulator import Simulator
 from ..dynamics.trajectory import Motion
 from ..energies.materials import MASS_DAMPING
-from ..io.errors import ConvergenceError, InputError, number_of
+from ..io.errors import ConvergenceError, InputError
 from ..learning.correction import (
     DIVERGENCE_DISTANCE,
     CorrectedSimulator,
@@ -33,8 +34,6 @@ from ..stepping.rollout import rollout
 from ..stepping.state import State
 from .actuation import Acting, Commands, Given, InputReader, inputs_of
 from .description import Description
-
-SUFFIX: Final = ".safetensors"
 
 
 class Robot:
@@ -106,9 +105,16 @@ class Robot:
         Raises:
             InputError: an unknown name, or a value out of range.
         """
+        return self._changed(self.simulator, {**self.parameters, **parameters})
+
+    def integrated_by(self, integrator: str) -> "Robot":
+        """Returns the robot, stepped by another time integrator."""
+        return self._changed(replace(self.simulator, integrator=integrator), self.parameters)
+
+    def _changed(self, simulator: Simulator, parameters: Mapping[str, torch.Tensor | float]) -> "Robot":
         other = object.__new__(Robot)
-        other.__dict__.update(self.__dict__)
-        other._set_parameters({**self.parameters, **parameters})
+        other.__dict__.update({**self.__dict__, "simulator": simulator})
+        other._set_parameters(parameters)
         return other
 
     def on(self, mesh: Mesh, **body: Any) -> "Robot":
@@ -128,18 +134,11 @@ class Robot:
                 lacks; or a robot whose network replaces the simulator.
             MeshError: the mesh cannot be simulated, or has no vertex where the body is fixed.
         """
-        if self.is_data_driven:
-            raise InputError(
-                f"{self.description.model} has no simulator, only a network for its mesh: load another model."
-            )
-        names = {name for name in self.parameters if self._is_material(name) and name != MASS_DAMPING}
+        materials = self.simulator.materials.items()
+        material = {f"{region}_{name}" if region else name for region, own in materials for name in own.quantities}
+        names = material & self.parameters.keys() - {MASS_DAMPING}
         parameters = {name: float(self.parameters[name][0]) for name in names}
         return Robot(self.description.on(mesh, parameters, body), self.simulator.device)
-
-    def _is_material(self, name: str) -> bool:
-        """Whether a parameter is a constant of the material, or of that of a region."""
-        materials = self.simulator.materials.items()
-        return any(name in {f"{region}_{q}" if region else q for q in own.quantities} for region, own in materials)
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -153,19 +152,8 @@ class Robot:
 
     def __repr__(self) -> str:
         """Returns a short description: vertices, markers, time step, inputs, parameters, error."""
-        body, description = self.simulator.body, self.description
-        bodies = len(corners_of(self.labels))
-        counts = {"marker": len(owners(self.labels)) - bodies, "rigid body": bodies}
-        seen = [number_of(count, what) for what, count in counts.items() if count]
-        lines = [
-            f"Robot {description.name}, {description.model}: {body.n_vertices} vertices, "
-            f"{' and '.join(seen) or 'no markers'}, steps of {1e3 * self.time_step:g} ms"
-        ]
-        lines += [f"  input {name} [{given.unit}]: {', '.join(given.parts)}" for name, given in self.inputs.items()]
-        lines += [f"  identified {name}: {value:.6g}" for name, value in description.parameters.items()]
-        if description.errors_mm.get("mean") is not None:
-            lines.append(f"  mean error in the test trials: {description.errors_mm['mean']:.3g} mm")
-        return "\n".join(lines)
+        inputs = [f"  input {name} [{given.unit}]: {', '.join(given.parts)}" for name, given in self.inputs.items()]
+        return self.description.summary(self.time_step, inputs)
 
     def save(self, path: str | Path) -> Path:
         """Writes its description to one safe file (safetensors and JSON) that `loading.load` opens on any machine.
@@ -174,11 +162,7 @@ class Robot:
             InputError: the name has another extension.
             DataFileError: the file cannot be written.
         """
-        place = Path(path).expanduser()
-        if place.suffix != SUFFIX:
-            raise InputError(f"{place} does not end in {SUFFIX}: give such a name.")
-        self.description.write(place)
-        return place
+        return self.description.write(Path(path).expanduser())
 
     # Observation
 
@@ -195,10 +179,7 @@ class Robot:
             markers: (..., M, 3) predicted [m].
             since: (...,) time since the last change of the inputs [s]; None for that at which intervals are widest.
         """
-        description = self.description
-        if description.intervals is None or description.bound is None:
-            return None
-        return description.intervals.half_widths(markers.detach().cpu().numpy(), description.bound.numpy(), since)
+        return self.description.half_widths(markers.detach().cpu().numpy(), since)
 
     # Initial states
 
@@ -253,14 +234,9 @@ class Robot:
             for _ in range(POSE_STEPS):
                 start = self.step(start, **inputs)
             return start
-        acting = self._commands.act(start, self._read(inputs, batch))
-        predictor = self._predictor(acting.conditions, acting.base)
-
-        def force(state: State) -> torch.Tensor:
-            predicted = predictor(state, 0)
-            assert isinstance(predicted, torch.Tensor)
-            return predicted
-
+        acting, predictor = self._acting(start, inputs)
+        assert predictor is not None
+        force = cast(Callable[[State], torch.Tensor], partial(predictor, step=0))
         body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start, force)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return body.with_memory({**start.memory_of(), **acting.memory, "left": left})
@@ -309,10 +285,12 @@ class Robot:
 
     def _acting(self, state: State, inputs: Mapping[str, Given]) -> tuple[Acting, LearnedPredictor | None]:
         """Returns what acts in a step under commands, and the predictor of its learned force."""
-        acting = self._commands.act(state, self._read(inputs, state.batch))
-        if self._learned is None:
+        acting, learned = self._commands.act(state, self._read(inputs, state.batch)), self._learned
+        if learned is None:
             return acting, None
-        predictor = self._predictor(acting.conditions, acting.base)
+        conditions = None if learned.network.actuation is None else acting.conditions
+        frame = None if acting.base is None else BaseFrame(acting.base, self.time_step, first=1)
+        predictor = LearnedPredictor(learned.network, conditions, learned.range_, self.frames, frame)
         predictor.hidden = state.memory_of().get("hidden")
         return acting, predictor
 
@@ -366,21 +344,16 @@ class Robot:
             InputError: an invalid input, as for `step`, or no number of steps.
             ConvergenceError: a step failed, and ``on_failure`` is ``raise``.
         """
-        series = {name: self._reader.series(name, value, state.batch) for name, value in inputs.items()}
-        lengths = [len(value) for name, value in series.items() if self._reader.is_series(name, inputs[name])]
-        if steps is None and not lengths:
-            raise InputError("the number of steps is unknown: give `steps`, or an input with a value for each step.")
-        count = max(lengths, default=0) if steps is None else steps
-        acting = [{name: value[min(k, len(value) - 1)] for name, value in series.items()} for k in range(count)]
+        acting = self._reader.by_step(inputs, steps, state.batch)
 
         def step(before: State, number: int) -> State:
             after = self.step(before, **acting[number])
             on_step(number + 1)
             return after
 
-        states = rollout(step, state, range(count), lambda reached: reached)
+        states = rollout(step, state, range(len(acting)), lambda reached: reached)
         markers = torch.stack([self.observe(reached) for reached in states])
-        driven = {name: torch.stack([now[name] for now in acting]) for name in series if acting}
+        driven = {name: torch.stack([now[name] for now in acting]) for name in inputs if acting}
         return Motion.of(
             states,
             self.simulator.body,
@@ -395,14 +368,6 @@ class Robot:
             inputs=driven,
             units={name: (self.inputs[name].unit, self.inputs[name].parts) for name in self.driven},
         )
-
-    def integrated_by(self, integrator: str) -> "Robot":
-        """Returns the robot, stepped by another time integrator."""
-        other = object.__new__(Robot)
-        other.__dict__.update(self.__dict__)
-        other.simulator = replace(self.simulator, integrator=integrator)
-        other._set_parameters(self.parameters)
-        return other
 
     # Linearisation and the network's inputs in a state
 
@@ -425,17 +390,10 @@ class Robot:
         refuse_transforms()
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
 
-    def _predictor(self, conditions: torch.Tensor | None, base: torch.Tensor | None) -> LearnedPredictor:
-        learned = self._learned
-        assert learned is not None
-        given = None if learned.network.actuation is None else conditions
-        frame = None if base is None else BaseFrame(base, self.time_step, first=1)
-        return LearnedPredictor(learned.network, given, learned.range_, self.frames, frame)
-
 
 def _since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> NDArray[np.float64]:
     """(T + 1, B) time since the last change of commands (T, B, ...) at T + 1 times [s]."""
-    frames = np.minimum(np.arange(times), times - 2)
-    acting = [values.detach().cpu().double().numpy()[frames].reshape(times, batch, -1) for values in driven.values()]
+    values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
+    acting = [np.concatenate([own, own[-1:]]).reshape(times, batch, -1) for own in values]
     at = time_step * np.arange(times, dtype=np.float64)
     return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

@@ -84,6 +84,32 @@ def write_blocks(hessian: mat99, columns: int, clamp: bool, out: wp.array[wp.mat
             out[(m * (m + 1)) / 2 + n] = block
 
 
+@wp.func
+def moved_vector(f: wp.vec3d, row: int, column: int, by: wp.float64) -> wp.vec3d:
+    """Returns f with a change of the entry in a row; a vector has one column."""
+    f[row] = f[row] + by
+    return f
+
+
+@wp.func
+def moved_matrix(f: wp.mat33d, row: int, column: int, by: wp.float64) -> wp.mat33d:
+    """Returns f with a change of the entry in a row and a column."""
+    f[row, column] = f[row, column] + by
+    return f
+
+
+@wp.func
+def vector_entry(f: wp.vec3d, row: int, column: int) -> wp.float64:
+    """Returns the entry in a row."""
+    return f[row]
+
+
+@wp.func
+def matrix_entry(f: wp.mat33d, row: int, column: int) -> wp.float64:
+    """Returns the entry in a row and a column."""
+    return f[row, column]
+
+
 @generated
 def derived_law(name: str, energy: Any, size: float = 1.0, lame: tuple[tuple[float, float], ...] = ()) -> Law:
     """Returns the law of an energy function.
@@ -100,6 +126,7 @@ def derived_law(name: str, energy: Any, size: float = 1.0, lame: tuple[tuple[flo
     wp.set_module_options({"max_unroll": 1}, module)
     line, step = shape is wp.vec3d, wp.constant(wp.float64(size * STEP))
     columns, inner = wp.constant(1 if line else 3), wp.dot if line else wp.ddot
+    moved, entry = (moved_vector, vector_entry) if line else (moved_matrix, matrix_entry)
 
     # Warp emits functions that use wp.grad after all others, so only kernels can call them.
     @wp.func(module=module)
@@ -118,24 +145,6 @@ def derived_law(name: str, energy: Any, size: float = 1.0, lame: tuple[tuple[flo
                 result += SHARES[k] * by_values
             result = result / (TWELVE * h)
         return result
-
-    @wp.func(module=module)
-    def moved(f: shape, j: int, n: int, by: wp.float64) -> shape:
-        """Returns f with a change of the entry in row j and column n."""
-        if wp.static(line):
-            f[j] = f[j] + by
-        else:
-            f[j, n] = f[j, n] + by
-        return f
-
-    @wp.func(module=module)
-    def entry(stress: shape, j: int, n: int) -> wp.float64:
-        """Returns the entry in row j and column n."""
-        if wp.static(line):  # noqa: SIM108  # Warp has no other branches that are left out.
-            value = stress[j]
-        else:
-            value = stress[j, n]
-        return value
 
     @wp.func(module=module)
     def tangent(f: shape, v: vector, clamp: bool, out: wp.array[wp.mat33d]):

@@ -1,6 +1,6 @@
 """L-BFGS directions of a batch in compact form (Byrd, Nocedal and Schnabel 1994), with the matrix of the global step.
 
-Without pairs, a direction is that of the matrix alone.
+Without pairs, a direction is that of the matrix alone. ``pairs`` is a struct `Pairs` of either type.
 """
 
 from types import SimpleNamespace
@@ -15,11 +15,96 @@ from .reductions import ZERO, block_sum
 MIN_CURVATURE = wp.constant(wp.float64(1e-10))
 
 
+@wp.func
+def place(pairs: Any, b: int, age: int) -> int:
+    """Returns the index of a pair in the ring buffer; age 0 is the oldest."""
+    m = pairs.s.shape[1]
+    return (pairs.last[b] - pairs.count[b] + 1 + age + m) % m
+
+
+@wp.func
+def substitute_backward(pairs: Any, b: int, k: int):
+    """Solves R a = S g for k pairs; every thread does, and writes the same values."""
+    for j in range(k):
+        i = k - 1 - j
+        here = place(pairs, b, i)
+        rest = pairs.b[b, i]
+        for newer in range(i + 1, k):
+            rest -= pairs.r[b, here, place(pairs, b, newer)] * pairs.a[b, newer]
+        pairs.a[b, i] = rest / pairs.r[b, here, here]
+
+
+@wp.func
+def substitute_forward(pairs: Any, b: int, i: int, product: wp.float64):
+    """Solves row i of R^T b = D a - Y z after the rows before it, from the product, row i of Y z."""
+    here = place(pairs, b, i)
+    diagonal = pairs.r[b, here, here]
+    rest = diagonal * pairs.a[b, i] - product
+    for older in range(i):
+        rest -= pairs.r[b, place(pairs, b, older), here] * pairs.b[b, older]
+    pairs.b[b, i] = rest / diagonal
+
+
+@wp.func
+def direction_and_slope(
+    vertex_at: wp.array[int], solution: wp.array2d[Any], search: LineSearch, pairs: Any, b: int, lane: int
+) -> wp.float64:
+    """Writes the direction -(z + S^T b), with b = R^-T (D a - Y z), and returns its slope."""
+    k = pairs.count[b]
+    for i in range(k):
+        total = wp.float64(0.0)
+        row = pairs.y[b, place(pairs, b, i)]
+        for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+            total += wp.dot(wp.vec3d(row[vertex_at[p]]), wp.vec3d(solution[b, p]))
+        substitute_forward(pairs, b, i, block_sum(total))
+    slope = wp.float64(0.0)
+    for p in range(lane, vertex_at.shape[0], wp.block_dim()):
+        v = vertex_at[p]
+        value = wp.vec3d(solution[b, p])
+        for i in range(k):
+            value += pairs.b[b, i] * wp.vec3d(pairs.s[b, place(pairs, b, i), v])
+        search.direction[b, v] = -value
+        slope -= wp.dot(search.gradient[b, v], value)
+    return block_sum(slope)
+
+
+@wp.func
+def add_pair(pairs: Any, b: int, lane: int, step: wp.float64, search: LineSearch, after: wp.array2d[wp.vec3d]):
+    """Stores a pair of positive curvature, from the residual after a step."""
+    m, n, lanes = pairs.s.shape[1], after.shape[1], wp.block_dim()
+    k = pairs.count[b]
+    new = (pairs.last[b] + 1) % m
+    s, y = pairs.s[b, new], pairs.y[b, new]
+    curvature, lengths, changes = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    for v in range(lane, n, lanes):
+        moved = step * search.direction[b, v]
+        changed = after[b, v] - search.gradient[b, v]
+        curvature += wp.dot(moved, changed)
+        lengths += wp.dot(moved, moved)
+        changes += wp.dot(changed, changed)
+    curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
+    if not curvature > MIN_CURVATURE * wp.sqrt(lengths * changes):
+        return
+    for v in range(lane, n, lanes):
+        s[v] = s.dtype(step * search.direction[b, v])
+        y[v] = y.dtype(after[b, v] - search.gradient[b, v])
+    for i in range(wp.where(k == m, 1, 0), k):
+        total, other = wp.float64(0.0), place(pairs, b, i)
+        row = pairs.s[b, other]
+        for v in range(lane, n, lanes):
+            total += wp.dot(wp.vec3d(row[v]), wp.vec3d(y[v]))
+        total = block_sum(total)
+        pairs.r[b, other, new] = total
+    if lane == 0:
+        pairs.r[b, new, new] = curvature
+        pairs.last[b] = new
+        pairs.count[b] = wp.min(k + 1, m)
+
+
 @generated
 def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
     """Returns kernels for pairs, right-hand sides and solutions of type ``wp.float64`` or ``wp.float32``."""
-    module = named_module(f"lbfgs.{scalar.__name__}")
-    vector = wp.vec3d if scalar is wp.float64 else wp.vec3f
+    module, vector = named_module(f"lbfgs.{scalar.__name__}"), wp.vec3d if scalar is wp.float64 else wp.vec3f
 
     @wp.struct
     class Pairs:
@@ -32,33 +117,6 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
         r: wp.array3d[wp.float64]  # (B, M, M) by place [J]
         a: wp.array2d[wp.float64]  # (B, M) coefficients of `project`, oldest pair first
         b: wp.array2d[wp.float64]  # (B, M) S g in `project`, coefficients of `set_direction`
-
-    @wp.func(module=module)
-    def place(pairs: Pairs, b: int, age: int) -> int:
-        """Returns the index of a pair in the ring buffer; age 0 is the oldest."""
-        m = pairs.s.shape[1]
-        return (pairs.last[b] - pairs.count[b] + 1 + age + m) % m
-
-    @wp.func(module=module)
-    def substitute_backward(pairs: Pairs, b: int, k: int):
-        """Solves R a = S g for k pairs; every thread does, and writes the same values."""
-        for j in range(k):
-            i = k - 1 - j
-            here = place(pairs, b, i)
-            rest = pairs.b[b, i]
-            for newer in range(i + 1, k):
-                rest -= pairs.r[b, here, place(pairs, b, newer)] * pairs.a[b, newer]
-            pairs.a[b, i] = rest / pairs.r[b, here, here]
-
-    @wp.func(module=module)
-    def substitute_forward(pairs: Pairs, b: int, i: int, product: wp.float64):
-        """Solves row i of R^T b = D a - Y z after the rows before it, from the product, row i of Y z."""
-        here = place(pairs, b, i)
-        diagonal = pairs.r[b, here, here]
-        rest = diagonal * pairs.a[b, i] - product
-        for older in range(i):
-            rest -= pairs.r[b, place(pairs, b, older), here] * pairs.b[b, older]
-        pairs.b[b, i] = rest / diagonal
 
     @wp.kernel(module=module)
     def project(
@@ -89,15 +147,21 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
                 value -= pairs_out.a[b, i] * wp.vec3d(pairs_out.y[b, place(pairs_out, b, i), v])
             right_out[b, p] = vector(value)
 
+    return SimpleNamespace(project=project, set_direction=_set_direction(Pairs, vector, module), Pairs=Pairs)
+
+
+def _set_direction(pairs_type: Any, vector: Any, module: wp.Module) -> Any:
+    """Returns the kernel that begins a line search."""
+
     @wp.kernel(module=module)
     def set_direction(
         vertex_at: wp.array[int],
         solution: wp.array2d[vector],  # (B, F) z, solution for the right-hand side of `project` [m]
         progress_out: SolverProgress,
         search_out: LineSearch,
-        pairs_out: Pairs,
+        pairs_out: pairs_type,
     ):
-        """Sets the direction -(z + S^T b), with b = R^-T (D a - Y z), its slope and the first trial.
+        """Sets the direction, its slope and the first trial.
 
         If the slope is positive or not finite, the pairs are deleted; without pairs a new factor is requested, once.
         """
@@ -105,21 +169,7 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
         if progress_out.phase[b] != NEED_DIRECTION:
             return
         k = pairs_out.count[b]
-        for i in range(k):
-            total = wp.float64(0.0)
-            row = pairs_out.y[b, place(pairs_out, b, i)]
-            for p in range(lane, vertex_at.shape[0], wp.block_dim()):
-                total += wp.dot(wp.vec3d(row[vertex_at[p]]), wp.vec3d(solution[b, p]))
-            substitute_forward(pairs_out, b, i, block_sum(total))
-        slope = wp.float64(0.0)
-        for p in range(lane, vertex_at.shape[0], wp.block_dim()):
-            v = vertex_at[p]
-            value = wp.vec3d(solution[b, p])
-            for i in range(k):
-                value += pairs_out.b[b, i] * wp.vec3d(pairs_out.s[b, place(pairs_out, b, i), v])
-            search_out.direction[b, v] = -value
-            slope -= wp.dot(search_out.gradient[b, v], value)
-        slope = block_sum(slope)
+        slope = direction_and_slope(vertex_at, solution, search_out, pairs_out, b, lane)
         if wp.isfinite(slope) and (slope <= ZERO or k == 0):
             for p in range(lane, vertex_at.shape[0], wp.block_dim()):
                 v = vertex_at[p]
@@ -135,47 +185,4 @@ def lbfgs_kernels(scalar: Any) -> SimpleNamespace:
             else:
                 progress_out.phase[b] = FAILED
 
-    @wp.func(module=module)
-    def add_pair(
-        pairs: Pairs,
-        b: int,
-        lane: int,
-        step: wp.float64,
-        search: LineSearch,
-        after: wp.array2d[wp.vec3d],  # residual after the step
-    ):
-        """Stores a pair of positive curvature."""
-        m, n, lanes = pairs.s.shape[1], after.shape[1], wp.block_dim()
-        k = pairs.count[b]
-        new = (pairs.last[b] + 1) % m
-        s = pairs.s[b, new]
-        y = pairs.y[b, new]
-        curvature, lengths, changes = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        for v in range(lane, n, lanes):
-            moved = step * search.direction[b, v]
-            changed = after[b, v] - search.gradient[b, v]
-            curvature += wp.dot(moved, changed)
-            lengths += wp.dot(moved, moved)
-            changes += wp.dot(changed, changed)
-        curvature, lengths, changes = block_sum(curvature), block_sum(lengths), block_sum(changes)
-        if not curvature > MIN_CURVATURE * wp.sqrt(lengths * changes):
-            return
-        for v in range(lane, n, lanes):
-            s[v] = vector(step * search.direction[b, v])
-            y[v] = vector(after[b, v] - search.gradient[b, v])
-        first = 0
-        if k == m:
-            first = 1
-        for i in range(first, k):
-            total, other = wp.float64(0.0), place(pairs, b, i)
-            row = pairs.s[b, other]
-            for v in range(lane, n, lanes):
-                total += wp.dot(wp.vec3d(row[v]), wp.vec3d(y[v]))
-            total = block_sum(total)
-            pairs.r[b, other, new] = total
-        if lane == 0:
-            pairs.r[b, new, new] = curvature
-            pairs.last[b] = new
-            pairs.count[b] = wp.min(k + 1, m)
-
-    return SimpleNamespace(project=project, set_direction=set_direction, add_pair=add_pair, Pairs=Pairs)
+    return set_direction

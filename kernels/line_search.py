@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from .lbfgs import lbfgs_kernels
+from .lbfgs import add_pair, lbfgs_kernels
 from .minimisation import (
     DONE,
     INFINITE,
@@ -132,11 +132,44 @@ def decreases_enough(
     return energy <= before + rounding and after <= (wp.float64(2.0) * ARMIJO - ONE) * slope
 
 
+@wp.func
+def backtrack(
+    tolerances: Tolerances,
+    inertia: wp.array2d[wp.float64],
+    clamped: wp.array[wp.bool],
+    progress: SolverProgress,
+    search: LineSearch,
+    history: History,
+    step: wp.float64,
+    halvings: int,
+    b: int,
+    lane: int,
+):
+    """Takes a trial of half the step; after the last one, goes back to the origin and abandons the search."""
+    half = HALF * step
+    ends = halvings + 1 >= MAX_HALVINGS
+    if ends:
+        half = wp.float64(0.0)
+    for i in range(lane, inertia.shape[1], wp.block_dim()):
+        search.positions[b, i] = search.origin[b, i] + half * search.direction[b, i]
+    at_rest = False
+    if ends:
+        scale = progress.scale[b]
+        at_rest = within_rounding(progress, tolerances, inertia, search, scale, progress.iterations[b], b, lane)
+    if lane == 0:
+        progress.step[b] = half
+        progress.halvings[b] = halvings + 1
+        if at_rest:
+            progress.phase[b] = DONE
+            history.stored[b] = 0
+        elif ends:
+            abandon_search(progress, tolerances, clamped, b)
+
+
 @generated
 def accept_kernel(scalar: Any) -> Any:
     """Returns the kernel that tests a trial, for pairs of type ``wp.float64`` or ``wp.float32``."""
-    lbfgs = lbfgs_kernels(scalar)
-    pairs_type, add_pair = lbfgs.Pairs, lbfgs.add_pair
+    pairs_type = lbfgs_kernels(scalar).Pairs
 
     @wp.kernel(module=named_module(f"line_search.{scalar.__name__}"))
     def accept(
@@ -153,8 +186,6 @@ def accept_kernel(scalar: Any) -> Any:
         """Accepts a trial that decreases the energy enough, or halves the step; tests convergence."""
         b, lane = wp.tid()
         phase = progress_out.phase[b]
-        lanes = wp.block_dim()
-        n = inertia.shape[1]
         if phase != START and phase != LINE_SEARCH:
             return
         energy = evaluation.energy[b]
@@ -168,31 +199,14 @@ def accept_kernel(scalar: Any) -> Any:
             slope = progress_out.slope[b]
             halvings = progress_out.halvings[b]
             after = wp.float64(0.0)
-            for i in range(lane, n, lanes):
+            for i in range(lane, inertia.shape[1], wp.block_dim()):
                 after += wp.dot(evaluation.residual[b, i], search_out.direction[b, i])
             if not decreases_enough(before, energy, flat, step, slope, block_sum(after)):
-                step = HALF * step
-                given_up = halvings + 1 >= MAX_HALVINGS
-                if given_up:
-                    step = wp.float64(0.0)
-                for i in range(lane, n, lanes):
-                    search_out.positions[b, i] = search_out.origin[b, i] + step * search_out.direction[b, i]
-                at_rest = False
-                if given_up:
-                    scale = progress_out.scale[b]
-                    at_rest = within_rounding(progress_out, tolerances, inertia, search_out, scale, iterations, b, lane)
-                if lane == 0:
-                    progress_out.step[b] = step
-                    progress_out.halvings[b] = halvings + 1
-                    if at_rest:
-                        progress_out.phase[b] = DONE
-                        history_out.stored[b] = 0
-                    elif given_up:
-                        abandon_search(progress_out, tolerances, clamped, b)
+                backtrack(tolerances, inertia, clamped, progress_out, search_out, history_out, step, halvings, b, lane)
                 return
             if keeps_pairs == 1:
                 add_pair(pairs_out, b, lane, step, search_out, evaluation.residual)
-        for i in range(lane, n, lanes):
+        for i in range(lane, inertia.shape[1], wp.block_dim()):
             search_out.gradient[b, i] = evaluation.residual[b, i]
         scale = evaluation.balance[b] + progress_out.force[b]
         stalls += 1

@@ -197,10 +197,8 @@ _SOLVE: Final = (
 )
 
 
-@generated
-def tiled_kernels(scalar: Any) -> SimpleNamespace:
-    """Returns kernels for a scalar type, in blocks of ``BLOCK`` threads."""
-    module = named_module(f"tiles.{scalar.__name__}")
+def _of_one_matrix(scalar: Any) -> tuple[Any, Any]:
+    """Returns the factorisation of a matrix, and the sweeps over a right-hand side."""
     name = "double" if scalar is wp.float64 else "float"
 
     @wp.func_native(_FACTOR.replace("SCALAR", name))
@@ -208,6 +206,15 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
 
     @wp.func_native(_SOLVE.replace("SCALAR", name))
     def substitute(factor: wp.array2d[scalar], column_out: wp.array[scalar]): ...
+
+    return factorise, substitute
+
+
+@generated
+def tiled_kernels(scalar: Any) -> SimpleNamespace:
+    """Returns kernels for a scalar type, in blocks of ``BLOCK`` threads."""
+    module = named_module(f"tiles.{scalar.__name__}")
+    factorise, substitute = _of_one_matrix(scalar)
 
     @wp.kernel(module=module)
     def clear(

@@ -9,6 +9,7 @@ import re
 import textwrap
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import warp as wp
@@ -75,11 +76,13 @@ class Reader(ast.NodeVisitor):
         return root, SimpleNamespace(ndim=left, dtype=kind.dtype) if left else kind.dtype, not left
 
     def visit_Assign(self, node):
-        for target in node.targets:
-            self.store(target)
-            root, kind, _ = self.place(node.value)
-            if isinstance(target, ast.Name) and is_array(kind):
-                self.places[target.id] = root, kind
+        (target,) = node.targets
+        several = isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple)
+        for name, value in zip(target.elts, node.value.elts, strict=True) if several else [(target, node.value)]:
+            self.store(name)
+            root, kind, _ = self.place(value)
+            if isinstance(name, ast.Name) and is_array(kind):
+                self.places[name.id] = root, kind
         self.generic_visit(node)
 
     def visit_AugAssign(self, node):
@@ -94,13 +97,15 @@ class Reader(ast.NodeVisitor):
     def visit_Call(self, node):
         self.generic_visit(node)
         text = ast.unparse(node.func)
-        if text.startswith("wp."):  # wp.grad(energy)(f, v) writes nothing
-            self.written |= {self.place(node.args[0])[0]} if "atomic" in text else set()
+        if "atomic" in text:
+            self.written.add(self.place(node.args[0])[0])
+        if text.startswith("wp.") or text.endswith(".dtype"):  # such as wp.grad(energy)(f, v), or a conversion
             return
         called = eval(text, dict(self.names))
         if isinstance(called, wp.Function) and not called.is_builtin():
-            arguments = dict(zip(called.input_types, node.args, strict=True))
-            self.written |= {self.place(arguments[name])[0] for name in written_by(called)}
+            arguments = {n: self.place(value) for n, value in zip(called.input_types, node.args, strict=True)}
+            types = {name: kind for name, (_, kind, _) in arguments.items()}
+            self.written |= {arguments[name][0] for name in written_by(called, types)}
 
 
 def writes(statement, name):
@@ -110,13 +115,13 @@ def writes(statement, name):
     return named or (bool(value) and f"{name}.data[" in target)
 
 
-@functools.cache
-def written_by(function):
-    """Names of the arguments that a kernel or a Warp function writes."""
+def written_by(function, types=None):
+    """Names of the arguments that a kernel, or a Warp function of arguments of some types, writes."""
     if code := getattr(function, "native_snippet", None):
         return {name for name in function.input_types if any(writes(part, name) for part in re.split("[;{}]", code))}
     tree, names = definition(function.func)
-    reader = Reader({arg.label: arg.type for arg in function.adj.args}, names)
+    declared = {arg.label: arg.type for arg in function.adj.args}
+    reader = Reader({name: types[name] if kind is Any else kind for name, kind in declared.items()}, names)
     for _ in range(2):  # A row may have its name in a loop.
         for statement in tree.body:
             reader.visit(statement)
@@ -134,7 +139,7 @@ def test_every_kernel_of_the_folder_is_read():
 
 
 @wp.func
-def count(sums: wp.array2d[int], b: int):
+def count(sums: Any, b: int):
     sums[b, 0] += 1
 
 

@@ -62,7 +62,10 @@ CASES = {
         ),
         (
             "^the material resists no change of shape: ",
-            "simulation={model:law,bulk_1:1e6,stiffness_damping:null,youngs_modulus:null,poissons_ratio:null}",
+            *(
+                "simulation={model:law,bulk_1:1e6,stiffness_damping:null,youngs_modulus:null,poissons_ratio:null}",
+                "law=null",
+            ),
         ),
         ("^data.others.a.weight_g is 50 and twist_deg 10: ", "data.others.a={weight_g:50,twist_deg:10}"),
         ("^data.others.a is .*: weight_g is 0 and twist_deg 0: ", "data.others.a=[{weight_g:50},{at:{x:0.05}}]"),

@@ -1,4 +1,4 @@
-"""Warnings of values that can be simulated and look like a mistake: units, nearly flat cells, and slow sizes."""
+"""Values that look like a mistake, as units, nearly flat cells and slow sizes: warnings, and errors."""
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -14,7 +14,7 @@ from ..energies.contact.obstacles import HalfSpace
 from ..energies.materials import Material
 from ..fem.bodies import Body
 from ..fem.integration_points import volume_points
-from ..io.errors import warn
+from ..io.errors import InputError, warn
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import LONGEST_DIAGONAL, SHORTEST_DIAGONAL
 from ..mesh.volume_mesh import Mesh
@@ -27,6 +27,7 @@ STRONGEST: Final = 100.0  # m/s^2
 FLAT_CELL: Final = 0.02  # scaled Jacobian
 INERTIA_ERROR: Final = 0.15  # of the rotary inertia
 MANY_UNKNOWNS: Final = 60_000  # steps take seconds on a core (docs/gpu.md)
+_LARGEST_STRAIN: Final = 0.3  # rho g L / E above which a wrong unit is assumed
 
 
 def warn_of_implausible(
@@ -125,6 +126,28 @@ def _warn_of_material(material: Material, of: str) -> None:
     if any(lower < density < upper for lower, upper in DENSITIES):
         kind = "heavier than any metal" if density > DENSITIES[-1][0] else "lighter than a foam"
         warn(f"density{of} is {density:.3g} kg/m^3, {kind}: give it in kg/m^3, as in 1070 for silicone, not in g/cm^3.")
+
+
+def check_weight(body: Body, material: Material, gravity: Sequence[float]) -> None:
+    """Refuses a body with very large strains under its own weight, which indicate a wrong unit.
+
+    A body of length L under its weight has strains of about rho g L / E: one percent for an arm of silicone.
+
+    Raises:
+        InputError: the strain is too large, or the material resists no change of shape.
+    """
+    length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
+    constants = material.constants
+    density, stiffness = mean_of(constants["density"]), small_strain_stiffness(material)
+    if stiffness <= 0.0:
+        raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
+    strain = density * float(np.linalg.norm(gravity)) * length / stiffness
+    if strain > _LARGEST_STRAIN:
+        raise InputError(
+            f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
+            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(constants))} not "
+            "Pa?"
+        )
 
 
 def small_strain_stiffness(material: Material) -> float:

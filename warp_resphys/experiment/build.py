@@ -19,6 +19,7 @@ from ..data.marker_view import MarkerView
 from ..data.markers import BoundMarkers, JoinedMarkers, Markers, bind_markers, follow_vertices
 from ..data.rigid_bodies import arms, corners_of
 from ..dynamics.nonlinear_solver import SolverSettings
+from ..dynamics.plausibility import check_weight
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import make_material
 from ..energies.materials import Material
@@ -27,7 +28,7 @@ from ..fem.coordinates import SymmetryPlane
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError, naming
-from ..io.machine import find_device
+from ..io.machine import available_memory_gib, find_device
 from ..mesh.arm import ArmGeometry, mesh_arm
 from ..mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
 from ..mesh.readers import read_mesh
@@ -51,6 +52,9 @@ from ..settings.mesh import (
 )
 from ..settings.observed import BindingSettings, MarkerSettings, RigidBodySettings
 from .actuators import build_actuators
+
+_BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
+_SHARE_OF_MEMORY = 0.8
 
 
 def choose_device(name: str) -> torch.device:
@@ -88,9 +92,21 @@ def _file_of(settings: MeshSettings) -> str | None:
 @lru_cache(maxsize=8)
 def _built_mesh(settings: MeshSettings, file: str | None) -> Mesh:
     """Builds a mesh; ``file`` is the digest of its file."""
+    if isinstance(settings, HexahedralBox | TetrahedralBox):
+        _check_memory(settings.divisions)
     mesh = _read_or_generate(settings)
     check_mesh(mesh)
     return mesh
+
+
+def _check_memory(divisions: Sequence[int]) -> None:
+    """Refuses a box whose cells do not fit into the free memory."""
+    cells, limit = math.prod(divisions), _SHARE_OF_MEMORY * available_memory_gib()
+    if (needed := cells * _BYTES_PER_CELL / 2**30) > limit:
+        raise InputError(
+            f"mesh.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but {limit:.3g} GiB are "
+            "free: use fewer."
+        )
 
 
 def _read_or_generate(settings: MeshSettings) -> Mesh:
@@ -226,7 +242,8 @@ def whole_mesh(settings: BodySettings) -> Mesh:
         raise MeshError("parts.body: this is the name of the first mesh: choose another.")
     parts = {}
     for name, part in settings.parts.items():
-        own = build_mesh(part.mesh)
+        with naming(f"parts.{name}."):
+            own = build_mesh(part.mesh)
         parts[name] = replace(own, vertices=own.vertices + np.asarray(part.shift))
     joined = join({"body": mesh, **parts})
     if twice := joined.regions.keys() & mesh.regions.keys():
@@ -351,7 +368,7 @@ def build_simulator(
         InputError: a value cannot be simulated.
     """
     solver = dict(settings.solver) | ({} if on_failure is None else {"on_failure": on_failure})
-    return Simulator(
+    simulator = Simulator(
         build_body(settings, payload_at) if body is None else body,
         build_material(material, "simulation"),
         time_step=settings.time_step,
@@ -360,3 +377,6 @@ def build_simulator(
         solver=SolverSettings(**solver),
         device=simulation_device(settings.device),
     )
+    for own in simulator.materials.values():
+        check_weight(simulator.body, own, settings.gravity)
+    return simulator

@@ -3,8 +3,7 @@
 The values of settings and their relations are checked when settings are made, see `settings.run`.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from itertools import product
 from typing import cast
@@ -14,38 +13,30 @@ import torch
 
 from ..data.input_response import SLOPES
 from ..data.markers import MarkerMap
-from ..dynamics.plausibility import mean_of, small_strain_stiffness
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.catalogue import read_law
 from ..energies.convex_material import ConvexMaterial
-from ..energies.materials import Material
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.bodies import Body
 from ..io.errors import InputError, naming
-from ..io.machine import available_memory_gib
 from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
 from ..learning.reconstruction import make_reconstructor
 from ..mesh.selection import select_vertices
 from ..mesh.volume_mesh import surface_vertices
-from ..settings.body import BodySettings, MaterialSettings
+from ..settings.body import MaterialSettings
 from ..settings.data_kinds import RecordedData, ReleaseFromLoad
 from ..settings.learning import IdentifySettings, LawSettings
-from ..settings.mesh import HexahedralBox, MeshSettings, TetrahedralBox
 from ..settings.run import RunSettings
 from .actuators import Drive, check_drive, drive_of
 from .build import build_body, build_material, build_simulator
-from .experiment import LAW
 from .identify import ELASTIC
 from .recordings.recorded_checks import check_recorded
 from .shapes import check_shape
 from .simulate import substeps_of, target_settings, vertices_in
-from .splits import split_of, trials_of
+from .splits import split_of
 
-_BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
-_SHARE_OF_MEMORY = 0.8
-_LARGEST_STRAIN = 0.3  # rho g L / E above which a wrong unit is assumed
 _NOT_NEGATIVE = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
 
 
@@ -57,7 +48,6 @@ def check_run(run: RunSettings) -> None:
         MeshError: the mesh cannot be read or simulated, or no vertex lies at a place.
         DataFileError: the folder has no recordings.
     """
-    check_memory(run.bodies)
     for prefix, settings in run.bodies.items():
         with naming(prefix):
             check_drive(settings)
@@ -68,8 +58,6 @@ def check_run(run: RunSettings) -> None:
     assert run.tip is not None
     select_vertices(body.mesh, **run.tip.arguments())
     simulator = build_simulator(run, run.simulation, body)
-    for material in simulator.materials.values():
-        _check_size(body, material, run.gravity)
     _check_target(run, body)
     if isinstance(run.data, RecordedData) and run.markers is not None:
         check_recorded(run, run.data, run.markers, body)
@@ -79,7 +67,7 @@ def check_run(run: RunSettings) -> None:
     else:
         _check_simulated(run, simulator)
     if run.law is not None:
-        _check_law(run, run.law)
+        _check_law(run.law)
     if run.control is not None:
         _check_control(run, body)
     if run.identify is not None:
@@ -91,20 +79,12 @@ def check_run(run: RunSettings) -> None:
                 build_simulator(run.changed(integrator=run.identify.integrator), run.simulation, body)
         _check_identification(run.identify, names, simulator)
         _check_parts(run.identify, simulator)
-        _check_owners(run.identify, run)
 
 
-def _check_law(run: RunSettings, law: LawSettings) -> None:
+def _check_law(law: LawSettings) -> None:
     """Checks the identification of a law, or that a law of another run can be used."""
-    if run.simulation.regions:
-        raise InputError("law: the simulator has materials by region, and one law is for one material: leave law out.")
     with naming("law.terms: "):
         ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
-    if run.simulation.model == LAW and law.file is None:
-        raise InputError(
-            f"law: simulation.model is {LAW} already: identify its constants in identify.parameters, or take another "
-            "one."
-        )
     if law.file is not None:
         given = read_law(law.file)
         material = MaterialSettings.model_validate({"model": given["model"], **given["constants"]})
@@ -131,33 +111,8 @@ def _check_control(run: RunSettings, body: Body) -> None:
     """Checks that the robot can be controlled."""
     if find_spec("piqp") is None:
         raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
-    if run.network.core is not None:
-        raise InputError("control evaluates perceptrons alone: set control=none, or network.core=null.")
     if drive_of(run, body) is None:
         raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
-    if run.obstacles or run.self_contact:
-        raise InputError(
-            "control plans with a reduced model, which has no contact: set control=none, or obstacles={} and "
-            "self_contact=null."
-        )
-    if run.is_laboratory and any(trial.payload for trial in trials_of(run)):
-        raise InputError("control does not support payloads: remove them from laboratory.trials.")
-
-
-def check_memory(bodies: Mapping[str, BodySettings]) -> None:
-    """Refuses meshes of bodies, by the prefix of their keys, that do not fit into the free memory."""
-    limit = _SHARE_OF_MEMORY * available_memory_gib()
-    meshes: dict[str, MeshSettings] = {f"{key}mesh": body.mesh for key, body in bodies.items()}
-    for key, body in bodies.items():
-        meshes |= {f"{key}parts.{name}.mesh": part.mesh for name, part in body.parts.items()}
-    for key, mesh in meshes.items():
-        cells = math.prod(mesh.divisions) if isinstance(mesh, HexahedralBox | TetrahedralBox) else 0
-        needed = cells * _BYTES_PER_CELL / 2**30
-        if needed > limit:
-            raise InputError(
-                f"{key}.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but {limit:.3g} GiB are "
-                "free: use fewer."
-            )
 
 
 def _check_identification(identify: IdentifySettings, identifiable: Sequence[str], simulator: Simulator) -> None:
@@ -180,27 +135,6 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
             raise InputError(
                 f"identify.parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not negative: "
                 "set it to zero or more."
-            )
-
-
-def _check_owners(identify: IdentifySettings, run: RunSettings) -> None:
-    """Checks parameters of which trials or sessions have their own values."""
-    tables = [run.recorded.trials] if run.recorded is not None else []
-    tables += [run.laboratory.trials] if run.laboratory is not None else []
-    named = any(trial.session for table in tables for trial in table.values())
-    placement, markers = identify.placement, run.markers
-    if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):
-        raise InputError(
-            "identify.placement.mounting is of rigid bodies, and markers.rigid_bodies is empty: leave it out."
-        )
-    for name, limits in identify.parameters.items():
-        if limits.per == "material":
-            raise InputError(
-                f"identify.parameters.{name}.per is material, which is for data.kind pictures: leave it out."
-            )
-        if limits.per == "session" and not named:
-            raise InputError(
-                f"identify.parameters.{name}.per is session, but no trial names one: set data.trials.NAME.session."
             )
 
 
@@ -240,8 +174,6 @@ def _check_target(run: RunSettings, body: Body) -> None:
         build_material(target.material, f"{key}.material")
         with naming(f"{key}: "):
             simulator = build_simulator(target_settings(run, target), target.material, payload_at=run.payload_at)
-        for material in simulator.materials.values():
-            _check_size(simulator.body, material, run.gravity)
         if run.recorded is not None:
             _check_drive(drive_of(run, body), drive_of(target, simulator.body))
             continue
@@ -266,23 +198,4 @@ def _check_drive(drive: Drive | None, real: Drive | None) -> None:
         raise InputError(
             f"laboratory: its body takes {played}, but that of the simulator takes {simulated}: give both the same "
             "inputs, by chambers, tendons, muscles.commanded or energies."
-        )
-
-
-def _check_size(body: Body, material: Material, gravity: Sequence[float]) -> None:
-    """Refuses a body with very large strains under its own weight, which indicate a wrong unit.
-
-    A body of length L under its weight has strains of about rho g L / E: one percent for an arm of silicone.
-    """
-    length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
-    constants = material.constants
-    density, stiffness = mean_of(constants["density"]), small_strain_stiffness(material)
-    if stiffness <= 0.0:
-        raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
-    strain = density * float(np.linalg.norm(gravity)) * length / stiffness
-    if strain > _LARGEST_STRAIN:
-        raise InputError(
-            f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
-            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(constants))} not "
-            "Pa?"
         )

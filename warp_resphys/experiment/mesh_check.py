@@ -17,7 +17,6 @@ from ..learning.metrics import marker_errors, summarise
 from ..learning.replay import Replay
 from ..settings.stage_keys import StageSettings
 from .build import finer
-from .checks import check_memory
 from .experiment import Experiment
 from .files import MESH_CHECK
 
@@ -37,7 +36,6 @@ def check_mesh(context: StageContext) -> None:
     model = "simulation" if settings.identified is None else "sysid"
     content: dict[str, Any] = {"model": model}
     try:
-        check_memory({"": other})
         experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
         meshes = [experiment.body.mesh for experiment in experiments]
         if len(meshes[0].vertices) == len(meshes[1].vertices):

@@ -21,6 +21,7 @@ def check_relations(run: RunKeys) -> None:
     _check_base(run)
     _check_obstacles(run)
     _check_view(run)
+    _check_identification(run)
     _check_control(run)
 
 
@@ -138,6 +139,31 @@ def _check_view(run: RunKeys) -> None:
         )
 
 
+def _check_identification(run: RunKeys) -> None:
+    """Checks the law beside the material, and parameters of which trials or sessions have their own values."""
+    if run.law is not None and run.simulation.regions:
+        raise ValueError("law: the simulator has materials by region, and one law is for one material: leave law out.")
+    if run.law is not None and run.law.file is None and run.simulation.model == "law":
+        raise ValueError(
+            "law: simulation.model is law already: identify its constants in identify.parameters, or take another one."
+        )
+    if run.identify is None or run.pictures is not None:
+        return
+    tables = [own.trials for own in (run.recorded, run.laboratory) if own is not None]
+    named = any(trial.session for table in tables for trial in table.values())
+    placement, markers = run.identify.placement, run.markers
+    if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):
+        raise ValueError(
+            "identify.placement.mounting is of rigid bodies, and markers.rigid_bodies is empty: leave it out."
+        )
+    for name, limits in run.identify.parameters.items():
+        key = f"identify.parameters.{name}.per"
+        if limits.per == "material":
+            raise ValueError(f"{key} is material, which is for data.kind pictures: leave it out.")
+        if limits.per == "session" and not named:
+            raise ValueError(f"{key} is session, but no trial names one: set data.trials.NAME.session.")
+
+
 def _check_control(run: RunKeys) -> None:
     """Checks control beside the data and the models."""
     control, data = run.control, run.recorded
@@ -165,3 +191,12 @@ def _check_control(run: RunKeys) -> None:
         )
     if short := [seconds for seconds in control.seconds if seconds < _LEAST_STEPS * run.time_step]:
         raise ValueError(f"control.seconds has {short[0]:g}: a path takes {_LEAST_STEPS} steps at least.")
+    if run.network.core is not None:
+        raise ValueError("control evaluates perceptrons alone: set control=none, or network.core=null.")
+    if run.obstacles or run.self_contact:
+        raise ValueError(
+            "control plans with a reduced model, which has no contact: set control=none, or obstacles={} and "
+            "self_contact=null."
+        )
+    if run.is_laboratory and run.laboratory is not None and any(x.payload for x in run.laboratory.trials.values()):
+        raise ValueError("control does not support payloads: remove them from laboratory.trials.")

@@ -10,12 +10,12 @@ import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import means, run_without_report
 from warp_resphys import select_vertices
-from warp_resphys.experiment import identify_law
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.simulate import build_target, initial_state
 from warp_resphys.experiment.splits import all_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.safe_files import read_json
+from warp_resphys.learning import law_search
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
@@ -42,7 +42,7 @@ OTHERS += ["120 g at 45°"]
 def short_stride():
     """Balances forces every other step, as the trials have few steps."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identify_law, "_STRIDE", 2)
+        patch.setattr(law_search, "_STRIDE", 2)
         yield
 
 

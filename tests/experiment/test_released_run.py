@@ -15,7 +15,7 @@ from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.resuming import StageContext, StageInterrupted, run_stages
 from warp_resphys.io.safe_files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.learning import identification
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
@@ -185,14 +185,13 @@ def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tm
     (stage, *_) = learning_stages(wanted, split_of(wanted), ".", "imported")
     descents, at = [], 4
 
-    def descend(self, number, start, max_evaluations, tolerance, report):
-        descents.append((self._misfit.simulator.integrator, number))
+    def descend(misfit, number, start, max_evaluations, tolerance, report):
+        descents.append((misfit.simulator.integrator, number))
         if len(descents) == at:
             raise KeyboardInterrupt
-        unit, history = self._misfit.to_unit(start), [{"loss": 1.0, **start}]
-        return {"parameters": dict(start), "loss": number + 1.0, "unit": unit, "prior_weight": 0.0, "history": history}
+        return identification._Attempt(misfit.to_unit(start), number + 1.0, [{"loss": 1.0, **start}], 0.0)
 
-    monkeypatch.setattr(ParameterSearch, "_descend", descend)
+    monkeypatch.setattr(identification, "_descend", descend)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
         run_stages([stage], tmp_path)
     assert not (tmp_path / "identification.json").exists()

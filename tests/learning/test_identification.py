@@ -10,7 +10,7 @@ from support.swinging_beam import MARKERS, MESH, TIP, blank, double
 from warp_resphys import Body, Simulator
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.learning.identification import first_points, search_parameters
 from warp_resphys.learning.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
@@ -55,7 +55,7 @@ def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
 def test_a_parameter_outside_its_range_ends_on_the_bound():
     bounds = {"youngs_modulus": Bounds(3e5, 1e6, logarithmic=True)}
     pair = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=12)
-    result = ParameterSearch(Misfit([pair], bounds)).run([{"youngs_modulus": 6e5}], 40)
+    result = search_parameters(Misfit([pair], bounds), [{"youngs_modulus": 6e5}], 40)
     assert result.at_bounds == ("youngs_modulus",)
     assert result.parameters["youngs_modulus"] == pytest.approx(3e5)
 
@@ -82,24 +82,24 @@ def test_a_start_where_the_simulation_fails_is_passed_over():
 
     replay, release = replay_of(simulator(Fragile), TRUTH, noise=5e-5)
     soft = FIRST | {"youngs_modulus": 120e3}
-    identifier = ParameterSearch(Misfit([(replay, release)], RANGES))
-    result = identifier.run([soft, FIRST], 40)
+    misfit = Misfit([(replay, release)], RANGES)
+    result = search_parameters(misfit, [soft, FIRST], 40)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
     assert result.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
     assert result.at_bounds == ()
     assert result.history[0] == []
     assert len(result.history[1]) < 25
     with pytest.raises(ConvergenceError, match=r"every start.*: too soft"):
-        identifier.run([soft], 20)
+        search_parameters(misfit, [soft], 20)
 
 
 def test_starts_are_the_first_guess_and_the_best_candidates():
     replay, release = replay_of(simulator(), TRUTH, frames=20)
-    identifier = ParameterSearch(Misfit([(replay, release)], RANGES))
-    starts = identifier.starts(FIRST, 3, 8, seed=0)
+    misfit = Misfit([(replay, release)], RANGES)
+    starts = first_points(misfit, FIRST, 3, 8, seed=0)
     assert len(starts) == 3
     assert starts[0] == pytest.approx(FIRST)
-    assert starts == identifier.starts(FIRST, 3, 8, seed=0) != identifier.starts(FIRST, 3, 8, seed=1)
+    assert starts == first_points(misfit, FIRST, 3, 8, seed=0) != first_points(misfit, FIRST, 3, 8, seed=1)
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
 
 
@@ -109,7 +109,7 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
 def test_unknown_parameters_are_refused(bounds, sentence):
     replay, release = replay_of(simulator(), TRUTH, frames=3)
     with pytest.raises(InputError, match=sentence):
-        ParameterSearch(Misfit([(replay, release)], bounds))
+        Misfit([(replay, release)], bounds)
 
 
 def test_a_motion_that_stands_still_is_refused():
@@ -117,13 +117,18 @@ def test_a_motion_that_stands_still_is_refused():
     still = replay.trials.held[:, None].repeat(1, 3, 1, 1)
     motions = replace(replay.trials, observed=still)
     with pytest.raises(InputError, match="'m0' stay where they were held"):
-        ParameterSearch(Misfit([(Replay(replay.simulator, MARKERS, motions), release)], RANGES))
+        Misfit([(Replay(replay.simulator, MARKERS, motions), release)], RANGES)
 
 
 @pytest.mark.parametrize(("low", "high", "log"), [(1.0, 1.0, False), (0.0, 1.0, True), (0.0, np.inf, False)])
 def test_bounds_leave_a_range(low, high, log):
     with pytest.raises(InputError):
         Bounds(low, high, log)
+
+
+def test_values_of_trials_need_a_prior():
+    with pytest.raises(InputError, match="per is trial, but there is no prior"):
+        Bounds(0.0, 1.0, per="trial")
 
 
 @pytest.mark.parametrize("bounds", [Bounds(1e5, 1e6, logarithmic=True), Bounds(-1.0, 3.0)])
@@ -149,10 +154,10 @@ def test_stiffness_and_damping_are_identified_from_poses_and_motions():
     """A pose under a weight depends on the stiffness alone: the damping is identified from the motion."""
     motion, release = replay_of(simulator(), TRUTH, masses=(0.0,), frames=25)
     pose, start = resting_pose(motion.simulator)
-    result = ParameterSearch(Misfit([(motion, release), (pose, start)], RANGES)).run([FIRST], 40)
+    result = search_parameters(Misfit([(motion, release), (pose, start)], RANGES), [FIRST], 40)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
     assert result.parameters["stiffness_damping"] == pytest.approx(0.002, rel=0.02)
-    alone = ParameterSearch(Misfit([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]})).run([FIRST], 40)
+    alone = search_parameters(Misfit([(pose, start)], {"youngs_modulus": RANGES["youngs_modulus"]}), [FIRST], 40)
     assert alone.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
 
 
@@ -183,11 +188,11 @@ def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
     offsets = 2e-3 * double([[1.0, -0.5, 0.3], [-0.4, 0.6, 1.0], [0.2, 0.8, -1.0]])
     askew = Placement(offsets, double([1e-3, 0.0, -1e-3]), double([0.0, 0.0, 0.0]), double([0.0, 0.0, 0.0]))
     pair = late(PlacedMarkers.of(MARKERS, askew) if placed else MARKERS)
-    more = {"accuracy": ACCURACY, "labels": ["a", "b", "c"]} if placed else {}
-    result = ParameterSearch(Misfit([pair], RANGES, delay=0.02, **more)).run([FIRST], 40)
+    more = {"accuracy": ACCURACY} if placed else {}
+    result = search_parameters(Misfit([pair], RANGES, delay=0.02, **more), [FIRST], 40, labels="abc")
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-2 if placed else 1e-3)
     assert result.parameters["stiffness_damping"] == pytest.approx(0.004, rel=0.05)
-    on_time = ParameterSearch(Misfit([pair], RANGES, **more)).run([FIRST], 40)
+    on_time = search_parameters(Misfit([pair], RANGES, **more), [FIRST], 40, labels="abc")
     assert result.loss < (0.2 if placed else 0.02) * on_time.loss
 
 

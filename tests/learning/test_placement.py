@@ -13,11 +13,10 @@ from warp_resphys import Body, Corotated, Rigid, Simulator
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_vertices
 from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.learning.identification import search_parameters
 from warp_resphys.learning.misfit import Misfit
-from warp_resphys.learning.nuisance import NuisanceFit
 from warp_resphys.learning.parameters import Bounds, Prior
-from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
+from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, NuisanceFit, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.mesh.boxes import box_hexahedra
@@ -90,7 +89,7 @@ def test_the_placement_minimises_its_sum_of_squares():
     )
     seen = [torch.rand(2, 3, 4, generator=draw) > 0.3]
     errors[0] = torch.where(seen[0][..., None], errors[0], 0.0)
-    weights, accuracy = [torch.tensor([3.0, 5.0]).double()], Accuracy(1e-3, 2e-3, 0.1)
+    weights, accuracy = [torch.tensor([3.0, 5.0]).double()], Accuracy(1e-3, 2e-3, 0.1, centre=CENTRE)
 
     def loss(b):
         moved = at + (turns @ b[:12].view(4, 3)[..., None])[..., 0]
@@ -104,7 +103,7 @@ def test_the_placement_minimises_its_sum_of_squares():
     trials = TrialBatch(names, torch.arange(3).double().expand(2, -1), observed, held)
     group = (Replay(SIM, DisplacedMarkers(bind(), 4), trials), Start.resting(REST.expand(2, -1, -1)))
     series = [torch.cat([at, *(at + turn for turn in turns.unbind(-1))], 2)[None]]
-    placed = NuisanceFit([group], weights, accuracy, CENTRE, 0.0)(series, 1e-5)[1]
+    placed = NuisanceFit([group], weights, accuracy, 0.0)(series, 1e-5)[1]
     result, inside = placed.common, placed.rows / math.sqrt(1e-5)
     assert float(result.turn.norm()) > 0.02
     gradients = []
@@ -113,7 +112,7 @@ def test_the_placement_minimises_its_sum_of_squares():
         gradients.append(torch.autograd.grad(loss(b), b)[0])
     assert float(gradients[1].norm()) < 1e-4 * float(gradients[0].norm())
     np.testing.assert_allclose(inside[12:15], result.shift / 2e-3, rtol=1e-9)
-    held = NuisanceFit([group], weights, Accuracy(shift=2e-3), CENTRE, 0.0)(series, 1e-5)[1].common
+    held = NuisanceFit([group], weights, Accuracy(shift=2e-3), 0.0)(series, 1e-5)[1].common
     assert float(held.offsets.abs().max()) == float(held.turn.abs().max()) == 0.0 < float(held.shift.abs().max())
 
 
@@ -146,14 +145,14 @@ def posed(observe, noise=0.0, seed=0, truth=TRUTH):
     return Replay(SIM, bind(), replace(blank, observed=seen)), start
 
 
-ACCURACY = Accuracy(2e-3, 2e-3, 0.03)
+ACCURACY = Accuracy(2e-3, 2e-3, 0.03, centre=CENTRE.tolist())
 
 
 def test_the_modulus_is_recovered_from_misplaced_markers():
     pair = posed(PlacedMarkers.of(bind(), ASKEW), noise=1e-5)
-    naive = ParameterSearch(Misfit([pair], RANGES)).run([{"youngs_modulus": 4e5}], 30)
-    search = ParameterSearch(Misfit([pair], RANGES, accuracy=ACCURACY, labels=LABELS, centre=CENTRE.tolist()))
-    result = search.run([{"youngs_modulus": 4e5}], 30)
+    naive = search_parameters(Misfit([pair], RANGES), [{"youngs_modulus": 4e5}], 30)
+    misfit = Misfit([pair], RANGES, accuracy=ACCURACY)
+    result = search_parameters(misfit, [{"youngs_modulus": 4e5}], 30, labels=LABELS)
     assert result.parameters["youngs_modulus"] == pytest.approx(215e3, rel=0.01)
     assert abs(naive.parameters["youngs_modulus"] - 215e3) > 3.0 * abs(result.parameters["youngs_modulus"] - 215e3)
     assert result.placement["offsets"].keys() == set(LABELS)
@@ -172,14 +171,14 @@ def test_a_prior_determines_what_poses_do_not():
     still, start = posed(bind(), noise=1e-5, truth={"youngs_modulus": 215e3, "density": 1070.0})
     own = still.trials.select([0])
     pair = Replay(SIM, bind(), own), start.select([0])
-    result = ParameterSearch(Misfit([pair], {**ranges, "density": prior})).run(
-        [{"youngs_modulus": 3e5, "density": 1000.0}], 30
+    result = search_parameters(
+        Misfit([pair], {**ranges, "density": prior}), [{"youngs_modulus": 3e5, "density": 1000.0}], 30
     )
     assert result.parameters["density"] == pytest.approx(1200.0, abs=4.0)
     assert result.parameters["youngs_modulus"] / 215e3 == pytest.approx(1200.0 / 1070.0, rel=0.01)
     assert result.uncertainty.deviation["density"] == pytest.approx(40.0, rel=0.1)
-    apart = ParameterSearch(Misfit([(still, start)], {**ranges, "density": prior})).run(
-        [{"youngs_modulus": 3e5, "density": 1e3}], 30
+    apart = search_parameters(
+        Misfit([(still, start)], {**ranges, "density": prior}), [{"youngs_modulus": 3e5, "density": 1e3}], 30
     )
     assert apart.parameters["density"] == pytest.approx(1070.0, rel=0.02)  # the weights tell
     assert apart.uncertainty.deviation["density"] < 20.0
@@ -216,16 +215,14 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
 
     ranges, guess = {"beam_youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}, [{"beam_youngs_modulus": 4e5}]
     bodies = ((0, nominal - middle),)
-    accuracy = Accuracy(markers=2e-3, mounting=0.03, rigid_bodies=bodies)
-    result = ParameterSearch(Misfit([pair], ranges, accuracy=accuracy, labels=LABELS, centre=CENTRE.tolist())).run(
-        guess, 30
-    )
-    naive = ParameterSearch(Misfit([pair], ranges)).run(guess, 30)
+    accuracy = Accuracy(markers=2e-3, mounting=0.03, rigid_bodies=bodies, centre=CENTRE.tolist())
+    result = search_parameters(Misfit([pair], ranges, accuracy=accuracy), guess, 30, labels=LABELS)
+    naive = search_parameters(Misfit([pair], ranges), guess, 30)
     off, plain = (abs(x.parameters["beam_youngs_modulus"] / 215e3 - 1.0) for x in (result, naive))
     assert off < 0.03
     assert plain > 3.0 * off
-    halved = ParameterSearch(Misfit([pair], ranges, shares=[0.5] * 4)).run(
-        guess, 30
+    halved = search_parameters(
+        Misfit([pair], ranges, shares=[0.5] * 4), guess, 30
     )  # Six of twelve coordinates are independent.
     wider, narrow = (x.uncertainty.deviation["beam_youngs_modulus"] for x in (halved, naive))
     assert wider / narrow == pytest.approx(math.sqrt(2.0 * (1.0 - 1.0 / 36.0) / (1.0 - 1.0 / 18.0)), rel=1e-3)
@@ -237,7 +234,7 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
 def test_misplaced_vertices_and_priors_out_of_range_are_refused():
     replay, start = posed(bind())
     with pytest.raises(InputError, match=r"leave identify\.placement out"):
-        ParameterSearch(Misfit([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY))
+        Misfit([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY)
     with pytest.raises(InputError, match="can be placed elsewhere"):
         MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved(MOVED[:2])
     with pytest.raises(InputError, match=r"the prior has the mean 2e\+06, outside of the range"):
@@ -267,7 +264,7 @@ def test_derivatives_by_the_values_of_trials_are_those_of_the_loss(sessions):
         rows = [[0, 2, 3], [1, 4]]
         trials = [replace(replay.trials.select(own), session=str(own)) for own in rows]
         parts = [(Replay(SIM, bind(), t), start.select(own)) for t, own in zip(trials, rows, strict=True)]
-    misfit = Misfit(parts, OWN, accuracy=ACCURACY, centre=CENTRE.tolist())
+    misfit = Misfit(parts, OWN, accuracy=ACCURACY)
     unit = np.array([0.45, 0.4, 0.6, 0.55, 0.3])
     misfit.update_prior_weight(unit)
     misfit.update_prior_weight(unit)
@@ -298,7 +295,7 @@ def test_a_trial_is_left_out_as_if_the_others_were_identified():
 
     def best(rows, weight):
         pair = Replay(SIM, bind(), replay.trials.select(rows)), start.select(rows)
-        misfit = Misfit([pair], RANGES, accuracy=ACCURACY, centre=CENTRE.tolist())
+        misfit = Misfit([pair], RANGES, accuracy=ACCURACY)
         misfit.prior_weight, unit = weight, misfit.to_unit(TRUTH)
         for _ in range(5):
             linear = misfit.linearise(unit)

@@ -133,9 +133,9 @@ def test_derivatives_of_clouds_are_those_of_differences(beam, kind):
     values = {**dict.fromkeys(ranges, 0.003), "youngs_modulus": 1.4e5}
     misfit = PictureMisfit([own], ranges)
     unit = misfit.to_unit(values | ({"focal_factor": 1.01} if kind == "depth" else {}))
-    ((_, jacobian, _),) = misfit.linearise(unit).trials
+    jacobian = misfit.linearise(unit).trials[0].slopes
     for column, step in enumerate(1e-5 * np.eye(len(unit))):
-        ends = [misfit.linearise(unit + sign * step, derivatives=False).trials[0][0] for sign in (1.0, -1.0)]
+        ends = [misfit.linearise(unit + sign * step, derivatives=False).trials[0].rows for sign in (1.0, -1.0)]
         numeric = (ends[0] - ends[1])[:, 0] / 2e-5
         away = np.abs(jacobian[:, column] - numeric) / np.abs(numeric).max()
         assert np.quantile(away, 0.97) < 2e-3  # that of the modulus is a one-sided difference of equilibria
@@ -154,7 +154,7 @@ def test_a_turned_scan_with_outliers(beam):
     own = with_cloud(pose, Cloud(turn.apply(points) + shift))
     ranges = {**MODULUS, **bounds_of(*PLACES, prior=Prior(0.0, 0.1))}
     first = {**dict.fromkeys(ranges, 0.0), "youngs_modulus": 3e5}
-    result = wr.learning.ParameterSearch(PictureMisfit([own], ranges)).run([first], 40)
+    result = wr.learning.search_parameters(PictureMisfit([own], ranges), [first], 40)
     deviation = result.uncertainty.deviation["youngs_modulus"]
     assert deviation < 0.15 * TRUTH["youngs_modulus"]
     assert abs(result.parameters["youngs_modulus"] - TRUTH["youngs_modulus"]) < 3.0 * deviation

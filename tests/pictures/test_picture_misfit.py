@@ -12,7 +12,7 @@ import warp_resphys as wr
 from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification import ParameterSearch
+from warp_resphys.learning.identification import search_parameters
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
 from warp_resphys.pictures.picture_misfit import PictureMisfit, values_of
@@ -76,7 +76,7 @@ def test_parameters_come_back(seen, kind):
     photo = replace(seen.photos[0], **({"tracked": None} if kind == "outline" else {"outline": None}))
     # Six exact coordinates determine four parameters, without priors.
     ranges = RANGES if kind == "outline" else {name: replace(range_, prior=None) for name, range_ in RANGES.items()}
-    result = ParameterSearch(PictureMisfit([replace(seen, photos=(photo,))], ranges)).run([FIRST], 40, tolerance=1e-12)
+    result = search_parameters(PictureMisfit([replace(seen, photos=(photo,))], ranges), [FIRST], 40, tolerance=1e-12)
     limit = 0.1 if kind == "outline" else 1e-3  # a mask has whole pixels
     assert result.parameters["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=limit)
     assert result.uncertainty.deviation["youngs_modulus"] < 0.2 * TRUTH["youngs_modulus"]
@@ -159,14 +159,14 @@ def test_deviations_are_those_of_repeated_pictures():
     for seed in range(12):
         mask = noisy_mask(region, SIZE[::-1], 1.0, np.random.default_rng(seed))
         own = replace(seen, photos=(replace(seen.photos[0], outline=Outline.of_mask(mask)),))
-        result = ParameterSearch(PictureMisfit([own], ranges, known)).run([first], 8)
+        result = search_parameters(PictureMisfit([own], ranges, known), [first], 8)
         found.append(np.log(result.parameters["youngs_modulus"]))
         said.append(result.uncertainty.deviation["youngs_modulus"] / result.parameters["youngs_modulus"])
     assert 0.5 < np.std(found, ddof=1) / np.mean(said) < 1.4
     assert abs(np.mean(found) - np.log(TRUTH["youngs_modulus"])) < 0.02
     # Copies of a picture, or others of the body at rest by the same camera, say no more than one.
     thrice = replace(own, photos=3 * own.photos)
-    again = ParameterSearch(PictureMisfit([thrice], ranges, known)).run([first], 8)
+    again = search_parameters(PictureMisfit([thrice], ranges, known), [first], 8)
     assert again.parameters["youngs_modulus"] == pytest.approx(result.parameters["youngs_modulus"], rel=1e-6)
     assert again.uncertainty.deviation["youngs_modulus"] == pytest.approx(
         result.uncertainty.deviation["youngs_modulus"], rel=0.02

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ UNDER_INPUTS: Final = "driven"  # of a body at rest under the inputs of the firs
 SLACK: Final = "slack"  # the same, where these do not act; as UNDER_INPUTS in a dataset
 RESTING: Final = ("rest", UNDER_INPUTS, SLACK)  # of motions that inputs begin, read at the time steps
 _KIND = "dataset"
+T = TypeVar("T")
 _UNITS = {
     **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
     **{"velocity": "m/s", "times": "s", "payload": "kg", "base": "m, rad", "initial": "m, m/s"},
@@ -288,3 +289,9 @@ def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArr
         raise InputError("data.payload_at selects fixed vertices only: hang the payload on vertices that can move.")
     masses[:, carrying] = loads[:, None] / len(carrying)
     return {"attached_mass": masses}
+
+
+def evenly(row: Sequence[T], limit: int) -> list[T]:
+    """Picks at most `limit` values, evenly spread over a row."""
+    places = np.linspace(0, len(row) - 1, min(limit, len(row))).round().astype(int)
+    return [row[i] for i in places]

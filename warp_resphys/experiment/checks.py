@@ -31,12 +31,12 @@ from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.run import RunSettings
 from .actuators import Drive, check_drive, drive_of
 from .build import build_body, build_material, build_simulator
-from .identify import ELASTIC
 from .recordings.recorded_checks import check_recorded
 from .shapes import check_shape
 from .simulate import substeps_of, target_settings, vertices_in
 from .splits import split_of
 
+_ELASTIC = ("youngs_modulus", "poissons_ratio")
 _NOT_NEGATIVE = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
 
 
@@ -119,7 +119,7 @@ def _check_identification(identify: IdentifySettings, identifiable: Sequence[str
     """Checks the group ``identify``, for the names of the identifiable parameters."""
     if not identify.parameters:
         raise InputError(f"identify.parameters is empty: give a range for at least one of {', '.join(identifiable)}.")
-    elastic = [name for name in ELASTIC if name in identifiable]
+    elastic = [name for name in _ELASTIC if name in identifiable]
     for group, names, choice in (
         ("parameters", identify.parameters, identifiable),
         ("elastic", identify.elastic or (), elastic),

@@ -13,6 +13,7 @@ from statistics import fmean
 
 import torch
 
+from ..data.trials import evenly
 from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
@@ -21,7 +22,6 @@ from ..report.wording import duration_text
 from ..settings.stage_keys import StageSettings
 from .experiment import MODELS, SIMFREE, Experiment
 from .mesh_check import CHECKED_SECONDS
-from .splits import evenly
 
 _LEAST_SECONDS = 60.0  # of the estimates that are shown
 _SHORT = 8e6  # steps times vertices that take less than that

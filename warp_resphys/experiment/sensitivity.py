@@ -9,7 +9,7 @@ the actuator did.
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -105,9 +105,7 @@ def _of_batch(
         placement = Placement.none(count, experiment.like.new_tensor(np.mean(dataset.bound, axis=0)))
         if plain is not None:
             placement = placement_of(plain, dataset.labels, dataset.session(names[0])).to(experiment.like)
-        displaced = DisplacedMarkers(observe, count)
-        replay = Replay(simulator, displaced, replay.trials)
-        start = replace(start, shift=None if start.shift is None else start.shift.repeat(1, displaced.copies, 1))
+        replay, start = DisplacedMarkers.replay(Replay(simulator, observe, replay.trials), start)
     rows = {parameter: row for row, parameter in enumerate(moved, 1)}
     sets = {name: value.repeat(1 + len(moved)) for name, value in values.items()}
     for name in sets:
@@ -116,8 +114,7 @@ def _of_batch(
     points = (replay.varied if moved and not replay.is_static else replay)(start, sets)
     slopes: Any = [None] * len(names)
     if placement is not None:
-        markers, rotations = DisplacedMarkers.split(points)
-        points = placement.apply(markers + (rotations @ placement.offsets[..., None])[..., 0])
+        points, rotations = placement.places(points)
         slopes = by_placement(placement, points[0], rotations[0]).double().cpu().numpy()
     shown = points.double().cpu().numpy()
     return {

@@ -15,6 +15,7 @@ import torch
 from ..dynamics.simulator import Simulator
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
+from ..io.parts import Checkpoint
 from ..io.progress import Progress
 from ..io.resuming import StageContext
 from ..io.safe_files import read_json, write_json
@@ -30,7 +31,6 @@ from .actuators import driven_parts, driving_quantity
 from .build import build_body, build_simulator
 from .experiment import LAW, Experiment
 from .files import LAW_FILE, SHAPES
-from .identify import Checkpoint
 from .simulate import loads, substeps_of, target_settings, twist, vertices_in
 
 

@@ -1,19 +1,17 @@
 """Trials of an experiment: their names, how they begin, and their split into training, validation and test."""
 
-from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
+from ..data.trials import evenly
 from ..io.errors import DataFileError, InputError
 from ..settings.data_kinds import RecordedData, ReleaseFromLoad, SimulatedData
 from ..settings.motions import Split, Trial, TrialSettings
 from ..settings.played import LaboratorySettings
 from ..settings.run import RunSettings
-
-T = TypeVar("T")
 
 SPLITS: Final = ("train", "validation", "test")
 OTHERS: Final = "others"
@@ -208,9 +206,3 @@ def test_groups(run: RunSettings, split: Split) -> dict[str, tuple[str, ...]]:
     """Names of the tested trials by input scale; the first group, ``1``, has the original inputs."""
     scaled = {f"{scale:g}": tuple(scaled_name(name, scale) for name in split.test) for scale in run.input_scales}
     return {"1": split.test} | scaled
-
-
-def evenly(row: Sequence[T], limit: int) -> list[T]:
-    """Picks at most `limit` values, evenly spread over a row."""
-    places = np.linspace(0, len(row) - 1, min(limit, len(row))).round().astype(int)
-    return [row[i] for i in places]

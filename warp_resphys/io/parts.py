@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from .fan_out import ALONE, Workers, fan_out
 from .progress import Progress
 from .resuming import StageContext
-from .safe_files import atomic_hdf5, create, is_final, read_array, read_hdf5
+from .safe_files import atomic_hdf5, create, is_final, read_array, read_hdf5, resume_checkpoint, write_checkpoint
 
 Report = Callable[..., None]
 Arrays = Mapping[str, tuple[NDArray[Any], str]]  # with their units
@@ -157,6 +157,26 @@ def _compute(parts: Parts, part: TrialPart) -> Arrays | None:
         return arrays
     parts._keep(part, arrays)
     return None
+
+
+class Checkpoint:
+    """Finished parts of the work of a stage, as JSON data in a file that is ignored if the settings changed."""
+
+    def __init__(self, context: StageContext) -> None:
+        self.path, self._fingerprint = context.run_dir / f"{context.name}_parts.safetensors", context.fingerprint
+        checkpoint = resume_checkpoint(self.path, "parts", context.fingerprint)
+        self._parts: dict[str, Any] = {} if checkpoint is None else checkpoint[1]["parts"]
+
+    def once(self, key: str, work: Callable[[], Any]) -> Any:
+        """Returns the result of a part, which is worked on unless it was finished before."""
+        if key not in self._parts:
+            self._parts = {**self._parts, key: work()}
+            write_checkpoint(self.path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self._parts})
+        return self._parts[key]
+
+    def within(self, name: str) -> Callable[[str, Callable[[], Any]], Any]:
+        """Returns `once` with a name before the keys."""
+        return lambda key, work: self.once(f"{name} {key}", work)
 
 
 def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:

@@ -1,42 +1,29 @@
-"""Search for the law of a material: the smallest class of convex terms that explains held-out motions.
+"""Laws of a material: classes of convex terms, and the smallest coefficients that balance the forces of motions.
 
-The terms are those of `energies.convex_material.ConvexMaterial`. Their forces are linear in their coefficients, so that
-the balance of forces of observed motions gives these. With the positions of all vertices at every step, the residual of
-a step (`Simulator.linearise`) at the observed solution is g_0 + sum_k theta_k a_k, where a_k is the force of
-coefficient k alone. The coefficients are the non-negative least-squares solution of
-
-    min sum || H^-1 (g_0 + sum_k theta_k a_k) ||^2
-
-over steps and motions: the weak form of an unknown law (Flaschel, Kumar and De Lorenzis, Computer Methods in Applied
-Mechanics and Engineering 381, 2021). H is the Hessian of a longer step, whose inverse turns forces into the
-displacements that they would cause. Without this weight, forces of nearly incompressible modes rule the sum.
-
+The terms are those of `energies.convex_material.ConvexMaterial`, with the coefficients of the weak form (`weak_form`).
 It decides which groups of terms a law needs: elastic terms beyond the modulus, viscosity, branches of relaxation, and
 families of fibres. Relaxation times and directions of fibres come from a grid, and are refined with the coefficients
-through the simulator (`learning.identification`).
+through the simulator (`law_search`).
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import chain, combinations
-from typing import Final
+from statistics import fmean
+from typing import Any, Final
 
 import numpy as np
-import scipy.linalg
-import scipy.optimize
 import torch
 
 from ..dynamics.simulator import Simulator
-from ..energies.hysteresis import PLASTIC_STRAIN
-from ..energies.solid import VISCOUS_STRAIN
-from ..energies.tendon_forces import SEGMENT_TENSION
+from ..energies.catalogue import law_content, unit_of
+from ..energies.convex_material import ConvexMaterial
+from ..energies.materials import Material
 from ..io.arrays import FloatArray
-from ..io.errors import InputError
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
-
-Candidate = Mapping[str, float]  # values of parameters that give one unit of a coefficient, the others being zero
+from .parameters import Bounds, Prior
+from .uncertainty import redundancy
+from .weak_form import Candidate, NormalEquations, WeakForm
 
 MODULUS: Final = ("c10", "bulk_1")  # of the smallest class, a neo-Hookean solid
 VISCOSITIES: Final = ("shear_viscosity", "bulk_viscosity")
@@ -46,147 +33,87 @@ _FIBRE: Final = {"slack": 0.0, "toe": 0.02, "stiffening": 0.0, "compression": 0.
 _NEEDLESS: Final = 1.02  # ratio of the residuals without and with a term below which it is left out
 _ROUNDING: Final = 1e-6  # residual below which every term that is left is needed
 _SAME: Final = 1.6  # ratio of neighbouring relaxation times that are one branch
-_TURN: Final = math.radians(15.0)  # of the finer directions about the best coarse one
-_SMALLEST: Final = 1e-3  # fraction of the shear modulus below which a branch or a family is left out
-_CARRIED = (VISCOUS_STRAIN, PLASTIC_STRAIN, SEGMENT_TENSION)  # memory that forces of later steps depend on
-_AT_ONCE = 256  # environments of a batch
-_RIDGE = 1e-14  # of the trace, where columns are dependent
+_FINER: Final = math.radians(15.0)  # of the finer directions about the best coarse one
+_LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
+_STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
+_TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
+_CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
+_SIGNIFICANT: Final = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
-class KnownMotion:
-    """B observed motions with the same number of steps T."""
+class IdentifiedLaw:
+    """An identified law.
 
-    q: torch.Tensor  # (T + 1, B, N, 3) positions of all vertices at the steps [m]
-    v: torch.Tensor  # (B, N, 3) velocities at the start [m/s]
-    inputs: Inputs = field(default_factory=Inputs)  # during the steps
-
-
-class WeakForm:
-    """Balance of forces of motions.
-
-    Args:
-        simulator: simulator with all energies, of which some have unknown coefficients.
-        motions: motions that begin without memory, as after a long rest.
-        zero: values of the parameters without the forces of these coefficients.
-        stiffness: values of the parameters for the Hessian of the weight.
-        stride: steps from one row to the next.
-        weight_step: time step of that Hessian [s].
+    Attributes:
+        simulator: simulator with the law; pass `parameters` to its functions.
+        accepted: whether it helps on the trials that it was tested on.
+        constants: of the material, by name, in SI units.
+        parameters: other identified parameters.
+        deviation: standard deviations of constants and parameters; empty if they are not known.
+        at_bounds: names of those that ended on a bound.
+        validation: trials that the law was tested on, and errors with it and without.
+        model: name of the material's class.
+        groups: groups of terms besides the modulus; this and what follows is None of a law that was known.
+        loss: of the identification.
+        classes: classes that were tried.
+        stretches: least and largest principal stretch in the trials that it was identified from.
+        trials: their names.
     """
 
-    def __init__(
-        self,
-        simulator: Simulator,
-        motions: Sequence[KnownMotion],
-        zero: Candidate,
-        stiffness: Candidate,
-        stride: int = 5,
-        weight_step: float = 0.05,
-    ) -> None:
-        if not motions or stride < 1:
-            raise InputError("there is no step to balance: give at least one motion, and a stride of one or more.")
-        self._simulator, self._zero, self._stride = simulator, dict(zero), stride
-        self._slow = replace(simulator, time_step=weight_step)
-        self._stiff = self._slow.prepare(stiffness)
-        self._motions = motions
-        with torch.no_grad():
-            self._states = [list(self._along(motion)) for motion in motions]
-        self.target = -self._rows([self._zero])[:, 0]  # (R,) rows of -H^-1 g_0
+    simulator: Simulator
+    accepted: bool
+    constants: Mapping[str, float]
+    parameters: Mapping[str, float]
+    deviation: Mapping[str, float]
+    at_bounds: Sequence[str]
+    validation: Mapping[str, Any]
+    model: str = ConvexMaterial.model
+    groups: Sequence[str] | None = None
+    loss: float | None = None
+    classes: Sequence[Mapping[str, Any]] | None = None
+    stretches: Sequence[float] | None = None
+    trials: Sequence[str] = ()
 
-    def columns(self, candidates: Sequence[Candidate]) -> FloatArray:
-        """Returns H^-1 a_k (R, K) of K candidates [m]; rows run over steps, motions and free coordinates."""
-        return self._rows([self._zero, *candidates])[:, 1:] + self.target[:, None]
-
-    def _along(self, motion: KnownMotion) -> "list[State]":
-        """Returns the states at the start of every step, without memory."""
-        method, step = self._simulator.method, self._simulator.time_step
-        states = [State(motion.q[0], motion.v)]
-        for q in motion.q[1:-1]:
-            x = method.solution_for(states[-1], q)
-            states.append(replace(method.finish(states[-1], x, step), q=q))
-        return states
-
-    @torch.no_grad()
-    def _rows(self, candidates: Sequence[Candidate]) -> FloatArray:
-        """Returns the weighted residuals (R, K) with the parameters of each candidate, the others being zero."""
-        parts = []
-        for motion, states in zip(self._motions, self._states, strict=True):
-            most = max(1, _AT_ONCE // motion.q.shape[1])
-            chunks = [candidates[i : i + most] for i in range(0, len(candidates), most)]
-            parts.append(np.concatenate([self._of_motion(motion, states, chunk) for chunk in chunks], axis=1))
-        return np.concatenate(parts)
-
-    def _of_motion(self, motion: KnownMotion, states: Sequence[State], candidates: Sequence[Candidate]) -> FloatArray:
-        simulator, count = self._simulator, len(candidates)
-        batch = motion.q.shape[1]
-        names = set().union(*candidates)
-        values = {name: [c.get(name, self._zero.get(name, 0.0)) for c in candidates] for name in names}
-        spread = {
-            name: motion.q.new_tensor(own).repeat_interleave(batch)[:, None]
-            for name, own in {**{k: [x] * count for k, x in self._zero.items()}, **values}.items()
-        }
-        constants = simulator.prepare(spread)
-        carries = True
-        memory: Mapping[str, torch.Tensor] = {}
-        rows = []
-        for number, start in enumerate(states):
-            if number % self._stride and not carries:
-                continue
-            state = replace(start.map(lambda t: t.repeat(count, 1, 1)), memory=memory)
-            end = motion.q[number + 1]
-            inputs = motion.inputs.at(number).repeat(count)
-            if number % self._stride == 0:
-                x = simulator.method.solution_for(state, end.repeat(count, 1, 1))
-                rows.append(self._weighted(simulator.linearise(state, inputs, constants).residual(x), end))
-            if carries:
-                memory = simulator.remember(state, end.repeat(count, 1, 1), constants, inputs).memory
-                memory = {name: value for name, value in memory.items() if name.endswith(_CARRIED)}
-                carries = bool(memory)
-        return np.concatenate(rows)
-
-    def _weighted(self, residuals: torch.Tensor, at: torch.Tensor) -> FloatArray:
-        """Returns H^-1 g on the free vertices, (B 3F, K), of residuals (K B, N, 3) at positions (B, N, 3)."""
-        lin = self._slow.linearise(State(at, torch.zeros_like(at)), None, self._stiff)
-        lin.factorise(at)
-        forces = residuals.unflatten(0, (-1, len(at))).permute(1, 2, 3, 0).flatten(1, 2)
-        moved = lin.solve(forces).unflatten(1, (-1, 3))[:, lin.free]
-        rows: FloatArray = moved.flatten(0, 2).cpu().numpy().astype(np.float64)
-        return rows
+    def plain(self) -> dict[str, Any]:
+        """Returns the law as JSON data."""
+        hidden = ("simulator", "trials")
+        known = {key: value for key, value in vars(self).items() if value is not None and key not in hidden}
+        return {**known, **law_content(self.model, self.constants)}
 
 
 @dataclass(frozen=True)
-class NormalEquations:
-    """Normal equations of columns (R, K) theta = target (R,), for fits of many subsets of the columns."""
+class Score:
+    """Errors of a simulator on trials: in each frame the mean square over the squared amplitude of the trial."""
 
-    matrix: FloatArray  # (K, K)
-    right: FloatArray  # (K,)
-    square: float  # |target|^2
+    frames: tuple[FloatArray, ...]  # (T,) of each trial
 
-    @classmethod
-    def of(cls, columns: FloatArray, target: FloatArray) -> "NormalEquations":
-        """Returns those of columns (R, K) and a target (R,)."""
-        return cls(columns.T @ columns, columns.T @ target, float(target @ target))
+    @property
+    def error(self) -> float:
+        """Root mean square over the amplitude, over all trials; infinite if one failed."""
+        if not self.frames:
+            return math.inf
+        square = fmean(float(own.mean()) for own in self.frames)
+        return math.sqrt(square) if math.isfinite(square) else math.inf
 
-    def fit(self, members: Sequence[int]) -> FloatArray:
-        """Returns the non-negative least-squares solution with some of the columns."""
-        picked = np.ix_(members, members)
-        scale = np.sqrt(np.diag(self.matrix)[members])
-        used = scale > 0.0
-        unit = (self.matrix[picked] / np.outer(np.where(used, scale, 1.0), np.where(used, scale, 1.0)))[used][:, used]
-        root = scipy.linalg.cholesky(unit + _RIDGE * np.trace(unit) / max(len(unit), 1) * np.eye(len(unit)))
-        right = scipy.linalg.solve_triangular(root, self.right[members][used] / scale[used], trans=1)
-        theta = np.zeros(len(scale))
-        theta[used] = scipy.optimize.nnls(root, right)[0] / scale[used]
-        return theta
+    def beats(self, other: "Score") -> bool:
+        """Whether the error is at most half, or its mean square smaller by two standard errors.
 
-    def residual(self, members: Sequence[int], theta: FloatArray) -> float:
-        """Returns the root mean square of the forces of some columns less the target, over that of the target.
-
-        It has half of the digits of the columns, 1e-8.
+        Frames are correlated in time, so that a short trial may show no less than a large gain. Of static poses the
+        standard error is that of the trials' mean; one pose has none, and its error must be smaller by 5 %.
         """
-        quadratic = float(theta @ self.matrix[np.ix_(members, members)] @ theta)
-        left = quadratic - 2.0 * float(theta @ self.right[members]) + self.square
-        return math.sqrt(max(left, 0.0) / self.square)
+        if not math.isfinite(self.error) or self.error <= _CLEARLY * other.error:
+            return self.error < other.error
+        less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
+        means = np.array([d.mean() for d in less])
+        if max(len(d) for d in less) > 1:
+            variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
+            doubt = math.sqrt(sum(variance)) / len(less)
+        elif len(less) > 1:
+            doubt = float(means.std(ddof=1)) / math.sqrt(len(less))
+        else:
+            return self.error < _CLOSER * other.error
+        return float(means.mean()) > _SIGNIFICANT * doubt
 
 
 @dataclass(frozen=True)
@@ -296,7 +223,7 @@ def _around(azimuth: float, elevation: float) -> list[FloatArray]:
     )
     across = np.linalg.svd(axis[None])[2][1:]
     turns = np.linspace(0.0, 2.0 * np.pi, 9)[:-1]
-    return [axis + math.tan(_TURN) * (np.cos(t) * across[0] + np.sin(t) * across[1]) for t in turns]
+    return [axis + math.tan(_FINER) * (np.cos(t) * across[0] + np.sin(t) * across[1]) for t in turns]
 
 
 def _sparse(columns: _Columns, modulus: Sequence[int], others: Sequence[int]) -> list[int]:
@@ -331,11 +258,114 @@ def _constants(candidates: Sequence[Candidate], coefficients: FloatArray) -> dic
     shear = 2.0 * (constants["c10"] + constants.get("c01", 0.0)) + sum(
         value for name, value in constants.items() if name.startswith("ogden")
     )
-    strong = [branch for branch in branches if branch[0] > _SMALLEST * shear]
+    strong = [branch for branch in branches if branch[0] > _LEAST * shear]
     for number, (modulus, time) in enumerate(strong, 1):
         constants |= {f"prony_modulus_{number}": modulus, f"prony_time_{number}": time}
-    pulling = [family for family in families if family["fibre_tension_1"] > _SMALLEST * shear]
+    pulling = [family for family in families if family["fibre_tension_1"] > _LEAST * shear]
     for number, family in enumerate(pulling, 1):
         own = {f"{name[:-1]}{number}": value for name, value in family.items()}
         constants |= {f"fibre_{name}_{number}": value for name, value in _FIBRE.items()} | own
     return constants
+
+
+def first_guess(material: Material, known: Mapping[str, float]) -> dict[str, float]:
+    """Returns a neo-Hookean law with the moduli, the viscosity and the creep of a material.
+
+    Args:
+        material: its class.
+        known: its constants.
+    """
+    tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
+    lame = np.asarray(material.law.lame).T @ [float(m) for m in material.moduli(tensors)]
+    mu, volume = float(lame[0]), max(float(lame[1]), _LEAST * float(lame[0]))
+    time = known.get("stiffness_damping", 0.0)
+    viscosities = dict(zip(VISCOSITIES, (time * mu, time * volume), strict=True))
+    times = {name: value for name, value in known.items() if name.startswith("prony_time_")}
+    ratios = [(known[name.replace("time", "ratio")], value) for name, value in times.items()]
+    relaxing = [(ratio * mu, time) for ratio, time in ratios if ratio > _LEAST]
+    branches = branches_of([modulus for modulus, _ in relaxing], [time for _, time in relaxing])
+    return {"c10": 0.5 * mu, "bulk_1": 0.5 * volume, **viscosities, **branches}
+
+
+def bounds_of_constant(
+    name: str, value: float, guess: Mapping[str, float], deviation: float, modulus: Prior | None
+) -> Bounds:
+    """Returns the range of a constant of a law, around a first value, and its prior.
+
+    The priors have the weight of one observation. They hold what the trials do not excite: moduli and viscosities near
+    those of the first guess, and further terms near zero. At small strains, markers do not tell c10 from these, and the
+    neo-Hookean law extrapolates best from there.
+
+    Args:
+        name: of the constant.
+        value: from which its search starts.
+        guess: `first_guess`.
+        deviation: standard deviation of further terms, over the shear modulus.
+        modulus: prior of c10, if one is known.
+    """
+    shear = 2.0 * guess["c10"]
+    if name == "bulk_1":
+        mean = max(value, shear)
+        return Bounds(0.1 * mean, max(10.0 * mean, _STIFFEST * shear), True, Prior(mean, 3.0 * mean))
+    if name == "c10":
+        return Bounds(0.0, max(4.0 * value, shear), prior=modulus or Prior(value, shear))
+    if name.startswith("prony_time"):
+        return Bounds(value / 4.0, 4.0 * value, True)
+    if name.startswith(("fibre_azimuth", "fibre_elevation")):
+        return Bounds(value - _TURN, value + _TURN)
+    if name.startswith("fibre_slack"):
+        return Bounds(0.0, 0.1)
+    if name.startswith("fibre_toe"):
+        return Bounds(0.002, 0.1, True)
+    if name in VISCOSITIES:
+        known = guess[name]
+        most = (0.01 if name == "shear_viscosity" else 1.0) * shear
+        prior = Prior(known, known) if known > 1e-6 * shear else None
+        return Bounds(0.0, max(4.0 * value, 4.0 * known, most), prior=prior)
+    return Bounds(0.0, max(4.0 * value, shear), prior=Prior(0.0, deviation * shear))
+
+
+def is_shape(name: str) -> bool:
+    """Whether a constant has no coefficient's meaning: a time, a direction, a slack or a toe."""
+    return unit_of(name) != "Pa" and name not in VISCOSITIES
+
+
+def is_refined(name: str) -> bool:
+    """Whether a constant is identified through the simulator."""
+    return not name.startswith(("fibre_stiffening", "fibre_compression"))
+
+
+def strong_names(constants: Mapping[str, float], shear: float) -> dict[str, str]:
+    """Names of constants by their names without terms, branches and families that hardly resist, which are left out.
+
+    Args:
+        constants: of a law.
+        shear: shear modulus of the material [Pa].
+    """
+    weak = {name for name, value in constants.items() if unit_of(name) == "Pa" and value < _LEAST * shear}
+    weak |= {name for name in VISCOSITIES if constants.get(name, 1.0) < 1e-6 * shear}
+    kept = {
+        name: name
+        for name in constants
+        if name in ("c10", "bulk_1") or not (name in weak or name.startswith(("prony", "fibre")))
+    }
+    for leading in ("prony_modulus_", "fibre_tension_"):
+        group = leading.split("_")[0]
+        strong = [name.removeprefix(leading) for name in constants if name.startswith(leading) and name not in weak]
+        for number, old in enumerate(strong, 1):
+            members = [name for name in constants if name.startswith(group) and name.endswith(f"_{old}")]
+            kept |= {f"{name.removesuffix(old)}{number}": name for name in members}
+    return kept
+
+
+def branches_of(moduli: Sequence[float], times: Sequence[float], first: int = 1) -> dict[str, float]:
+    """Constants of branches by their moduli [Pa] and relaxation times [s], numbered from `first`."""
+    pairs = enumerate(zip(moduli, times, strict=True), first)
+    return {key: x for k, (m, t) in pairs for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))}
+
+
+def family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[str, float]:
+    """Constants of fibres with a tension [Pa], along an azimuth and an elevation [rad]."""
+    zero = {f"fibre_{name}_1": 0.0 for name in ("slack", "stiffening", "compression")}
+    angles = dict(zip(("fibre_azimuth_1", "fibre_elevation_1"), direction, strict=True))
+    return {"fibre_tension_1": tension, "fibre_toe_1": 0.02, **angles, **zero}

@@ -1,37 +1,134 @@
 """The misfit of a simulator to observed motions, as a function of the physical parameters to identify.
 
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
-all motions at once. Prior knowledge (`identification`) is that of the parameters and of marker places (`nuisance`).
+all motions at once. Prior knowledge is that of the parameters (`parameters.Prior`) and of marker places (`placement`).
+It adds its squares, weighted as much as one independent residual of the data: by their mean square, times the number of
+residuals that are correlated. That weight is computed at the start of a search and again at the minimum.
 
 A parameter may have a value for each trial or session (`parameters.own_name`), held by its prior; all others have the
 mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
 """
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
 from typing_extensions import override
 
-from ..data.markers import Markers
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.state import State
-from .identification import BoundedMisfit
-from .nuisance import NuisanceFit, Nuisances
 from .parameters import Bounds, check_names, split_name
-from .placement import Accuracy, DisplacedMarkers
+from .placement import Accuracy, DisplacedMarkers, NuisanceFit, Nuisances
 from .replay import Replay, Start, exact
 from .trial_batch import TrialBatch
-from .uncertainty import LinearMisfit, LinearSystem, LinearTrial, Uncertainty, left_out, uncertainty_of
+from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, redundancy, uncertainty_of
 
+_LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed
 _DIFFERENCE = 1e-5  # of a parameter, for derivatives, as a fraction of its range
 _MOST_BYTES = 2**30  # of the states, and of the derivatives, that are kept
+
+
+class BoundedMisfit(ABC):
+    """A misfit as a function of parameters with bounds and priors.
+
+    Args:
+        bounds: range of each of the P parameters.
+
+    Attributes:
+        bounds: see above.
+        prior_weight: mean square of one independent residual, which weights the priors; 0 before it is computed.
+        failure: message of the last simulation that failed.
+    """
+
+    failure = ""
+
+    def __init__(self, bounds: Mapping[str, Bounds]) -> None:
+        self.bounds, self.prior_weight = dict(bounds), 0.0
+        priors = [range_.unit_prior() for range_ in self.bounds.values()]
+        self._priors = [(index, *prior) for index, prior in enumerate(priors) if prior is not None]
+
+    @abstractmethod
+    def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
+        """Linearises the residuals at (P,) parameters; None where the simulation fails.
+
+        Args:
+            unit: the parameters, as fractions of their ranges.
+            derivatives: whether to compute derivatives; they are zero otherwise.
+        """
+
+    def objective(self, unit: FloatArray, derivatives: bool) -> tuple[float, FloatArray, FloatArray]:
+        """Returns the loss, its gradient (P,) and Gauss-Newton matrix (P, P), for `linalg.least_squares.UnitBox`."""
+        count = len(unit)
+        linear, slopes = self.linearise(unit, derivatives), (np.zeros(count), np.zeros((count, count)))
+        if linear is None or not math.isfinite(linear.loss):
+            return math.inf, *slopes
+        slopes = (linear.gradient, linear.gauss_newton) if derivatives else slopes
+        return linear.loss if np.isfinite(slopes[1]).all() else math.inf, *slopes
+
+    @abstractmethod
+    def forget(self) -> None:
+        """Forgets the results of earlier parameters, from which the next are predicted."""
+
+    def nuisances(self, unit: FloatArray) -> Nuisances:
+        """Returns the best places of the markers and delays of the trials with (P,) parameters."""
+        return Nuisances()
+
+    @property
+    def has_priors(self) -> bool:
+        """Whether something is held by prior knowledge."""
+        return bool(self._priors)
+
+    def to_unit(self, values: Mapping[str, float]) -> FloatArray:
+        """(P,) values as fractions of their ranges, clipped to the bounds."""
+        clipped = ((b, min(max(values[name], b.lower), b.upper)) for name, b in self.bounds.items())
+        return np.array([b.to_unit(value) for b, value in clipped])
+
+    def from_unit(self, unit: Sequence[float] | FloatArray) -> dict[str, float]:
+        """Values of the parameters at (P,) fractions of their ranges."""
+        return {
+            name: float(range_.from_unit(torch.tensor(float(u), dtype=torch.float64)))
+            for (name, range_), u in zip(self.bounds.items(), unit, strict=True)
+        }
+
+    def losses_or_infinite(self, points: FloatArray) -> FloatArray:
+        """(E,) losses of (E, P) parameters, each as if it were the first; infinite where the simulation fails."""
+        losses = np.full(len(points), np.inf)
+        for number, point in enumerate(points):
+            self.forget()
+            linear = self.linearise(point, derivatives=False)
+            losses[number] = np.inf if linear is None else linear.loss
+        return losses
+
+    def prior_rows(self, unit: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """(K,) weighted residuals of the priors of parameters, their derivatives (K, P), and their weight."""
+        rows, slopes = np.zeros(len(self._priors)), np.zeros((len(self._priors), len(unit)))
+        weight = math.sqrt(self.prior_weight)
+        for row, (i, mean, deviation) in enumerate(self._priors):
+            rows[row], slopes[row, i] = weight * (unit[i] - mean) / deviation, weight / deviation
+        return rows, slopes, self.prior_weight
+
+    def update_prior_weight(self, unit: FloatArray) -> float:
+        """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
+        before = self.prior_weight
+        linearised = self.linearise(unit, derivatives=False) if self.has_priors else None
+        if linearised is None:
+            return 1.0
+        seen = sum(own.seen for own in linearised.trials)
+        squares = [np.square(own.rows).sum() * redundancy(own.rows) for own in linearised.trials]
+        self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
+        return self.prior_weight / before if before else math.inf
+
+    def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
+        """Uncertainty of (P,) parameters; None if a simulation close by fails."""
+        found = self.linearise(unit)
+        return None if found is None else uncertainty_of(found, self.bounds, unit)
 
 
 class Misfit(BoundedMisfit):
@@ -43,10 +140,8 @@ class Misfit(BoundedMisfit):
         bounds: range of each of the P parameters to identify.
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
-        labels: names of the markers, where `accuracy` is given.
-        centre: (3,) about which recordings may be rotated [m].
         known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
-        delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisance.NuisanceFit`.
+        delay: standard deviation of the delay of motions that their inputs begin [s]; see `placement.NuisanceFit`.
         shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
 
     Attributes:
@@ -62,8 +157,6 @@ class Misfit(BoundedMisfit):
         bounds: Mapping[str, Bounds],
         seconds: float | None = None,
         accuracy: Accuracy | None = None,
-        labels: Sequence[str] = (),
-        centre: Sequence[float] = (0.0, 0.0, 0.0),
         known: Mapping[str, float] | None = None,
         delay: float = 0.0,
         shares: Sequence[float] | None = None,
@@ -78,10 +171,8 @@ class Misfit(BoundedMisfit):
         settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
         self._known = {} if known is None else dict(known)
-        self._accuracy, self._labels = accuracy, tuple(labels)
         self._shares = None if shares is None else np.array(shares)
-        self._replays: list[tuple[Replay, Start]] = []
-        self._weights: list[torch.Tensor] = []
+        self._replays, self._weights = list[tuple[Replay, Start]](), list[torch.Tensor]()
         count = sum(len(replay.trials.names) for replay, _ in replays)
         for replay, start in replays:
             trials = replay.trials if seconds is None else replay.trials.first(seconds)
@@ -89,22 +180,12 @@ class Misfit(BoundedMisfit):
             for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
                 if not moved > 0.0:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
-            self._replays.append(self._prepared(replay, start, trials))
+            pair = Replay(self.simulator, replay.observe, trials), start
+            self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))
             self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
-        at = self.simulator.tensor(list(centre))
-        self._fit = NuisanceFit(self._replays, self._weights, accuracy, at, delay)
+        self._fit = NuisanceFit(self._replays, self._weights, accuracy, delay)
         self._moves = _moves_of(self.bounds)
         self.forget()
-
-    def _prepared(self, replay: Replay, start: Start, trials: TrialBatch) -> tuple[Replay, Start]:
-        """The replay with this simulator and, where marker places are uncertain, with displaced markers."""
-        if self._accuracy is None:
-            return Replay(self.simulator, replay.observe, trials), start
-        if not isinstance(replay.observe, Markers):
-            raise InputError("where the markers sit can be identified of markers alone: leave identify.placement out.")
-        displaced = DisplacedMarkers(replay.observe, trials.observed.shape[2])
-        shift = None if start.shift is None else start.shift.repeat(1, displaced.copies, 1)
-        return Replay(self.simulator, displaced, trials), replace(start, shift=shift)
 
     @override
     def forget(self) -> None:
@@ -114,16 +195,9 @@ class Misfit(BoundedMisfit):
 
     @override
     def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
-        """Linearises the residuals at (P,) parameters; None where the simulation fails.
-
-        Derivatives are differences of motions of nearly the same parameters (`Replay.varied`), into the range.
-
-        Args:
-            unit: the parameters, as fractions of their ranges.
-            derivatives: whether to compute derivatives; they are zero otherwise.
-        """
+        """Linearises the residuals at (P,) parameters, which marker places and delays follow."""
         system = self._system(unit, derivatives)
-        return None if system is None else system.misfit()
+        return None if system is None else system.eliminated()
 
     @override
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
@@ -142,12 +216,14 @@ class Misfit(BoundedMisfit):
         system = system or self._system(unit)
         if system is None:
             return None
-        linear = system.misfit()
-        whole = uncertainty_of(linear.trials, linear.prior_slopes, self.prior_weight, self.bounds, unit)
+        whole = uncertainty_of(system.eliminated(), self.bounds, unit)
         return replace(whole, left_out=left_out(system, self.bounds, unit))
 
-    def _system(self, unit: FloatArray, derivatives: bool = True) -> LinearSystem | None:
-        """All that is linear at (P,) parameters, see `linearise`."""
+    def _system(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
+        """Linearises the residuals at constant marker places and delays.
+
+        Derivatives are differences of motions of nearly the same parameters (`Replay.varied`), into the range.
+        """
         steps = _DIFFERENCE * np.where(unit < 0.5, 1.0, -1.0)
         moves = self._moves if derivatives else []
         moved = np.array([np.isin(np.arange(len(unit)), columns) * steps for columns in moves]).reshape(-1, len(unit))
@@ -170,9 +246,9 @@ class Misfit(BoundedMisfit):
             shown = shown if self._shares is None else self._shares * shown
             rows = weighted[0].reshape(*weighted.shape[1:3], -1)
             seen = (observed.observed.shape[-1] * shown.sum(1)).tolist()
-            of_trials = zip(observed.names, rows, slopes, columns, seen, strict=True)
-            trials += [LinearTrial(name, observed.session, *own) for name, *own in of_trials]
-        return LinearSystem(trials, nuisances, self.prior_rows(unit), self.prior_weight)
+            of_trials = zip(rows, slopes, seen, observed.names, columns, strict=True)
+            trials += [LinearTrial(r, s, n, name, observed.session, c) for r, s, n, name, c in of_trials]
+        return LinearMisfit(trials, *self.prior_rows(unit), nuisances)
 
     def _slopes(
         self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: TrialBatch
@@ -201,11 +277,7 @@ class Misfit(BoundedMisfit):
         return super().has_priors or not self._fit.is_empty
 
     @override
-    def placement(self, unit: FloatArray) -> dict[str, Any] | None:
-        return self.nuisances(unit).plain(self._labels)
-
     def nuisances(self, unit: FloatArray) -> Nuisances:
-        """The best places of the markers and delays of the trials with (P,) parameters."""
         with torch.no_grad():
             return self._fit(self._followed(self.simulator.tensor(unit)[None]), self.prior_weight)[1]
 

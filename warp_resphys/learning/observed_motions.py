@@ -129,6 +129,11 @@ class ObservedMotions:
         )
         return cls(trials, observation.to(like), **more)
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the observed points, which are numbers where they have none."""
+        return self.dataset.labels or tuple(map(str, range(self.dataset.observed.shape[2])))
+
     def trials(self, names: Sequence[str], simulator: Simulator) -> TrialBatch:
         """Trials that begin in the same way, on the device of a simulator, with inputs at its steps."""
         batch = TrialBatch.of(self.dataset, names, simulator.body, self.payload_at, simulator.time_step)
@@ -139,7 +144,7 @@ class ObservedMotions:
         observe, placement = self.observe, None if identified is None else identified.placement
         if placement is not None:
             assert isinstance(observe, Markers)
-            placed = placement_of(placement, self.dataset.labels, self.dataset.session(names[0]))
+            placed = placement_of(placement, self.labels, self.dataset.session(names[0]))
             observe = PlacedMarkers.of(observe, placed).to(simulator.rest_positions)
         return Replay(simulator, observe, self.trials(names, simulator))
 

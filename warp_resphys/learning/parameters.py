@@ -15,6 +15,7 @@ from ..data.input_response import RESPONSES, SLOPES
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
 from ..io.errors import InputError
+from ..settings.learning import RangeSettings
 
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
@@ -38,6 +39,15 @@ class Bounds:
     upper: float  # in the parameter's unit
     logarithmic: bool = False  # whether it is searched on a logarithmic scale
     prior: Prior | None = None
+    per: str = "all"  # session or trial: each has its own value, near the mean of the prior
+
+    @classmethod
+    def of(cls, limits: "Limits") -> "Bounds":
+        """Returns bounds from settings, or from a pair of numbers, which is logarithmic if both are positive."""
+        if isinstance(limits, RangeSettings):
+            prior = None if limits.prior is None else Prior(**dict(limits.prior))
+            return cls(limits.lower, limits.upper, limits.logarithmic, prior, limits.per)
+        return limits if isinstance(limits, Bounds) else cls(limits[0], limits[1], logarithmic=min(limits) > 0.0)
 
     def __post_init__(self) -> None:
         """Checks the range.
@@ -54,6 +64,8 @@ class Bounds:
                 f"the prior has the mean {self.prior.mean:g}, outside of the range from {self.lower:g} to "
                 f"{self.upper:g}: widen the range, or correct the prior."
             )
+        if self.per in ("session", "trial") and self.prior is None:
+            raise InputError(f"per is {self.per}, but there is no prior, which holds the values: add one.")
 
     def unit_prior(self) -> tuple[float, float] | None:
         """Mean and standard deviation of the prior, as fractions of the range; None without a prior."""
@@ -78,6 +90,9 @@ class Bounds:
         if self.logarithmic:
             return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
         return self.upper - self.lower
+
+
+Limits = Bounds | RangeSettings | tuple[float, float]
 
 
 def own_name(name: str, owner: str) -> str:

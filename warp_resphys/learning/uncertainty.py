@@ -18,17 +18,93 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
+from typing import NamedTuple
 
 import numpy as np
 
 from ..io.arrays import FloatArray
-from .nuisance import Nuisances
 from .parameters import Bounds
+from .placement import Nuisances
 
 _UNIFORM = 12.0  # reciprocal variance of a parameter in its range, as a fraction of it
 
-# Of a trial: weighted residuals (T, 3 M), their derivatives (3 T M, P), and the number of independent coordinates seen.
-Linearised = tuple[FloatArray, FloatArray, float]
+
+class LinearTrial(NamedTuple):
+    """Weighted residuals of a trial at P parameters, and their derivatives."""
+
+    rows: FloatArray  # (T, C) residuals
+    slopes: FloatArray  # (T C, P) by the parameters
+    seen: float  # number of the independent coordinates that were seen
+    name: str = ""
+    session: str = ""
+    columns: FloatArray = np.zeros((1, 0))  # (T C, K) by marker places and delays
+
+
+@dataclass(frozen=True)
+class LinearMisfit:
+    """Weighted residuals at P parameters and their derivatives, whose squares sum to the loss.
+
+    Attributes:
+        trials: their residuals.
+        prior: (K,) weighted residuals of the priors.
+        prior_slopes: (K, P) by the parameters.
+        prior_weight: of these squares, and of those of the priors of marker places and delays.
+        nuisances: marker places and delays that are not eliminated yet.
+    """
+
+    trials: Sequence[LinearTrial]
+    prior: FloatArray
+    prior_slopes: FloatArray
+    prior_weight: float
+    nuisances: Nuisances = field(default_factory=Nuisances)
+
+    @property
+    def loss(self) -> float:
+        """Sum of the squares."""
+        return float(sum(np.square(own.rows).sum() for own in self.trials) + np.square(self.prior).sum())
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(P,) gradient of the loss."""
+        parts = [own.slopes.T @ own.rows.ravel() for own in self.trials]
+        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
+
+    @property
+    def gauss_newton(self) -> FloatArray:
+        """(P, P) Gauss-Newton matrix of the loss."""
+        parts = [own.slopes.T @ own.slopes for own in self.trials]
+        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
+
+    def _follow(self, values: Sequence[FloatArray], prior: FloatArray | float = 0.0) -> FloatArray:
+        """Returns the change (K, ...) of places and delays with the least squares of values, priors included.
+
+        Args:
+            values: (T C, ...) by trial.
+            prior: (K, ...) weighted residuals of the priors of places and delays.
+        """
+        normal = np.sum([own.columns.T @ own.columns for own in self.trials], axis=0)
+        right = np.sum([own.columns.T @ of for own, of in zip(self.trials, values, strict=True)], axis=0)
+        right = right + math.sqrt(self.prior_weight) * prior
+        return np.asarray(-np.linalg.solve(normal + self.prior_weight * np.eye(len(normal)), right))
+
+    def eliminated(self) -> "LinearMisfit":
+        """Returns the misfit in which places and delays follow the parameters (Kaufman, BIT 15 (1975) 49)."""
+        follow = self._follow([own.slopes for own in self.trials])
+        further = math.sqrt(self.prior_weight) * follow
+        return LinearMisfit(
+            [own._replace(slopes=own.slopes + own.columns @ follow) for own in self.trials],
+            np.concatenate([self.prior, self.nuisances.rows]),
+            np.concatenate([self.prior_slopes, further]),
+            self.prior_weight,
+        )
+
+    def places(self, step: FloatArray, session: str) -> list[float] | None:
+        """(3 M + 6,) change of a session's placement with a step (P,) of the parameters; None if places are exact."""
+        if self.nuisances.common is None:
+            return None
+        moved = self._follow([own.rows.ravel() + own.slopes @ step for own in self.trials], self.nuisances.rows)
+        moves = self.nuisances.moves[session]
+        return [float(value) for value in moves @ moved[: moves.shape[1]]]
 
 
 @dataclass(frozen=True)
@@ -54,22 +130,19 @@ class Uncertainty:
     left_out: dict[str, LeftOut] = field(default_factory=dict)  # by trial; empty with less than two
 
 
-def uncertainty_of(
-    trials: Sequence[Linearised], prior: FloatArray, prior_weight: float, bounds: Mapping[str, Bounds], unit: FloatArray
-) -> Uncertainty:
+def uncertainty_of(linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArray) -> Uncertainty:
     """Returns the uncertainty of P parameters at the minimum.
 
     Args:
-        trials: linearised at the minimum.
-        prior: (K, P) derivatives of the prior residuals.
-        prior_weight: mean square of the prior residuals.
+        linear: misfit at the minimum.
         bounds: range of each parameter.
         unit: (P,) the minimum, in fractions of the ranges.
     """
-    free = 1.0 - min(len(unit) / sum(seen for _, _, seen in trials), 0.5)
-    scatter = [np.square(rows).sum() / (seen * free) * _scatter(rows, jacobian) for rows, jacobian, seen in trials]
-    scatter.append(prior_weight * prior.T @ prior)
-    curvature = np.sum([jacobian.T @ jacobian for _, jacobian, _ in trials], axis=0) + prior.T @ prior
+    trials, prior = linear.trials, linear.prior_slopes
+    free = 1.0 - min(len(unit) / sum(own.seen for own in trials), 0.5)
+    scatter = [np.square(own.rows).sum() / (own.seen * free) * _scatter(own.rows, own.slopes) for own in trials]
+    scatter.append(linear.prior_weight * prior.T @ prior)
+    curvature = np.sum([own.slopes.T @ own.slopes for own in trials], axis=0) + prior.T @ prior
     values, vectors = np.linalg.eigh(curvature)
     known = values > 1e-12 * max(values[-1], 1e-300)  # The data say nothing about the other directions.
     inverse = vectors[:, known] / values[known] @ vectors[:, known].T
@@ -115,106 +188,25 @@ def _scatter(rows: FloatArray, jacobian: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
-@dataclass(frozen=True)
-class LinearMisfit:
-    """Weighted residuals at some parameters and their derivatives, whose squares sum to the loss."""
-
-    trials: list[Linearised]
-    prior: FloatArray  # (K,) weighted residuals of the priors
-    prior_slopes: FloatArray  # (K, P)
-
-    @property
-    def loss(self) -> float:
-        """Sum of the squares."""
-        return float(sum(np.square(rows).sum() for rows, _, _ in self.trials) + np.square(self.prior).sum())
-
-    @property
-    def gradient(self) -> FloatArray:
-        """(P,) gradient of the loss."""
-        parts = [jacobian.T @ rows.ravel() for rows, jacobian, _ in self.trials]
-        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
-
-    @property
-    def gauss_newton(self) -> FloatArray:
-        """(P, P) Gauss-Newton matrix of the loss."""
-        parts = [jacobian.T @ jacobian for _, jacobian, _ in self.trials]
-        return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
-
-
-@dataclass(frozen=True)
-class LinearTrial:
-    """Weighted residuals of a trial at P parameters, and their derivatives."""
-
-    name: str
-    session: str
-    rows: FloatArray  # (T, 3 M) residuals
-    slopes: FloatArray  # (3 T M, P) by the parameters, at constant places and delays
-    columns: FloatArray  # (3 T M, K) by places and delays
-    seen: float  # number of the coordinates that were seen
-
-
-@dataclass(frozen=True)
-class LinearSystem:
-    """Weighted residuals of trials, of the priors (K',) of parameters and of places and delays, with their weight."""
-
-    trials: Sequence[LinearTrial]
-    nuisances: Nuisances
-    prior: tuple[FloatArray, FloatArray]  # (K',), and (K', P)
-    weight: float  # of the priors
-
-    def without(self, number: int) -> "LinearSystem":
-        """Returns the system without a trial."""
-        return replace(self, trials=[*self.trials[:number], *self.trials[number + 1 :]])
-
-    def followed(self, values: Sequence[FloatArray], prior: FloatArray | float = 0.0) -> FloatArray:
-        """Returns the change (K, ...) of places and delays with the least squares of values, priors included.
-
-        Args:
-            values: (3 T M, ...) by trial.
-            prior: (K, ...) weighted residuals of the priors of places and delays.
-        """
-        normal = np.sum([own.columns.T @ own.columns for own in self.trials], axis=0)
-        right = np.sum([own.columns.T @ of for own, of in zip(self.trials, values, strict=True)], axis=0)
-        right = right + math.sqrt(self.weight) * prior
-        return np.asarray(-np.linalg.solve(normal + self.weight * np.eye(len(normal)), right))
-
-    def misfit(self) -> LinearMisfit:
-        """Returns the misfit in which places and delays follow the parameters (Kaufman, BIT 15 (1975) 49)."""
-        follow = self.followed([own.slopes for own in self.trials])
-        trials = [(own.rows, own.slopes + own.columns @ follow, own.seen) for own in self.trials]
-        rows, slopes = self.prior
-        further = math.sqrt(self.weight) * follow
-        return LinearMisfit(trials, np.concatenate([rows, self.nuisances.rows]), np.concatenate([slopes, further]))
-
-    def places(self, step: FloatArray, session: str) -> list[float] | None:
-        """(3 M + 6,) change of a session's placement with a step (P,) of the parameters; None if places are exact."""
-        if self.nuisances.common is None:
-            return None
-        moved = self.followed([own.rows.ravel() + own.slopes @ step for own in self.trials], self.nuisances.rows)
-        moves = self.nuisances.moves[session]
-        return [float(value) for value in moves @ moved[: moves.shape[1]]]
-
-
-def left_out(system: LinearSystem, bounds: Mapping[str, Bounds], unit: FloatArray) -> dict[str, LeftOut]:
+def left_out(system: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArray) -> dict[str, LeftOut]:
     """Returns the identification without each of the trials; empty with less than two.
 
     Ranges count as normal distributions of the same variance, as what no other trial determines could be anything.
 
     Args:
-        system: linearised at the minimum.
+        system: misfit at the minimum, of which places and delays are not eliminated.
         bounds: range of each of the P parameters.
         unit: (P,) the minimum, in fractions of the ranges.
     """
     slopes = np.array([range_.slope(u) for range_, u in zip(bounds.values(), unit, strict=True)])
     result: dict[str, LeftOut] = {}
     for number, out in enumerate(system.trials if len(system.trials) > 1 else ()):
-        others = system.without(number)
-        linear = others.misfit()
-        seen = sum(own.seen for own in others.trials)
+        others = replace(system, trials=[*system.trials[:number], *system.trials[number + 1 :]])
+        linear, seen = others.eliminated(), sum(own.seen for own in others.trials)
         variance = sum(float(np.square(own.rows).sum()) for own in others.trials) / seen
         curvature = 0.5 * linear.gauss_newton + _UNIFORM * variance * np.eye(len(unit))
         step = np.asarray(-0.5 * np.linalg.lstsq(curvature, linear.gradient)[0], dtype=np.float64)
-        uncertainty = uncertainty_of(linear.trials, linear.prior_slopes, system.weight, bounds, unit)
+        uncertainty = uncertainty_of(linear, bounds, unit)
         result[out.name] = LeftOut(
             change=dict(zip(bounds, (slopes * step).tolist(), strict=True)),
             placement=others.places(step, out.session),

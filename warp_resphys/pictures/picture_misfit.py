@@ -25,9 +25,9 @@ from typing_extensions import override
 from ..data.camera import CORRECTIONS, PlacedCamera
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..learning.identification import BoundedMisfit
+from ..learning.misfit import BoundedMisfit
 from ..learning.parameters import Bounds, split_name
-from ..learning.uncertainty import Linearised, LinearMisfit
+from ..learning.uncertainty import LinearMisfit, LinearTrial
 from .released_force import RELEASE_DELAY
 from .seen import Photo, SeenPose, Shape
 
@@ -120,23 +120,23 @@ class PictureMisfit(BoundedMisfit):
 
     @override
     def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
-        values, trials = self.from_unit(unit), list[Linearised]()
+        values, trials = self.from_unit(unit), list[LinearTrial]()
         share = 1.0 / sum(len(pose.photos) for pose in self.poses)
         for number, pose in enumerate(self.poses):
             known = {**self._known, **values}
             seen_by = values_of(pose, known)
             try:
                 shapes, columns = self._shapes_by(number, unit, seen_by, derivatives)
-                series = dict[str, list[Linearised]]()  # of tracked points that move, by lens
+                series = dict[str, list[LinearTrial]]()  # of tracked points that move, by lens
                 for photo in pose.photos:
                     seen_by = values_of(pose, known, photo.lens)
                     parts, points = self._of_photo(pose, photo, seen_by, shapes, columns, share)
                     trials += parts
                     (series.setdefault(photo.lens, []) if pose.moves else trials).extend(points)
                 for frames in filter(None, series.values()):  # errors of the same points may be correlated in time
-                    rows, jacobians, counts = zip(*frames, strict=True)
-                    joined = np.stack([row.ravel() for row in rows])
-                    trials.append((joined, np.concatenate(jacobians), sum(counts)))
+                    rows = np.stack([frame.rows.ravel() for frame in frames])
+                    slopes = np.concatenate([frame.slopes for frame in frames])
+                    trials.append(LinearTrial(rows, slopes, sum(frame.seen for frame in frames)))
             except ConvergenceError:
                 return None
             except InputError:
@@ -190,13 +190,13 @@ class PictureMisfit(BoundedMisfit):
         shapes: torch.Tensor,
         columns: Sequence[int] | None,
         share: float,
-    ) -> tuple[list[Linearised], list[Linearised]]:
+    ) -> tuple[list[LinearTrial], list[LinearTrial]]:
         """Weighted residuals of a picture, and their derivatives: outlines both ways and a cloud, and tracked points.
 
         The outlines of all pictures by a standing camera, both ways, have nearly the same errors (correlated by 0.87 to
         0.997 between real pictures), so that they count as one set.
         """
-        corrections, parts, points = PlacedCamera.corrections(values), list[Linearised](), list[Linearised]()
+        corrections, parts, points = PlacedCamera.corrections(values), list[LinearTrial](), list[LinearTrial]()
         vertices, velocities = pose.seen(photo, shapes, values)
         q, moved = vertices[0], torch.cat([vertices[1:], velocities[None]])
         share, copies, camera = share / photo.kinds, pose.copies(photo), photo.camera
@@ -271,7 +271,7 @@ def _physical(values: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in values.items() if name not in CORRECTIONS}
 
 
-def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: FloatArray, copies: int) -> Linearised:
+def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: FloatArray, copies: int) -> LinearTrial:
     """Robust residuals (T, C) whose squares sum to a share of the weighted mean square of distances.
 
     Args:
@@ -290,7 +290,7 @@ def _weighted(share: float, weight: FloatArray, distance: FloatArray, jacobian: 
     scale = (root * length)[:, None]
     rows = scale * distance
     count = max(round(int((weight > 0.0).sum()) * distance.shape[1] / copies), 1)
-    return rows, (scale[..., None] * slopes).reshape(rows.size, -1), count
+    return LinearTrial(rows, (scale[..., None] * slopes).reshape(rows.size, -1), count)
 
 
 def values_of(pose: SeenPose, values: Mapping[str, float], lens: str = "") -> dict[str, float]:

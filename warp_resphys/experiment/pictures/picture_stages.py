@@ -9,7 +9,6 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +21,7 @@ from ...io.errors import InputError
 from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
-from ...learning.identification import ParameterSearch
+from ...learning.identification import first_points, search_parameters, shown
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
@@ -34,7 +33,6 @@ from ...settings.run import RunSettings
 from ...settings.stage_keys import SIMULATOR, StageSettings
 from ..build import build_mesh, simulation_device
 from ..files import COMPARE, IDENTIFICATION, LAW_FILE, METRICS, REPORT
-from ..identify import Checkpoint, bounds_of, search_parameters
 from .camera_laboratory import frame_files, play_camera
 from .seen_poses import (
     PICTURES,
@@ -163,7 +161,7 @@ class _Plan:
             for owner in dict.fromkeys(owners[limits.per]) if chosen(name, limits.per) else ():
                 mine = [pose for pose in poses if owner in (*pose.owners, *pose.lenses)]
                 if any(name in pose.parameter_names and (pose.deforms or name in CORRECTIONS) for pose in mine):
-                    result[own_name(name, owner) if owner else name] = bounds_of(limits)
+                    result[own_name(name, owner) if owner else name] = Bounds.of(limits)
         return result
 
     def guess(self, names: Iterable[str], poses: Sequence[SeenPose]) -> Values:
@@ -244,8 +242,8 @@ class _Plan:
         fitted = {key: known[key] for key in bounds if key in known}
         if bounds and not fitted:
             wanted, guess = self.settings.identify, self.guess(bounds, [pose])
-            search = ParameterSearch(PictureMisfit([pose], bounds, given, [near]))
-            fitted = search.run([guess], wanted.max_evaluations, tolerance=wanted.tolerance).parameters
+            misfit = PictureMisfit([pose], bounds, given, [near])
+            fitted = dict(search_parameters(misfit, [guess], wanted.max_evaluations, wanted.tolerance).parameters)
         values = {**given, **fitted}
         shared = values_of(pose, values)
         return pose, values, (shared, pose.shape(shared, near))
@@ -258,17 +256,16 @@ def identify_pictures(context: StageContext) -> None:
         ConvergenceError: the simulation fails at every start.
     """
     settings: StageSettings = context.settings
-    wanted, kept = settings.identify, Checkpoint(context)
+    wanted = settings.identify
     plan = _Plan(settings, context.run_dir)
     poses = [plan.pose(name, {}) for name in settings.data.train]
     bounds = plan.bounds(poses, lambda name, per: True)
     misfit = PictureMisfit(poses, bounds, plan.given(poses))
-    guess, total = plan.guess(bounds, poses), wanted.starts * wanted.max_evaluations
-    with Progress(context.name, total, "evaluations at most", kept.evaluations) as progress:
-        many: dict[str, Any] = {"count": wanted.starts, "candidates": wanted.candidates, "seed": settings.seed}
-        work = partial(search_parameters, ParameterSearch(misfit), guess, wanted, progress, **many)
-        found = kept.once("sysid", work)
-    result = {**found, "first_guess": guess}
+    guess, most = plan.guess(bounds, poses), wanted.max_evaluations
+    with shown(context.name, wanted.starts * most) as report:
+        starts = first_points(misfit, guess, wanted.starts, wanted.candidates, settings.seed)
+        found = search_parameters(misfit, starts, most, wanted.tolerance, report)
+    result = replace(found, first_guess=guess).plain()
     cameras = {
         pose.name: {photo.lens: photo.camera.pose.tolist() for photo in pose.photos if photo.camera.lens is not None}
         for pose in poses
@@ -277,10 +274,9 @@ def identify_pictures(context: StageContext) -> None:
     write_json(context.run_dir / IDENTIFICATION, {"sysid": result, "cameras": cameras})
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)
-        fitted = values_of(pose, found["parameters"])
+        fitted = values_of(pose, found.parameters)
         constants = {key: fitted.get(key, value) for key, value in plan.poses.material(pose.name).constants.items()}
         write_json(context.run_dir / law_file(material), law_content(settings.simulation.model, constants))
-    kept.path.unlink(missing_ok=True)
 
 
 def compare_pictures(context: StageContext) -> None:

@@ -18,14 +18,13 @@ from ...data.recordings.marker_quality import quality
 from ...data.recordings.processing import smooth
 from ...data.registration import root_mean_square, unit_vector
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
-from ...data.trials import RESTING, SLACK, UNDER_INPUTS, Trials
+from ...data.trials import RESTING, SLACK, UNDER_INPUTS, Trials, evenly
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, number_of
 from ...io.resuming import StageContext
 from ...io.safe_files import write_json
 from ..build import bound_markers
 from ..files import DATASET, QUALITY, REGISTRATION, SCALED_DATASET
-from ..splits import evenly
 from .registered_trials import RegisteredTrials
 
 log = logging.getLogger(__name__)

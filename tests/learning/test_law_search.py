@@ -1,4 +1,4 @@
-"""Scores of laws on trials, and the constants that a refined law keeps."""
+"""Laws: identified from observed motions, their scores on trials, and the constants that a refined law keeps."""
 
 import math
 from dataclasses import dataclass
@@ -6,11 +6,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
+from warp_resphys import Body, Corotated, Inputs, ObservedMotions, Simulator, box_hexahedra, select_vertices
+from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
-from warp_resphys.experiment.identify_law import _LawSearch
-from warp_resphys.experiment.law_trials import Score, branches_of, strong_names
-from warp_resphys.learning.law import LawClass
+from warp_resphys.learning.evaluation import evaluate
+from warp_resphys.learning.law import LawClass, Score, branches_of, strong_names
+from warp_resphys.learning.law_search import _LawSearch, identify_law
+from warp_resphys.settings.learning import LawSettings
 
 SHEAR = 100e3  # Pa
 
@@ -96,14 +100,38 @@ def search_from_markers(errors, guess=None, lost=()):
         kept["c10"] = 0.0 if "elastic" in law.groups else law.constants["c10"]  # as if other terms took its place
         return Refined(LawClass(law.groups, kept, math.nan), Score((np.array([errors[law.groups] ** 2] * 2),)))
 
+    settings = SimpleNamespace(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
     search = object.__new__(_LawSearch)
-    search._refine = refine
-    law = SimpleNamespace(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
-    search.settings = SimpleNamespace(law=law)
-    search.guess, search.shear = {"c10": 50e3, "bulk_1": 60e3, **(guess or {})}, SHEAR
     vertices = np.array([[0.0, 0.0, 0.0], [0.01, 0.2, 0.01]])
-    search.experiment = SimpleNamespace(body=SimpleNamespace(mesh=SimpleNamespace(vertices=vertices)))
+    base = SimpleNamespace(body=SimpleNamespace(mesh=SimpleNamespace(vertices=vertices)))
+    guess = {"c10": 0.5 * SHEAR, "bulk_1": 60e3, **(guess or {})}
+    vars(search).update(_refine=refine, settings=settings, guess=guess, base=base)
     return [own.law.groups for own in search._from_markers()], began
+
+
+def test_a_law_is_identified_from_observed_motions_and_simulates_on():
+    """A Mooney-Rivlin beam, of which all vertices are seen; the simulator has a linear material of another modulus."""
+    mesh = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
+    body, tip = Body(mesh, fixed=select_vertices(mesh, x=0.0)), select_vertices(mesh, x=0.08)
+    truth = {"c10": 15e3, "c01": 25e3, "bulk_1": 1e6, "shear_viscosity": 60.0, "density": 1070.0}
+    robot = Simulator(body, make_material("law", **truth), time_step=0.01)
+    pulls = torch.tensor(
+        [[0.2, 0.0, -0.1], [-0.15, 0.1, 0.0], [0.1, 0.0, 0.2], [0.1, 0.1, 0.1]], dtype=torch.float64
+    )  # N
+    pull = torch.zeros(4, len(mesh.vertices), 3, dtype=torch.float64)
+    pull[:, tip] = pulls[:, None] / len(tip)
+    with torch.no_grad():
+        start = robot.static_equilibrium(Inputs(external_force=pull))
+        motions = ObservedMotions.of(robot, robot.rollout(start, 30).q, start)
+    simulator = Simulator(body, Corotated(150e3, 0.45, density=1070.0), time_step=0.01)
+    settings = LawSettings(terms=["c01", "c20"], branches=0, families=0, trials=None)
+    law = identify_law(simulator, motions, train=motions.dataset.names[:3], validation=["motion 3"], settings=settings)
+    assert law.accepted
+    assert law.groups == ("elastic", "viscosity")
+    assert {name: law.constants[name] for name in truth} == pytest.approx(truth, rel=0.05)
+    assert law.constants.get("c20", 0.0) < 200.0
+    assert law.validation["law"] < 0.01 * law.validation["below"]
+    assert float(evaluate(law.simulator, motions, parameters=law.parameters).mean()) < 1e-5
 
 
 WHOLE = ("elastic", "branches", "fibres")

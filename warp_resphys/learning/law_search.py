@@ -1,0 +1,451 @@
+"""Identification of the law of a material, which is accepted if it helps on validation trials.
+
+Where the trials give the positions of all vertices, the weak form fits every class of laws (`law`), and the smallest
+one that is close to the best on the validation trials is refined through the simulator, and larger ones that balance
+the forces clearly better, too. With markers alone, the search begins with all groups of terms and takes one after the
+other away, each time refined through the simulator, if the validation trials are as close without it. The other
+identified parameters are refined with the law.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from ..data.markers import WHOLE_STATE, WholeState
+from ..data.rigid_bodies import independent
+from ..data.trials import RELEASED, evenly
+from ..dynamics.simulator import Simulator
+from ..energies.catalogue import make_material
+from ..energies.convex_material import ConvexMaterial
+from ..energies.materials import MASS_DAMPING
+from ..fem.integration_points import principal_stretches
+from ..io.arrays import FloatArray
+from ..settings.learning import LawSettings
+from .identification import Identification, IsLast, Once, first_points, refined_searches, search_parameters, shown
+from .law import (
+    VISCOSITIES,
+    IdentifiedLaw,
+    LawClass,
+    Score,
+    bounds_of_constant,
+    branches_of,
+    family,
+    first_guess,
+    fit_classes,
+    is_refined,
+    is_shape,
+    strong_names,
+)
+from .misfit import Misfit
+from .observed_motions import Identified, ObservedMotions
+from .parameters import Bounds, Limits, Prior
+from .replay import Replay
+from .weak_form import KnownMotion, WeakForm
+
+_OF_MASS: Final = ("density", MASS_DAMPING)
+_FURTHER: Final = 0.2  # standard deviation of the priors of further terms from markers, over the shear modulus
+_HELD_OUT: Final = 4  # every fourth training trial
+_EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
+_CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
+_RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
+_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
+_OFF_THE_POLE: Final = 0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
+_STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
+_BESIDE: Final = "beside"  # key of the search of parameters beside a known law
+_BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
+
+
+def identify_law(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    parameters: Mapping[str, Limits] | None = None,
+    *,
+    identified: Identified | None = None,
+    train: Sequence[str] | None = None,
+    validation: Sequence[str] = (),
+    settings: LawSettings | None = None,
+    seconds: float | None = None,
+    known: Mapping[str, Any] | None = None,
+    once: Once = lambda key, work: work(),
+    title: str = "",
+) -> IdentifiedLaw:
+    """Identifies the law of a material from observed motions, and tests it on others.
+
+    Without validation trials, every fourth training trial takes their place until a law is chosen; of three motions or
+    fewer, the last part, of which `identify` has seen all.
+
+    Args:
+        simulator: of the body, with a material of a simpler class; the law begins with its constants.
+        motions: observed states or markers.
+        parameters: ranges that `identify` had; parameters that are not of the material are refined with the law.
+        identified: result of `identify`; the simulator's own values if None.
+        train: names of the training trials; all by default.
+        validation: names of the validation trials.
+        settings: terms, relaxation times and evaluations; the defaults of the class if None.
+        seconds: duration of the trials that may be learned from [s]; None for the part that `motions` learns from.
+        known: ``model`` and ``constants`` of a law beside which the parameters are identified; None to identify a law.
+        once: see `identify`.
+        title: of the progress to show; empty for none.
+
+    Raises:
+        ConvergenceError: the simulation fails at every start.
+    """
+    ranges = {name: Bounds.of(limits) for name, limits in (parameters or {}).items()}
+    names = motions.dataset.names if train is None else tuple(train)
+    if motions.train_fraction < 1.0:
+        learned = motions.train_fraction * float(motions.dataset.times.max())
+        seconds = min(learned, seconds or math.inf)
+    options = (settings or LawSettings(), seconds, once, title)
+    search = _LawSearch(simulator, motions, ranges, identified or Identified(), names, tuple(validation), *options)
+    return search.run() if known is None else search.beside(known)
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """A law that is refined through the simulator."""
+
+    law: LawClass
+    others: dict[str, float]  # identified parameters that are not those of the material
+    names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
+    found: Identification
+    score: Score  # on the trials that laws are tested on
+
+
+@dataclass(frozen=True)
+class _LawSearch:
+    """Search for a law; for the attributes see `identify_law`."""
+
+    base: Simulator
+    motions: ObservedMotions
+    ranges: Mapping[str, Bounds]
+    identified: Identified
+    train: tuple[str, ...]
+    validation: tuple[str, ...]
+    settings: LawSettings
+    seconds: float | None
+    once: Once
+    title: str
+
+    @cached_property
+    def checked(self) -> tuple[str, ...]:
+        """Names of the trials that laws are tested on."""
+        held_out = self.train[_HELD_OUT // 2 :: _HELD_OUT] if len(self.train) >= _HELD_OUT else self.train
+        return self.validation or held_out
+
+    def names(self, whole: bool) -> tuple[str, ...]:
+        """Names of the trials of a search: all of the training, or those that a law is identified from at first."""
+        split = whole or self.validation or self.checked == self.train
+        own = self.train if split else tuple(name for name in self.train if name not in self.checked)
+        return own if self.settings.trials is None else tuple(evenly(own, self.settings.trials))
+
+    @property
+    def states(self) -> bool:
+        """Whether the positions of all vertices are known."""
+        return isinstance(self.motions.observe, WholeState)
+
+    @property
+    def early(self) -> float | None:
+        """Duration from which a law is identified before it is tested on the same trials [s]; None with others."""
+        longest = self.seconds or float(self.motions.dataset.times.max())
+        return _EARLY * longest if self.checked == self.train and longest > 0.0 else None
+
+    @cached_property
+    def mass(self) -> dict[str, float]:
+        """Density and damping by mass."""
+        return {name: self._known[name] for name in _OF_MASS}
+
+    @cached_property
+    def _known(self) -> dict[str, float]:
+        """Constants of the material as it was identified."""
+        known = {name: float(torch.as_tensor(x)) for name, x in self.base.materials[""].constants.items()}
+        return known | {name: x for name, x in self.identified.parameters.items() if name in known}
+
+    @cached_property
+    def guess(self) -> dict[str, float]:
+        """A neo-Hookean law like the identified material."""
+        return first_guess(self.base.materials[""], self._known)
+
+    @property
+    def shear(self) -> float:
+        """Shear modulus of the identified material [Pa]."""
+        return 2.0 * self.guess["c10"]
+
+    def simulator(self, constants: Mapping[str, float], model: str = ConvexMaterial.model) -> Simulator:
+        """Returns the simulator with the constants of a law; failed steps are counted."""
+        material = make_material(model, **{**self.mass, **constants})
+        return replace(self.base, material=material, solver=replace(self.base.settings, on_failure="count"))
+
+    @cached_property
+    def others(self) -> dict[str, float]:
+        """Identified parameters beside the law: density and damping by mass, and those of other parts."""
+        own = {*self.base.materials[""].quantities} - {*_OF_MASS}
+        return {name: float(value) for name, value in self.identified.parameters.items() if name not in own}
+
+    def run(self) -> IdentifiedLaw:
+        """Identifies a law."""
+        if self.states:
+            fitted = self.once("classes", lambda: [asdict(own) for own in self._from_states()])
+            classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in fitted]
+            scores = [score.error for score in self.scores([law.constants for law in classes])]
+            smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
+            best = self._enlarged(self._refine(classes[smallest]), classes)
+        else:
+            refined = self._from_markers()
+            classes, scores = [own.law for own in refined], [own.score.error for own in refined]
+            best = refined[-1]
+        if not self.validation:
+            again = self._refine(best.law, whole=True)
+            best = best if best.score.beats(again.score) else replace(again, score=best.score)
+        constants = {name: best.others.get(name, x) for name, x in self.mass.items()} | best.law.constants
+        deviation, tried = _deviation(best.found), zip(classes, scores, strict=True)
+        return IdentifiedLaw(
+            simulator=self.simulator(constants),
+            groups=best.law.groups,
+            constants=constants,
+            parameters=best.others,
+            deviation={n: deviation[old] for n, old in best.names.items() if old in deviation},
+            at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
+            loss=best.found.loss,
+            classes=[{**asdict(own), "validation": score} for own, score in tried],
+            stretches=self._stretches(best.law.constants, best.others),
+            trials=self.names(whole=True),
+            **self._tested(best.score),
+        )
+
+    def beside(self, law: Mapping[str, Any]) -> IdentifiedLaw:
+        """Identifies the parameters beside a known law, which is used in any case."""
+        constants = {**law["constants"], **self.mass}
+        simulator = self.simulator(constants, law["model"])
+        bounds, found = self._bounds_of_others, Identification()
+        if bounds:
+            limits = (self.seconds, self.settings.seconds)
+            found = self._search(_BESIDE, bounds, lambda before: (simulator, {}), self.names(whole=True), limits)
+        values = {name: simulator.tensor([value]) for name, value in found.parameters.items()}
+        return IdentifiedLaw(
+            simulator=simulator,
+            constants=constants,
+            parameters=found.parameters,
+            deviation=law.get("deviation", {}) | _deviation(found),
+            at_bounds=[*law.get("at_bounds", ()), *found.at_bounds],
+            model=law["model"],
+            **self._tested(self._errors(simulator, values, 1)[0]) | {"accepted": True},
+        )
+
+    def _tested(self, score: Score) -> dict[str, Any]:
+        """Whether a law helps, and its errors and those without it on the trials that laws are tested on."""
+        shared = {name: self.base.tensor([value]) for name, value in self.identified.parameters.items()}
+        counting = replace(self.base, solver=replace(self.base.settings, on_failure="count"))
+        below, split = self._errors(counting, shared, 1)[0], "validation" if self.validation else "training"
+        errors = {"trials": list(self.checked), "split": split, "law": score.error, "below": below.error}
+        return {"accepted": score.beats(below), "validation": errors}
+
+    def scores(self, laws: Sequence[Mapping[str, float]], others: Mapping[str, float] | None = None) -> list[Score]:
+        """Returns the errors of laws on the trials that they are tested on.
+
+        Args:
+            laws: constants by name.
+            others: values of the other identified parameters, in place of the identified ones.
+        """
+        union: dict[str, float] = {}
+        for law in laws:
+            union |= {name: value if is_shape(name) else 0.0 for name, value in law.items()}
+        simulator = self.simulator({**union, **laws[0]})
+        values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
+        for name, value in {**self.others, **(others or {})}.items():
+            values[name] = simulator.tensor([value]).expand(len(laws))
+        return self._errors(simulator, values, len(laws))
+
+    def _errors(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> list[Score]:
+        """Returns the errors of a simulator with some sets of parameters on the trials that laws are tested on."""
+        frames: list[list[FloatArray]] = [[] for _ in range(sets)]
+        begin = self.early or 0.0
+        with torch.no_grad():
+            for replay, start in self.motions.replays(simulator, self.checked, self.identified):
+                own = replay.trials if self.seconds is None else replay.trials.first(self.seconds)
+                squares = Replay(simulator, replay.observe, own)
+                errors = squares.errors(squares(start, values)).square().sum((3, 4))  # (E, R, T)
+                seen = own.seen.sum(2)
+                means = errors / (seen.clamp_min(1) * own.amplitude.square()[:, None])
+                for row, inside in enumerate((own.times >= begin) & (seen > 0)):
+                    for number in range(sets) if bool(inside.any()) else ():
+                        frames[number].append(means[number, row, inside].double().cpu().numpy())
+        return [Score(tuple(own)) for own in frames]
+
+    def _stretches(self, constants: Mapping[str, float], others: Mapping[str, float]) -> list[float]:
+        """Returns the least and the largest principal stretch in the trials, simulated where markers are seen."""
+        dataset, mesh, names = self.motions.dataset, self.base.body.mesh, self.names(whole=True)
+        if self.states:
+            bodies = [dataset.observed[dataset.rows(names)]]
+        else:
+            simulator = self.simulator(constants)
+            values = {name: simulator.tensor([value]) for name, value in others.items()}
+            with torch.no_grad():
+                bodies = [
+                    Replay(simulator, WHOLE_STATE, replay.trials)(replace(start, shift=None), values).cpu().numpy()
+                    for replay, start in self.motions.replays(simulator, names, self.identified)
+                ]
+        parts = [principal_stretches(mesh, own.reshape(-1, *mesh.vertices.shape)) for own in bodies]
+        return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
+
+    def _from_states(self) -> list[LawClass]:
+        """Returns the classes of the weak form."""
+        wanted, forms = self.settings, []
+        times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
+        zero = dict.fromkeys((*wanted.terms, "c10", "bulk_1", *VISCOSITIES), 0.0)
+        zero |= branches_of([0.0], [0.1]) if wanted.branches else {}
+        zero |= family(0.0) if wanted.families else {}
+        simulator, guess = self.simulator(zero), self.guess
+        stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
+        for names in (self.train, self.validation):
+            motions = [self._motion(simulator, own) for own in self.motions.dataset.batches(names)]
+            forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
+        assert forms[0] is not None
+        return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
+
+    def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
+        replay = self.motions.replay(simulator, names)
+        _, inputs, _ = replay.prepare({name: simulator.tensor([value]) for name, value in self.others.items()})
+        start = self.motions.start(replay)
+        return KnownMotion(replay.trials.observed.transpose(0, 1), start.state.v, inputs)
+
+    def _enlarged(self, best: _Refined, classes: Sequence[LawClass]) -> _Refined:
+        """Returns the best refined law of larger classes that balance the forces clearly better."""
+        residual = min(own.residual for own in classes if _refined_groups(own) == _refined_groups(best.law))
+        for law in classes:
+            if _refined_groups(law) > _refined_groups(best.law) and law.residual < _BALANCED * residual:
+                larger = self._refine(law)
+                if larger.score.error * _CLOSE < best.score.error:
+                    best, residual = larger, law.residual
+        return best
+
+    def _from_markers(self) -> list[_Refined]:
+        """Returns the classes that were tried through the simulator, the best last.
+
+        The search begins with all groups of terms, and takes away those without which validation trials are as close:
+        a class that lacks a group makes up for it with others, from where the group no longer helps.
+        """
+        guess, wanted = dict(self.guess), self.settings
+        own = {name: value for name, value in guess.items() if name.startswith("prony")}
+        known = [value for name, value in own.items() if name.startswith("prony_time")]
+        shortest, longest = wanted.relaxation_times
+        middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
+        times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
+        groups = {
+            "elastic": dict.fromkeys(wanted.terms, 0.0),
+            "branches": branches_of([0.1 * self.shear] * len(times), times, len(known) + 1),
+            "fibres": family(0.3 * self.shear, self._longest_side()) if wanted.families else {},
+        }
+        groups = {name: added for name, added in groups.items() if added}
+        guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.shear)
+        whole = {name: value for added in groups.values() for name, value in added.items()}
+        best = self._refine(LawClass(tuple(groups), guess | whole, math.nan))
+        tried = [best]
+        for name in groups:
+            left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
+            if name == "branches":
+                left |= own
+            if name == "elastic":  # They may have been all that resists shear.
+                left["c10"] = max(left["c10"], guess["c10"])
+            smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
+            if left == best.law.constants:  # The search has left nothing of the group.
+                best = replace(best, law=smaller)
+                continue
+            tried.append(self._refine(smaller))
+            if not best.score.beats(tried[-1].score):
+                best = tried[-1]
+        return [one for one in tried if one.law.constants != best.law.constants] + [best]
+
+    def _longest_side(self) -> tuple[float, float]:
+        """Azimuth and elevation of the longest side of the box around the body [rad]."""
+        side = int(np.ptp(self.base.body.mesh.vertices, axis=0).argmax())
+        return ((0.0, 0.0), (0.5 * np.pi, 0.0), (0.0, 0.5 * np.pi - _OFF_THE_POLE))[side]
+
+    def _refine(self, law: LawClass, whole: bool = False) -> _Refined:
+        """Returns a law that is refined through the simulator, with the other identified parameters.
+
+        Args:
+            law: first guess.
+            whole: whether to use the whole of training trials on which laws are tested as well.
+        """
+        guess = dict(law.constants)
+        guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
+        others = self._bounds_of_others
+        bounds = {name: self._bounds(name, value) for name, value in guess.items() if is_refined(name)} | others
+
+        def begin(before: Identification | None) -> tuple[Simulator, dict[str, float]]:
+            first = {} if before is None else dict(before.parameters)
+            own = guess | {name: value for name, value in first.items() if name in guess}
+            return self.simulator(own), first | own
+
+        key = " ".join([*law.groups, *(["whole"] if whole else [])])
+        limits = (self.seconds,) if whole else (self.seconds, self.settings.seconds, self.early)
+        found = self._search(key, bounds, begin, self.names(whole), limits)
+        refined = {name: found.parameters.get(name, value) for name, value in guess.items()}
+        names = strong_names(refined, self.shear)
+        kept, beside = {n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others}
+        score = self.scores([kept], beside)[0]
+        return _Refined(replace(law, constants=kept), beside, {**names, **{n: n for n in others}}, found, score)
+
+    def _search(
+        self,
+        key: str,
+        bounds: Mapping[str, Bounds],
+        begin: Callable[[Identification | None], tuple[Simulator, dict[str, float]]],
+        names: Sequence[str],
+        limits: Sequence[float | None],
+    ) -> Identification:
+        """Returns the parameters that are closest to trials.
+
+        Args:
+            key: of the search.
+            bounds: of the parameters.
+            begin: simulator and first guesses of a search, where they differ from the identified values, by the result
+                of the search before.
+            names: of the trials.
+            limits: durations of these that are used [s]; the smallest counts.
+        """
+        seconds = min((limit for limit in limits if limit is not None), default=None)
+        dataset, wanted = self.motions.dataset, self.settings
+
+        def prepared(before: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
+            simulator, guess = begin(before)
+            replays = self.motions.replays(simulator, names, self.identified)
+            misfit = Misfit(replays, bounds, seconds, shares=independent(dataset.labels))
+            known = {**self.identified.parameters, **guess}
+            return misfit, first_points(misfit, {name: known[name] for name in bounds})
+
+        def search(misfit: Misfit, starts: Sequence[Mapping[str, float]], is_last: IsLast) -> Identification:
+            most = wanted.max_evaluations
+            with shown(self.title, most) as report:
+                return search_parameters(misfit, starts, most, wanted.tolerance, report, is_last)
+
+        released = key != _BESIDE and any(dataset.begin_of(name) == RELEASED for name in self.train)
+        return refined_searches(prepared, search, released, lambda number, work: self.once(f"{key} {number}", work))[-1]
+
+    @cached_property
+    def _bounds_of_others(self) -> dict[str, Bounds]:
+        """Ranges of the identified parameters that are not those of the material."""
+        return {name: self.ranges[name] for name in self.others if name in self.ranges}
+
+    def _bounds(self, name: str, value: float) -> Bounds:
+        """Returns the range of a constant of a law."""
+        prior, modulus = None, self.ranges.get("youngs_modulus")
+        if modulus is not None and modulus.prior is not None:
+            share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
+            prior = Prior(share * modulus.prior.mean, share * modulus.prior.deviation)
+        return bounds_of_constant(name, value, self.guess, 1.0 if self.states else _FURTHER, prior)
+
+
+def _deviation(found: Identification) -> dict[str, float]:
+    """Standard deviations of identified parameters; empty if they are not known."""
+    return {} if found.uncertainty is None else dict(found.uncertainty.deviation)
+
+
+def _refined_groups(law: LawClass) -> set[str]:
+    """Groups of terms of a law when it is refined, which adds viscosities."""
+    return {*law.groups, "viscosity"}

@@ -189,17 +189,6 @@ class TestOwnOptions:
         )
         assert errors.count("\n") == 1
 
-    def test_the_command_line_is_left_as_it_was(self, command, own):
-        """The program's arguments after it has run, which `end_of` replaces by its own."""
-        left = []
-
-        def main():
-            cli.main()
-            left.extend(sys.argv)
-
-        assert end_of(main, *command.arguments, "seed=1") == (0, "")
-        assert left == [*command.arguments, "seed=1"]
-
 
 class TestUserErrors:
     @pytest.mark.parametrize(

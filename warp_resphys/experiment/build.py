@@ -178,9 +178,9 @@ def build_material(settings: MaterialSettings, key: str) -> Material | dict[str,
         InputError: a constant is unknown or out of range.
     """
     materials = {}
-    for region, own in settings.by_region.items():
+    for region, chosen in settings.by_region.items():
         with naming(f"{key}.regions.{region}: " if region else f"{key}: "):
-            materials[region] = make_material(own.model, **own.constants)
+            materials[region] = make_material(chosen.model, **chosen.constants)
     return materials.get("", materials)
 
 
@@ -243,8 +243,8 @@ def whole_mesh(settings: BodySettings) -> Mesh:
     parts = {}
     for name, part in settings.parts.items():
         with naming(f"parts.{name}."):
-            own = build_mesh(part.mesh)
-        parts[name] = replace(own, vertices=own.vertices + np.asarray(part.shift))
+            part_mesh = build_mesh(part.mesh)
+        parts[name] = replace(part_mesh, vertices=part_mesh.vertices + np.asarray(part.shift))
     joined = join({"body": mesh, **parts})
     if twice := joined.regions.keys() & mesh.regions.keys():
         raise MeshError(f"a part and a region of the first mesh have the name {min(twice)!r}: rename the part.")
@@ -283,9 +283,9 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
     """
     to, points = settings.bind_to, np.asarray(places, dtype=np.float64)
     parts, rows = list[BoundMarkers](), list[list[int]]()
-    for body, own in corners_of(labels).items():
-        parts.append(follow_vertices(mesh, mounted_on(settings.rigid_bodies[body], mesh), points[own]))
-        rows.append(list(range(own.start, own.stop)))
+    for body, corners in corners_of(labels).items():
+        parts.append(follow_vertices(mesh, mounted_on(settings.rigid_bodies[body], mesh), points[corners]))
+        rows.append(list(range(corners.start, corners.stop)))
     if marked := [row for row, label in enumerate(labels) if label in settings.tracked]:
         tracked = mesh, points[marked], [labels[row] for row in marked]
         if settings.observation is not None:
@@ -377,6 +377,6 @@ def build_simulator(
         solver=SolverSettings(**solver),
         device=simulation_device(settings.device),
     )
-    for own in simulator.materials.values():
-        check_weight(simulator.body, own, settings.gravity)
+    for made in simulator.materials.values():
+        check_weight(simulator.body, made, settings.gravity)
     return simulator

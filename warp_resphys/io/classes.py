@@ -63,11 +63,11 @@ def _arguments(make: Callable[..., Any], given: int, where: str) -> type[_Argume
     """Returns a class of settings with the arguments after the first ones."""
     try:
         fields: dict[str, Any] = {
-            own.name: (
-                Any if own.annotation is Parameter.empty else own.annotation,
-                ... if own.default is Parameter.empty else own.default,
+            parameter.name: (
+                Any if parameter.annotation is Parameter.empty else parameter.annotation,
+                ... if parameter.default is Parameter.empty else parameter.default,
             )
-            for own in [*signature(make, eval_str=True).parameters.values()][given:]
+            for parameter in [*signature(make, eval_str=True).parameters.values()][given:]
         }
         return create_model(make.__qualname__, __base__=_Arguments, **fields)
     except (NameError, PydanticUserError) as error:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import TracebackType
 from typing import Any, Final
 
@@ -19,10 +20,10 @@ _BAR_SECONDS = 0.1
 _LINE_SECONDS = 10.0
 _SURE_CALLS, _SURE_SECONDS = 8, 20.0  # of which one is done before an estimate is shown
 _AT_MOST = " at most"  # of units of work that may end early
-_shown = True
-_running: list[Progress] = []  # innermost last; a terminal has room for one bar
-_done: list[str] = []  # work of the loops of a stage that is running, which ends with one line for all of them
-_in_stage = False
+_SHOWN: Final = ContextVar("shown", default=True)
+_RUNNING: Final = ContextVar("running", default=0)  # number of loops that are shown; a terminal has room for one bar
+# Work of the loops of a stage, which ends with one line for all of them; None outside of stages.
+_STAGE: Final = ContextVar[list[str] | None]("stage", default=None)
 _TITLES: Final = {  # of stages, by the first word of their names, and of single ones
     "simulate": "Simulating the trials",
     "laboratory": "Simulating the recordings",
@@ -59,19 +60,17 @@ def one_line(stage: str) -> Iterator[Callable[[float], str]]:
     Args:
         stage: its name.
     """
-    global _in_stage
-    before, _in_stage = _in_stage, True
-    _done.clear()
+    done: list[str] = []
+    token = _STAGE.set(done)
     try:
-        yield lambda seconds: f"{title_of(stage):<42}{(_done or [''])[0]:<16}{duration(seconds)}".rstrip()
+        yield lambda seconds: f"{title_of(stage):<42}{(done or [''])[0]:<16}{duration(seconds)}".rstrip()
     finally:
-        _in_stage = before
+        _STAGE.reset(token)
 
 
 def be_quiet() -> None:
     """Disables progress output in this process, such as a worker whose parent shows the progress of all."""
-    global _shown
-    _shown = False
+    _SHOWN.set(False)
 
 
 class Progress:
@@ -103,7 +102,7 @@ class Progress:
         self.description, self.total, self.unit, self.done = description, total, unit, start_at
         self._title = title_of(description)
         self._start_at, self._shown, self._calls = start_at, -1, 0
-        self.console = Console(stderr=True, quiet=not _shown) if console is None else console
+        self.console = Console(stderr=True, quiet=not _SHOWN.get()) if console is None else console
         self._fields: dict[str, object] = {}
         self._start = self._next = 0.0
         self._marks = ((0.0, 0), (0.0, 0))  # times at which the units done had doubled, and these units
@@ -115,9 +114,9 @@ class Progress:
         self._start = time.perf_counter()
         self._marks = ((self._start, 0), (self._start, 0))
         self._next = self._start + (self._after if self.console.is_terminal else max(self._after, _LINE_SECONDS))
-        if self._after and _running:
+        if self._after and _RUNNING.get():
             self._next = math.inf
-        _running.append(self)
+        self._token = _RUNNING.set(_RUNNING.get() + 1)
         if self.console.is_terminal and not self._after:
             self._start_bar()
         return self
@@ -125,7 +124,7 @@ class Progress:
     def _start_bar(self) -> None:
         columns = TextColumn("{task.description}"), BarColumn(bar_width=24), TextColumn("{task.fields[status]}")
         options: dict[str, Any] = {"refresh_per_second": 5, "redirect_stdout": sys.stdout.isatty()}
-        self._bars = Bars(*columns, console=self.console, transient=_in_stage, **options)
+        self._bars = Bars(*columns, console=self.console, transient=_STAGE.get() is not None, **options)
         self._bars.start()
         self._task = self._bars.add_task(self._title, total=self.total, completed=self.done, status=self.status())
 
@@ -134,11 +133,12 @@ class Progress:
     ) -> None:
         """Shows the final state."""
         now, self._ended = time.perf_counter(), kind is None and self.unit.endswith(_AT_MOST)
-        _running.remove(self)
+        _RUNNING.reset(self._token)
+        stage = _STAGE.get()
         waited = not self._after or (self._next < math.inf and now >= self._start + self._after)
-        if not self._after and len(_running) == 0 and not self.unit.endswith(_AT_MOST):
-            _done.append(f"{self.total:,} {self.unit}")
-        if self._bars is not None or (waited and self.done != self._shown and not _in_stage):
+        if stage is not None and not self._after and not _RUNNING.get() and not self.unit.endswith(_AT_MOST):
+            stage.append(f"{self.total:,} {self.unit}")
+        if self._bars is not None or (waited and self.done != self._shown and stage is None):
             self._show(now)
         if self._bars is not None:
             self._bars.stop()

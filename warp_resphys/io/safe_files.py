@@ -242,11 +242,11 @@ def write_checkpoint(
     """
     from safetensors.torch import save
 
-    own = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     text = json.dumps(to_plain(metadata))
     header = {"format": FORMAT, "version": str(FORMAT_VERSION), "kind": kind, "metadata": text}
     with atomic_path(path) as partial:
-        partial.write_bytes(save(own, metadata=header))
+        partial.write_bytes(save(copies, metadata=header))
 
 
 def read_checkpoint(path: str | Path, expected_kind: str) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

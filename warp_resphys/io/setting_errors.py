@@ -71,7 +71,7 @@ def _unknown(schema: Schema, values: Any, where: str, path: Path) -> str:
     group, name = path[:-1], str(path[-1])
     inside = _value(values, group)
     choices = sorted(options(schema, _node(schema, group, values)), key=lambda option: not _fits(option, inside))
-    own = list(next((option["properties"] for option in choices if "properties" in option), {}))
+    near = list(next((option["properties"] for option in choices if "properties" in option), {}))
     every, key = list(keys(schema)), _dotted(path, where)
     kinds = [option["properties"] for option in choices if "kind" in option.get("properties", {})]
     for other in kinds[1:]:
@@ -79,9 +79,9 @@ def _unknown(schema: Schema, values: Any, where: str, path: Path) -> str:
             kind = _words_of(other["kind"])[0]
             return f"{key} is a setting of kind {kind}, not of {inside['kind']}: remove it with ~{key}."
     same = [known for known in every if known.rpartition(".")[2] == name]
-    hint = did_you_mean(name, same, preferred=same) or did_you_mean(name, own) or did_you_mean(_dotted(path), every)
-    hint = hint or f": {_dotted(group, where) or 'a configuration'} has {', '.join(own)}."
-    if "files" in own and re.fullmatch(r".+\.[a-z]\w*", str(value := _value(values, path)), re.IGNORECASE):
+    hint = did_you_mean(name, same, preferred=same) or did_you_mean(name, near) or did_you_mean(_dotted(path), every)
+    hint = hint or f": {_dotted(group, where) or 'a configuration'} has {', '.join(near)}."
+    if "files" in near and re.fullmatch(r".+\.[a-z]\w*", str(value := _value(values, path)), re.IGNORECASE):
         hint += f" There is no file {key}={value} either: check its path; in quotes it is 'files=[\"{key}={value}\"]'."
     return f"unknown key '{key}'{hint}"
 

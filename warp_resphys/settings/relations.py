@@ -65,7 +65,7 @@ def _check_times(run: RunKeys) -> None:
         for name, swing in (motion.swings or {}).items()
     }
     waves = {name: trial.waves for name, trial in trials.items() if trial.waves is not None}
-    frequencies |= {f"laboratory.trials.{name}.waves.frequency": own.frequency for name, own in waves.items()}
+    frequencies |= {f"laboratory.trials.{name}.waves.frequency": wave.frequency for name, wave in waves.items()}
     frequencies |= {} if data is None or data.cutoff is None else {"data.cutoff": data.cutoff}
     for key, frequency in frequencies.items():
         if 2.0 * frequency * run.time_step >= 1.0:
@@ -149,7 +149,7 @@ def _check_identification(run: RunKeys) -> None:
         )
     if run.identify is None or run.pictures is not None:
         return
-    tables = [own.trials for own in (run.recorded, run.laboratory) if own is not None]
+    tables = [group.trials for group in (run.recorded, run.laboratory) if group is not None]
     named = any(trial.session for table in tables for trial in table.values())
     placement, markers = run.identify.placement, run.markers
     if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):

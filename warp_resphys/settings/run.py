@@ -45,15 +45,15 @@ def filled(values: Any) -> Any:
     keys = TargetSettings.model_fields
     common = {key: values.get(key) for key, field in keys.items() if key in values or field.is_required()}
     for group in ("target", "laboratory"):
-        own = values.get(group)
-        if isinstance(own, Mapping):
-            direct = {key for key, value in own.items() if key not in keys and not isinstance(value, Mapping)}
-            constants = {key: own[key] for key in direct} if group == "target" else {}
-            material = _mapping(own.get("material", {}))
+        part = values.get(group)
+        if isinstance(part, Mapping):
+            direct = {key for key, value in part.items() if key not in keys and not isinstance(value, Mapping)}
+            constants = {key: part[key] for key in direct} if group == "target" else {}
+            material = _mapping(part.get("material", {}))
             if constants and material is not None:
-                own = {key: value for key, value in own.items() if key not in constants}
-                own["material"] = {key: value for key, value in {**constants, **material}.items() if value is not None}
-            values[group] = {**common, "material": values.get("simulation"), **own}
+                part = {key: value for key, value in part.items() if key not in constants}
+                part["material"] = {key: value for key, value in {**constants, **material}.items() if value is not None}
+            values[group] = {**common, "material": values.get("simulation"), **part}
     return values
 
 

@@ -145,9 +145,9 @@ class RunKeys(SimulatorSettings):
     @property
     def targets(self) -> dict[str, TargetSettings]:
         """The simulation that stands in for the real body, by key; empty if the data are recordings of a real body."""
-        own = {"target": None if self.recorded is not None else self.target}
-        own |= {"laboratory": self.laboratory if self.is_laboratory else None}
-        return {key: settings for key, settings in own.items() if settings is not None}
+        played = {"target": None if self.recorded is not None else self.target}
+        played |= {"laboratory": self.laboratory if self.is_laboratory else None}
+        return {key: settings for key, settings in played.items() if settings is not None}
 
     @property
     def bodies(self) -> dict[str, SteppedSettings]:

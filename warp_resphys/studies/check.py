@@ -91,8 +91,8 @@ def check(settings: CheckSettings, folder: Path) -> None:
         for name in GRADIENTS:
             checks.append(bounded(f"{name}, gradients", partial(gradient_error, name, device), GRADIENT_BOUND))
             progress.advance()
-    rows = [[own.name, own.result, own.allowed, "passed" if own.passed else "FAILED"] for own in checks]
-    failed = [own for own in checks if not own.passed]
+    rows = [[one.name, one.result, one.allowed, "passed" if one.passed else "FAILED"] for one in checks]
+    failed = [one for one in checks if not one.passed]
     place = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU"
     show(PageTable.plain(f"Largest errors on {place}", ["check", "error", "allowed", ""], rows), speed_table(device))
     outcome = f"{len(failed)} of {len(rows)} checks failed" if failed else f"All {len(rows)} checks passed"
@@ -118,14 +118,14 @@ def motion_checks(name: str, device: torch.device) -> Iterator[Check]:
     yield bounded(f"{name}, height on the CPU", lambda: abs(float(reference[-1, ..., 2].mean()) - height), most, "m")
 
     def error(environments: slice, **options: Any) -> float:
-        own = positions(build(device=device, **options), environments)
-        return float(torch.linalg.vector_norm(own - reference[:, environments], dim=-1).max())
+        moved = positions(build(device=device, **options), environments)
+        return float(torch.linalg.vector_norm(moved - reference[:, environments], dim=-1).max())
 
     # On a GPU, the banded solver is the tiled one.
     absent = ("pardiso",) * (not has_pardiso()) if device.type == "cpu" else ("tiled", "pardiso")
-    own = [linear for linear in LINEAR_SOLVERS if linear not in absent]
+    solvers = [linear for linear in LINEAR_SOLVERS if linear not in absent]
     cases = [("newton", "auto", torch.float64), ("quasi_newton", "auto", torch.float32)]
-    cases += [("quasi_newton", linear, torch.float64) for linear in (own if name in EVERY_SOLVER else ("auto",))]
+    cases += [("quasi_newton", linear, torch.float64) for linear in (solvers if name in EVERY_SOLVER else ("auto",))]
     cases += [("projective_dynamics", "auto", torch.float64)] * (name == "hexahedra")
     for solver, linear, dtype in cases:
         settings = SolverSettings(solver, _TOLERANCE[dtype], max_iterations=100_000, linear_solver=linear)
@@ -155,9 +155,11 @@ def positions(simulator: Simulator, environments: slice = slice(None)) -> torch.
 def gradient_error(name: str, device: torch.device) -> float:
     """Largest relative error of the adjoints of two steps on a device, beside central differences."""
     gradients = GRADIENTS[name]
-    own = gradients.simulator(solver=SolverSettings("newton", relative_tolerance=1e-12), device=device)
-    names = {"q", "v", *(name for name in own.parameters if name.startswith(gradients.of))} if gradients.of else None
-    rows = check_gradients(own, gradients.start, steps=2, change=gradients.change, names=names)
+    simulator = gradients.simulator(solver=SolverSettings("newton", relative_tolerance=1e-12), device=device)
+    names = (
+        {"q", "v", *(name for name in simulator.parameters if name.startswith(gradients.of))} if gradients.of else None
+    )
+    rows = check_gradients(simulator, gradients.start, steps=2, change=gradients.change, names=names)
     return max(row.relative_error for row in rows)
 
 
@@ -166,10 +168,10 @@ def speed_table(device: torch.device) -> PageTable:
     devices = dict.fromkeys((torch.device("cpu"), device))
     rows = []
     for batch in _TIMED:
-        for what, *figures in zip(("step", "gradient"), *(milliseconds(own, batch) for own in devices), strict=True):
+        for what, *figures in zip(("step", "gradient"), *(milliseconds(one, batch) for one in devices), strict=True):
             faster = [f"{figures[0] / figure:.1f}" for figure in figures[1:]]
             rows.append([f"{what} of {batch}", *(f"{figure:.2f}" for figure in figures), *faster])
-    columns = [str(own) for own in devices] + ["times as fast"] * (len(devices) - 1)
+    columns = [str(one) for one in devices] + ["times as fast"] * (len(devices) - 1)
     return PageTable.plain("Milliseconds of beams of 480 unknowns, all together", ["", *columns], rows)
 
 

@@ -1,12 +1,12 @@
-"""Laws that are functions of a length: fibres, strings and muscles.
+"""Laws that are functions of a length: fibres, strings, muscles, and inertia.
 
 The vector x at a point less an origin o has the length l and the unit vector u. With the values v, a tension gives
 
     e(l, v),   t = de/dl,   slope dt/dl,   and dt/dv,
 
 so that the stress is t u and the tangent slope u u^T + t / l (1 - u u^T), which has a negative eigenvalue only for a
-negative tension. The origin is zero, or for a string the first three values. The last value, the elongation over which
-fibres become taut, is a constant.
+negative tension. The origin is zero, or for strings and inertia the first three values. The last value of fibres, the
+elongation over which they become taut, is a constant.
 """
 
 from typing import Any
@@ -85,6 +85,21 @@ def muscle_tension(length: wp.float64, v: wp.vec4d):
     return v[0] * length + v[2] * energy, v[0] + v[2] * force, v[2] * slope, by_values
 
 
+@wp.func
+def stiffness_across(length: wp.float64, pull: wp.float64, slope: wp.float64) -> wp.float64:
+    """Returns t / l, its limit without length."""
+    if length > ZERO:
+        return pull / length
+    return slope
+
+
+@wp.func
+def inertia_tension(length: wp.float64, v: wp.vec4d):
+    """Inertia of a point in a step, ``k / 2 l^2`` from its inertial target; v = (target, k) [m, N/m]."""
+    pull = v[3] * length
+    return HALF * pull * length, pull, v[3], wp.vec4d(ZERO, ZERO, ZERO, length)
+
+
 def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
     vector, module = tension.input_types["v"], named_module(name)
 
@@ -112,9 +127,7 @@ def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
         along = wp.dot(u, df)
         result = along * by_values
         if wp.static(tied):
-            moved = (slope * along) * u
-            if length > ZERO:
-                moved += (pull / length) * (df - along * u)
+            moved = (slope * along) * u + stiffness_across(length, pull, slope) * (df - along * u)
             for i in range(3):
                 result[i] = -moved[i]
         return result
@@ -123,9 +136,7 @@ def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
     def tangent(f: wp.vec3d, v: vector, clamp: bool, out: wp.array[wp.mat33d]):
         u, length = stretched(f, v)
         _energy, pull, slope, _by_values = tension(length, v)
-        across = ZERO
-        if length > ZERO:
-            across = pull / length
+        across = stiffness_across(length, pull, slope)
         if clamp:
             across = wp.max(across, ZERO)
         block = (slope - across) * wp.outer(u, u)
@@ -138,4 +149,7 @@ def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
 
 
 THREAD, MUSCLE = _axial_law("axial.thread", thread_tension), _axial_law("axial.muscle", muscle_tension)
-STRING = _axial_law("axial.string", string_tension, tied=True)
+STRING, INERTIA = (
+    _axial_law(f"axial.{name}", tension, tied=True)
+    for name, tension in (("string", string_tension), ("inertia", inertia_tension))
+)

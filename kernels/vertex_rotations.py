@@ -1,14 +1,14 @@
-"""Mean rotations of the cells around vertices, rotations of rigid parts, and inertia of points, k / 2 |x - y|^2."""
+"""Mean rotations of the cells around vertices, and rotations of rigid parts."""
 
 import warp as wp
 
 from .matrices import polar_rotation
-from .points import MatrixPoints, VectorPoints, matrix_at, vector_at
+from .points import MatrixPoints, matrix_at
 
 wp.set_module_options({"enable_backward": False})
 
 SMALLEST = wp.constant(wp.float64(1.0e-30))  # of determinants; gradients are scaled by the mean volume of cells
-ZERO, THIRD, HALF, ONE = wp.float64(0.0), wp.float64(1.0 / 3.0), wp.float64(0.5), wp.float64(1.0)
+THIRD, ONE = wp.float64(1.0 / 3.0), wp.float64(1.0)
 
 
 @wp.kernel
@@ -67,59 +67,6 @@ def rotation_since(
     """Rotations of vertices from earlier ones to the present ones."""
     b, k = wp.tid()
     since_out[b, k] = rotation[b, vertices[k]] * wp.transpose(before[b, k])
-
-
-@wp.kernel
-def local_step(
-    active: wp.array[int],  # (B) zero: skip the environment
-    points: VectorPoints,
-    inertia: wp.array2d[wp.float64],  # (B, P) k, mass over the square of the effective time step [N/m]
-    target: wp.array2d[wp.vec3d],  # (B, P) y, inertial target [m]
-    positions: wp.array2d[wp.vec3d],
-    stress_out: wp.array2d[wp.vec3d],
-    energy_out: wp.array2d[wp.float64],
-):
-    """Inertial force k (x - y), and its energy."""
-    b, p = wp.tid()
-    if active[b] == 0:
-        return
-    offset = vector_at(points, positions, b, p) - target[b, p]
-    pull = inertia[b, p] * offset
-    stress_out[b, p] = pull
-    energy_out[b, p] = HALF * wp.dot(pull, offset)
-
-
-@wp.kernel
-def tangent(
-    active: wp.array[int],
-    clamp: wp.array[int],  # (B) without effect: the energy is convex
-    inertia: wp.array2d[wp.float64],
-    tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
-):
-    """K times the identity."""
-    b, p = wp.tid()
-    if active[b] == 0:
-        return
-    k = inertia[b, p]
-    tangent_out[b, p, 0] = wp.mat33d(k, ZERO, ZERO, ZERO, k, ZERO, ZERO, ZERO, k)
-
-
-@wp.kernel
-def adjoint(
-    points: VectorPoints,
-    inertia: wp.array2d[wp.float64],
-    target: wp.array2d[wp.vec3d],
-    positions: wp.array2d[wp.vec3d],
-    direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
-    inertia_out: wp.array2d[wp.float64],  # (B, P) dL/dk
-    target_out: wp.array2d[wp.vec3d],  # (B, P) dL/dy
-):
-    """-z . d residual by the inertia and by the target."""
-    b, p = wp.tid()
-    offset = vector_at(points, positions, b, p) - target[b, p]
-    dz = vector_at(points, direction, b, p)
-    inertia_out[b, p] = -wp.dot(offset, dz)
-    target_out[b, p] = inertia[b, p] * dz
 
 
 @wp.kernel

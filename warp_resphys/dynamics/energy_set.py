@@ -19,6 +19,7 @@ from ..energies.contact.obstacle_poses import ObstacleMotion
 from ..energies.contact.surface_contact import BoundSurfaceContact
 from ..energies.hysteresis import Hysteresis
 from ..energies.materials import Material
+from ..energies.pointwise import one_part_each
 from ..energies.potential import StepTerms
 from ..energies.rigid import PointInertia, rigid_energies
 from ..energies.solid import solids_of
@@ -308,7 +309,8 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
     if (contact := getattr(whole, "contact", None)) is not None:
         placed.append(PlacedEnergy.of(whole, whole, 0, contact, contact.points(whole.mesh)))
     if whole.coordinates:
-        placed.append(PlacedEnergy(PointInertia(whole.coordinates.points), (whole.coordinates.points,), "dependent_"))
+        dependent = one_part_each(whole.coordinates.points)
+        placed.append(PlacedEnergy(PointInertia(dependent), (dependent,), "dependent_"))
     return placed
 
 

@@ -25,7 +25,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..fem.integration_points import physical_gradients
+from ..fem.integration_points import Points, physical_gradients
 from ..io.errors import InputError
 from ..kernels.energy_functions import derived_law
 from ..kernels.laws import Law, point_kernels
@@ -66,6 +66,7 @@ class ReadingTerm(PartTerm):
             constants, device=launcher.device, dtype=torch.float64
         )
         part = self.part_of.cpu().numpy()
+        self._one_each = np.array_equal(part, np.arange(count))
         self._columns = {name: self._columns_of(name, part) for name in self._shapes}
         of_constants = np.tile(np.arange(len(constants))[:, None], len(part))
         columns = np.concatenate([*self._columns.values(), of_constants])
@@ -103,7 +104,10 @@ class ReadingTerm(PartTerm):
         slopes, first = {}, 0
         for name, shape in self._shapes.items():
             slope = out[""][..., first : first + len(self._columns[name])]
-            slope = slope.sum(1) if name in self._arrays else torch.einsum("bpn,pc->bcn", slope, self.one_hot)
+            if name in self._arrays:
+                slope = slope.sum(1)
+            elif not self._one_each:
+                slope = torch.einsum("bpn,pc->bcn", slope, self.one_hot)
             slopes[name] = slope.reshape(self.launcher.batch, *shape).clone()
             first += len(self._columns[name])
         return slopes
@@ -147,6 +151,12 @@ class PointwiseTerm(ReadingTerm):
             )
         shapes: dict[str, tuple[int, ...]] = {name: arrays.get(name, (energy.count,)) for name in names}
         super().__init__(launcher, sets, law, shapes, energy.count, list(arrays))
+
+
+def one_part_each(points: Points) -> PartPoints:
+    """Returns points of weight one that are a part each, in their order."""
+    count = points.n_points
+    return PartPoints(points.nodes, points.gradients, np.arange(count), np.ones(count))
 
 
 def at_vertices(vertices: ArrayLike, part: ArrayLike = 0) -> PartPoints:

@@ -25,14 +25,16 @@ from ..fem.bodies import Body, Rigid
 from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.integration_points import Points, SolidPoints, volume_points
 from ..kernels import vertex_rotations as kernels
+from ..kernels.axial import INERTIA
 from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, parameter
 from ..stepping.state import Mass
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep
 from .launcher import Launcher
 from .materials import Corotated
+from .pointwise import ReadingTerm, one_part_each
 from .solid import VISCOUS, SolidTerm
-from .term import Kernel, PointSet, Slope, Term
+from .term import PartPoints, PointSet
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,12 @@ class _OnOwnPoints(Energy):
 class PointInertia(_OnOwnPoints):
     """Inertia of points; values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m]."""
 
+    own_points: PartPoints  # a part each
+
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PointInertiaTerm":
-        return PointInertiaTerm(launcher, sets)
+        count = self.own_points.n_points
+        return PointInertiaTerm(launcher, sets, INERTIA, {"target": (count, 3), "inertia": (count,)}, count)
 
     @override
     def bind(self, site: EnergySite) -> "BoundInertia":
@@ -104,30 +109,12 @@ class BoundRigidInertia(BoundInertia):
         return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
 
 
-class PointInertiaTerm(Term):
+class PointInertiaTerm(ReadingTerm):
     """Kernels of the inertia of points."""
-
-    _kernels = kernels
-
-    def __init__(self, launcher: Launcher, sets: Sequence[PointSet]) -> None:
-        (s,) = sets
-        super().__init__(launcher, sets, {"inertia": (s.n_points,), "target": (s.n_points, 3)})
-
-    @override
-    def _arguments(self, s: PointSet, positions: Any) -> list[Any]:
-        return [s.points, self.view("inertia"), self.view("target", wp.vec3d), positions]
-
-    @override
-    def tangent(self, s: PointSet, positions: Any) -> Kernel:
-        return Kernel(kernels.tangent, [self.view("inertia")])
 
     @override
     def curvature(self) -> torch.Tensor:
         return self.values["inertia"]
-
-    @override
-    def _slopes(self) -> list[Slope]:
-        return [Slope("inertia", (self.n_points,)), Slope("target", (self.n_points, 3), wp.vec3d)]
 
 
 @dataclass(frozen=True)
@@ -203,5 +190,5 @@ def rigid_energies(body: Body, name: str, part: Rigid) -> list[Energy]:
     carried = scipy.sparse.csr_array(np.array([[volume]]))
     point = SolidPoints(controls[None], gradients[None, None], carried, scipy.sparse.csr_array((1, 1)))
     operators = np.asarray(np.linalg.cholesky(moments).T[None, :, :, None], dtype=np.float64)
-    inertia = RigidInertia(Points(controls[None], operators), cells, part.density)
+    inertia = RigidInertia(one_part_each(Points(controls[None], operators)), cells, part.density)
     return [Rigidity(point, part.stiffness, moments.sum(0) / volume), inertia]

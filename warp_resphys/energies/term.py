@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -278,7 +279,6 @@ class PartTerm(Term):
         count: number of parts.
         weights, weight: (P,) weights of the points, for kernels and for torch.
         part, part_of: (P,) part of each point, likewise.
-        one_hot: (P, count) the same as a matrix.
     """
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], shapes: Shapes, count: int) -> None:
@@ -288,9 +288,13 @@ class PartTerm(Term):
         self.count = count
         self.weights = launcher.upload(s.source.weights, wp.float64)
         self.part = launcher.upload(s.source.part.astype(np.int32), int)
-        self.one_hot = torch.as_tensor(np.eye(count)[s.source.part], device=launcher.device)  # (P, count)
         self.part_of = torch.as_tensor(s.source.part, device=launcher.device)
         self.weight = torch.as_tensor(s.source.weights, device=launcher.device)
+
+    @cached_property
+    def one_hot(self) -> torch.Tensor:
+        """Part of each point as a matrix (P, count)."""
+        return torch.eye(self.count, device=self.launcher.device, dtype=torch.float64)[self.part_of]
 
     @override
     def _by_values(self, out: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -88,12 +88,11 @@ def command_line() -> argparse.ArgumentParser:
     step = parts.add_parser("step", parents=[shared, body], help="one body, by solver")
     batches = parts.add_parser("batches", parents=[shared, body], help="many bodies at once")
     for part, solvers, counts in ((step, ["quasi_newton", "newton"], [1]), (batches, ["quasi_newton"], None)):
-        part.set_defaults(measure=steps.measure_steps, run=None)
+        part.set_defaults(measure=steps.measure_steps)
         part.add_argument("--solvers", nargs="+", choices=SOLVERS, default=solvers)
         part.add_argument("--batches", nargs="+", type=int, default=counts)
         part.add_argument("--steps", type=int, default=60, help="of a roll-out (default: %(default)s)")
         part.add_argument("--floor", action="store_true", help="the body is lifted, and falls on a floor")
-    batches.add_argument("--run", type=Path, help="a run folder, whose environments are timed, too")
     sizes = parts.add_parser("sizes", parents=[shared, body], help="by size of the body and linear solver")
     sizes.set_defaults(measure=steps.measure_sizes)
     linear = ["banded", "sparse", "pardiso"]

@@ -22,7 +22,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
+from robots_page import ROWS, beside, gain_of, items, robots_page, table
 
 from warp_resphys.commands import run_label
 from warp_resphys.data.recordings.segment import convert_segment
@@ -32,29 +32,15 @@ from warp_resphys.io.resuming import package_versions
 from warp_resphys.io.safe_files import read_json, write_text
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.metrics import PUBLISHED_MM
-from warp_resphys.report.data import Errors, trial_errors
-from warp_resphys.report.verdict import LEAST_TRIALS, best_pair, compared, known_errors, less_error
-from warp_resphys.report.wording import (
-    MINUS,
-    MODELS,
-    NONE,
-    duration_text,
-    error_parts,
-    in_a_row,
-    number_text,
-    published_parts,
-)
+from warp_resphys.report.data import trial_errors
+from warp_resphys.report.wording import MODELS, NONE, duration_text, error_parts, number_text, published_parts
 
-ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
 RUNS: Final = Path("runs")
 INTERRUPTED, USER_ERROR = 130, 2
 
 COMPARED: Final = (*BASELINES, "simulation", "sysid", "simfree", "resphys")
-CORRECTED: Final = ("sysid", "resphys")
 FIGURES: Final = ("error_over_time", "paths_worst")
 BODY_PICTURES: Final = ("figures/body.png", "fold_*/figures/body.png", "figures/registration.png")
-MACHINE: Final = {"processor": "Processor", "cores used": "Cores used", "GPU": "GPU", "commit": "Commit"}
-PACKAGES: Final = ("python", "warp-lang", "torch")
 
 
 @dataclass
@@ -225,131 +211,11 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
         "how": how,
         "errors_mm": {model: metrics["errors_mm"][model] for model in COMPARED if model in metrics["errors_mm"]},
         "beside": beside(errors),
-        "gains": {"sysid": _gain(errors, "simulation", "sysid"), "resphys": _gain(errors, "sysid", "resphys")},
+        "gains": {"sysid": gain_of(errors, "simulation", "sysid"), "resphys": gain_of(errors, "sysid", "resphys")},
         "intervals": intervals and {key: intervals[key] for key in ("coverage", "half_width_mm")},
         "seconds": sum(sum(part["seconds"].values()) for part in (metrics, *folds.values())),
         "moved_mm": metrics.get("mesh_check", {}).get("moved_mm"),
     }
-
-
-def beside(errors: Errors) -> dict[str, Any] | None:
-    """The corrected model of least mean error beside the best of all others; None where one of them is missing."""
-    corrected, other = best_pair(known_errors(errors))
-    gain = _gain(errors, other, corrected)
-    return gain and {"corrected": corrected, "other": other, "gain": gain}
-
-
-def _gain(errors: Errors, before: str, after: str) -> dict[str, Any] | None:
-    """Share of the error of one model that another removes; None where one is missing or has diverged."""
-    known = known_errors(errors)
-    return dict(compared(known[before], known[after])._asdict()) if {before, after} <= known.keys() else None
-
-
-def robots_page(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str], pictures: Path) -> str:
-    """Returns the page of robots: a table with a row for each, and a section for each.
-
-    Args:
-        results: by robot, from `measure`.
-        failed: error messages of runs that failed now, by robot; such a robot keeps its last results.
-        pictures: folder with pictures of their bodies.
-    """
-    results = {name: results[name] for name in ROWS["robots"] if name in results}
-    titles = {name: str(robot["title"]) for name, robot in ROWS["robots"].items()}
-    lines = [f"# Robots of {max((row['day'] for row in results.values()), default=NONE)}", _robots_verdict(results)]
-    lines += ["## All robots", *_robots_table(results, failed)] if results else []
-    for name, row in results.items():
-        lines += [f"## {titles[name]}", *_robot_section(name, row, pictures)]
-    failures = [f"{titles[name]} failed: {failure}" for name, failure in failed.items()]
-    lines += ["## Not run", _items(failures)] if failures else []
-    cells = [
-        [titles[name], row["day"], *(row["machine"].get(key, NONE) for key in (*MACHINE, *PACKAGES))]
-        for name, row in results.items()
-    ]
-    lines += ["## Machines and versions", _table(["Robot", "Measured", *MACHINE.values(), *PACKAGES], cells)]
-    return "\n\n".join([*lines, "## Command", "- `python scripts/reproduce.py robots --data FOLDER --results docs`"])
-
-
-def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str]) -> list[str]:
-    models = ("simulation", "sysid", "simfree", "resphys")
-    rows = []
-    for name, row in results.items():
-        errors, title = row["errors_mm"], _title(name)
-        small = [*row["beyond"], *([f"failed since {row['day']}"] if name in failed else [])]
-        means = {m: errors[m]["mean"] for m in BASELINES if m in errors and errors[m]["mean"] is not None}
-        best = min(means, key=means.__getitem__, default="")
-        interval = row["intervals"]
-        rows.append(
-            [
-                f"{title} ({', '.join(small)})" if small else title,
-                f"{number_text(means[best])} {MODELS[best].name.lower()}" if best else NONE,
-                *(" ".join(error_parts(errors[model])).strip() if model in errors else NONE for model in models),
-                *(_gain_text(row["gains"].get(model)) for model in CORRECTED),
-                f"{100.0 * interval['coverage']:.0f} % (± {interval['half_width_mm']:.2g} mm)" if interval else NONE,
-                duration_text(row["seconds"]),
-            ]
-        )
-    note = (
-        "Mean distance of the markers on data that neither training nor identification used [mm], ± the standard "
-        "deviation over trials. Without physics: the best of a body at rest, interpolation and kernel regression "
-        "between the training trials, and a linear model. Less error: the share of the uncorrected error that SysID "
-        "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
-        f"if there are {LEAST_TRIALS} or more. Coverage: the share of the "
-        "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: the "
-        "sum over all stages and folds, including those that ran in parallel, on a machine with other load."
-    )
-    heads = ["Robot", "Without physics [mm]", *(f"{MODELS[model].name} [mm]" for model in models)]
-    heads += [*(f"Less error by {MODELS[model].name}" for model in CORRECTED), "Coverage", "Time"]
-    return [_table(heads, rows), note]
-
-
-def _gain_text(gain: Mapping[str, Any] | None) -> str:
-    if gain is None:
-        return NONE
-    share, *ends = (f"{100.0 * gain[key]:.0f}".replace("-", MINUS) for key in ("share", "lower", "upper"))
-    return f"{share} %" if gain["trials"] < LEAST_TRIALS else f"{share} % ({' to '.join(ends)})"
-
-
-def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[str]:
-    """Picture, source of the recordings, test trials and published results of a robot."""
-    robot, count = ROWS["robots"][name], len(row["tested"])
-    text = f"Tested on {count} trial{'s' if count > 1 else ''}, {row['how']}: {', '.join(row['tested'])}."
-    if pair := row["beside"]:
-        means = {model: row["errors_mm"][model]["mean"] for model in (pair["corrected"], pair["other"])}
-        best, second = sorted(means, key=lambda model: means[model])
-        said = less_error(best, second, 1.0 - means[best] / means[second])
-        text += f" {said[0].upper()}{said[1:]} ({number_text(means[best])} and {number_text(means[second])} mm)."
-    if row["moved_mm"] is not None:
-        text += f" A finer mesh moves the markers of the identified simulator by {number_text(row['moved_mm'])} mm."
-    blocks = []
-    if (pictures / f"{name}.png").is_file():
-        alt = f"The body of {robot['title']} and its markers."
-        blocks += [f"![{alt}]({pictures.name}/{name}.png)", "The simulated body."]
-    actuation = robot["actuation"]
-    blocks += [f"{actuation[:1].upper()}{actuation[1:]}. {robot['source']}", text]
-    if published := robot.get("published"):
-        blocks += ["Published:", _items(published)]
-    return [*blocks, f"- `{shlex.join(['warp-resphys', *row['arguments']])}`"]
-
-
-def _robots_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """Sentences on the robots that need a corrected simulator, and on those for which the learned force helps."""
-    if not results:
-        return "No run has succeeded."
-    gains = {name: (row["beside"] and row["beside"]["gain"], row["gains"]["resphys"]) for name, row in results.items()}
-    words = []
-    for which, of in ((0, [n for n, row in results.items() if row["beside"]]), (1, [*results])):
-        clear = [n for n in of if (g := gains[n][which]) and g["trials"] >= LEAST_TRIALS and g["lower"] > 0.0]
-        words.append(f"{len(clear)} of {len(of)} robots" + (f" ({in_a_row([*map(_title, clear)])})" if clear else ""))
-    few = [name for name, row in results.items() if len(row["tested"]) < LEAST_TRIALS]
-    return (
-        "By its 90 % interval over the held-out trials, a corrected simulator has less error than all other models "
-        f"(uncorrected, a network alone, without physics) on {words[0]} for which all of these were measured, and the "
-        f"learned force reduces the error of identification on {words[1]}."
-    ) + (f" {in_a_row([*map(_title, few)])}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")
-
-
-def _title(name: str) -> str:
-    return str(ROWS["robots"][name]["title"])
 
 
 def beams_page(runs: Sequence[Run], figures: Path) -> str:
@@ -368,16 +234,16 @@ def beams_page(runs: Sequence[Run], figures: Path) -> str:
         sections += [f"## {ROWS['beams'][name]['title']}"]
         sections += _errors_table(name, labels, columns) if name in PUBLISHED_MM else _markers_table(name, first)
         sections += [f"![{kind.replace('_', ' ')}]({figures.name}/{name}_{kind}.png)" for kind in kinds]
-        sections += ["Reasons for deviations:", _items(ROWS["beams"][name]["deviations"])]
+        sections += ["Reasons for deviations:", items(ROWS["beams"][name]["deviations"])]
         if name == "beam_oscillation":
             sections += ["## Time benchmark", *_time_table(labels, columns)]
     lines = []
     for run in runs:
         command = shlex.join(["warp-resphys", *run.arguments])
         lines.append(f"`{command}`: {run.failure or duration_text(sum(run.metrics['seconds'].values()))}")
-    sections += ["## Runs", _items(lines)]
+    sections += ["## Runs", items(lines)]
     made = {**hardware(), "commit": commit() or "not known", **package_versions()}
-    sections += ["## Machine and versions", _items(f"{key}: {value}" for key, value in made.items())]
+    sections += ["## Machine and versions", items(f"{key}: {value}" for key, value in made.items())]
     return "\n\n".join(["# Reproduction of the published beams", *sections])
 
 
@@ -395,7 +261,7 @@ def _errors_table(name: str, labels: Sequence[str], columns: Mapping[str, Run]) 
         "Mean distance of the vertices over all test trajectories and steps, ± its standard deviation. There is no "
         "mean if a roll-out diverged. Reconstruction: the simulator with forces fitted to the test trajectory itself."
     )
-    return [_table(["Roll-out error [mm]", *labels], rows), note]
+    return [table(["Roll-out error [mm]", *labels], rows), note]
 
 
 def _time_table(labels: Sequence[str], columns: Mapping[str, Run]) -> list[str]:
@@ -411,8 +277,12 @@ def _time_table(labels: Sequence[str], columns: Mapping[str, Run]) -> list[str]:
         ours = [text(own[key]["mean"], own[key]["std"], n) for own, n in zip(seconds, steps, strict=True)]
         rows.append([label, text(mean, std, timing["steps"]), *ours])
     note = f"Published: trajectories of {timing['steps']} steps; here: of {' and '.join(sorted({*map(str, steps)}))}."
-    table = _table(["Time per trajectory [s]", *labels], rows)
-    return [table, note, "Reasons for deviations:", _items(timing["deviations"])]
+    return [
+        table(["Time per trajectory [s]", *labels], rows),
+        note,
+        "Reasons for deviations:",
+        items(timing["deviations"]),
+    ]
 
 
 def _markers_table(name: str, run: Run) -> list[str]:
@@ -427,7 +297,7 @@ def _markers_table(name: str, run: Run) -> list[str]:
     uncorrected = number_text(run.metrics["uncorrected_mm"])
     note = f"Error over all vertices [mm] of random sets of markers on the surface. Uncorrected: {uncorrected} mm."
     heads = ["Published median", "Published spread", "Median here", "Interquartile range here", "Largest here"]
-    return [_table(["Markers", *heads], rows), note]
+    return [table(["Markers", *heads], rows), note]
 
 
 def copy_picture(folder: Path, patterns: Iterable[str], to: Path) -> None:
@@ -436,15 +306,6 @@ def copy_picture(folder: Path, patterns: Iterable[str], to: Path) -> None:
     if files:
         to.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(files[0], to)
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"|{'|'.join(cells)}|" if cells[0] == "---" else f"| {' | '.join(cells)} |" for cells in lines)
-
-
-def _items(texts: Iterable[str]) -> str:
-    return "\n".join(f"- {text}" for text in texts)
 
 
 def _write(path: Path, text: str) -> None:

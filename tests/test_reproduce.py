@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import reproduce
 
-from support.command_line import configuration
 from warp_resphys.io.errors import ResphysError
+from warp_resphys.overrides import composed
 from warp_resphys.report.wording import error_parts, number_text
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "reproduce.py"
@@ -70,16 +70,16 @@ def test_every_row_is_an_experiment():
     assert {robot["experiment"] for robot in reproduce.ROWS["robots"].values()} <= experiments
     assert {*reproduce.ROWS["beams"]} <= experiments
     every = [*reproduce.ROWS["robots"].values(), *reproduce.ROWS["variants"].values()]
-    assert configuration("config", *(override for row in every for override in row.get("overrides", ())))
+    assert composed("config", [override for row in every for override in row.get("overrides", ())])
     for name, beam in reproduce.ROWS["beams"].items():
-        assert configuration("config", f"experiment={name}", *beam.get("overrides", ())).get("law") is None
+        assert composed("config", [f"experiment={name}", *beam.get("overrides", ())]).get("law") is None
 
 
 def test_gains_and_the_best_models_are_those_of_the_trials():
     errors = {"rest": [9.0, 8.0], "simulation": [2.0, 2.0], "sysid": [1.0, 1.0], "resphys": [3.0, None]}
     pair = reproduce.beside(errors)
     assert (pair["corrected"], pair["other"], pair["gain"]["share"]) == ("sysid", "simulation", 0.5)
-    assert reproduce._gain(errors, "sysid", "resphys") is None
+    assert reproduce.gain_of(errors, "sysid", "resphys") is None
     kept = json.loads((DOCS / "robots.json").read_text())
     kept["sopra"]["gains"]["resphys"]["lower"] = -0.1
     page = reproduce.robots_page(kept, {"tentacle": "data.steps is -1"}, DOCS / "robots")

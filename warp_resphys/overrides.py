@@ -18,9 +18,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
+from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from .commands import CONFIG_PACKAGE, VALUED, quote, quote_name
 from .io.errors import InputError
@@ -88,6 +89,16 @@ def readable(arguments: Sequence[str], schema: Schema = MappingProxyType({})) ->
     overrides = [override for argument in rest for override in reader.overrides(argument)]
     read = [override for override in overrides if isinstance(override, str)]
     return [*map(arguments.__getitem__, options), *read], [one for one in overrides if isinstance(one, LateOverride)]
+
+
+def composed(name: str, arguments: Sequence[str] = ()) -> Any:
+    """Returns the values of a configuration, such as ``config`` for a run, as a command line composes them."""
+    words, late = readable(arguments)
+    with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
+        config = compose(name, words)
+    for override in late:
+        override.apply(config)
+    return OmegaConf.to_container(config, resolve=True)
 
 
 def _groups(arguments: Sequence[str]) -> set[str]:

@@ -7,28 +7,18 @@ yardstick, is timed with them, so that times over the yardstick can be compared 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from statistics import median
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
 from threadpoolctl import threadpool_limits
 
-from warp_resphys.commands import CONFIG_PACKAGE
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.dynamics.trajectory import Motion
 from warp_resphys.io.progress import Progress
-from warp_resphys.overrides import readable
 
 CPU: Final = torch.device("cpu")
 _SIZE: Final = 480  # of the yardstick's matrices
-
-
-def composed(name: str, overrides: Sequence[str]) -> Any:
-    """Returns the values of a configuration, as the command line composes them."""
-    with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
-        return OmegaConf.to_container(compose(name, readable(overrides)[0]), resolve=True)
 
 
 def now(device: torch.device = CPU) -> float:

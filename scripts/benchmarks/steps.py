@@ -2,9 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,11 +14,12 @@ from warp_resphys.experiment.build import build_body, build_simulator, choose_de
 from warp_resphys.io.machine import peak_memory_gib
 from warp_resphys.io.settings import parse
 from warp_resphys.linalg.threads import threads_for
+from warp_resphys.overrides import composed
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
 
-from .measuring import composed, free_unknowns, median_ms, now, solves, take_turns
+from .measuring import free_unknowns, median_ms, now, solves, take_turns
 
 Rows = list[dict[str, Any]]
 MATERIALS: Final[Mapping[str, Mapping[str, Any]]] = {
@@ -115,7 +114,7 @@ def run_settings(arguments: argparse.Namespace, *overrides: str) -> RunSettings:
 
 
 def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Times steps and their parts, and the environments of a run."""
+    """Times steps and their parts."""
     device = choose_device(arguments.device)
     settings = run_settings(arguments, *(FLOOR if arguments.floor else ()))
     cases = [*product(arguments.solvers, arguments.materials, arguments.batches or BATCHES[device.type])]
@@ -127,11 +126,7 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
         relative = {"yardsticks": (times["forward_ms"] + times["backward_ms"]) / yardstick}
         steps.append({**head, "unknowns": free_unknowns(simulator), **times, **relative})
         parts.append({**head, **part_times(simulator, batch, arguments.repeats)})
-    tables: dict[str, Any] = {"yardstick_ms": yardstick, STEPS: steps, "parts of an iteration": parts}
-    if arguments.run is not None:
-        counts = arguments.batches or (1, 16, 64)
-        tables["environments"] = environments(arguments.run, counts, arguments.repeats, str(device))
-    return tables
+    return {"yardstick_ms": yardstick, STEPS: steps, "parts of an iteration": parts}
 
 
 def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]:
@@ -154,26 +149,6 @@ def part_times(simulator: Simulator, batch: int, repeats: int) -> dict[str, Any]
     with threads_for(linear.n):  # as in a step
         times = {f"{name}_ms": median_ms(part, 5 * repeats, potential.device) for name, part in parts.items()}
     return {"linear_solver": type(linear).__name__, **times}
-
-
-def environments(run: Path, counts: Sequence[int], repeats: int, device: str) -> Rows:
-    """Times random actions of environments of a run with the task reach; an action is several steps.
-
-    Raises:
-        DataFileError: the folder has no run that can be loaded.
-    """
-    from warp_resphys.environments.making import make_vector
-
-    rows, random = Rows(), np.random.default_rng(0)
-    for count in counts:
-        robots = make_vector("reach", run, count, spread=0.0, seconds=100.0, device=device)
-        robots.reset(seed=0)
-        action = random.uniform(-1.0, 1.0, (count, robots.world.parts)).astype(np.float32)
-        robots.step(action)  # loads kernels and makes buffers
-        ms = median_ms(partial(robots.step, action), 5 * repeats)  # an action ends with states on the host
-        speed = 1e3 * count / ms
-        rows.append({"robots": count, "action_ms": ms, "actions_per_s": speed, "steps_per_s": speed * robots.frames})
-    return rows
 
 
 def measure_sizes(arguments: argparse.Namespace) -> dict[str, Any]:

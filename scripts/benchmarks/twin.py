@@ -11,10 +11,9 @@ from warp_resphys.io.errors import ConvergenceError, InputError, listed
 from warp_resphys.io.progress import Progress
 from warp_resphys.io.settings import parse
 from warp_resphys.linalg.threads import threads_for
+from warp_resphys.overrides import composed
 from warp_resphys.robot.loading import load, trial_names
 from warp_resphys.studies.live_twin import TwinSettings, trial_packets
-
-from .measuring import composed
 
 
 def measure_twin(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -8,12 +8,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 from unittest import mock
 
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
-
 from warp_resphys import cli
 from warp_resphys.io.settings import S, parse
-from warp_resphys.overrides import readable
+from warp_resphys.overrides import composed
 
 
 class Outcome(NamedTuple):
@@ -60,16 +57,6 @@ def refusal(*arguments: object) -> str:
     return refused.err
 
 
-def configuration(name: str, *overrides: str) -> dict:
-    """A configuration of the package as plain data."""
-    words, late = readable(overrides)
-    with initialize_config_module("warp_resphys.conf", version_base="1.3"):
-        config = compose(name, words)
-    for override in late:
-        override.apply(config)
-    return OmegaConf.to_container(config, resolve=True)
-
-
 def settings_of(settings: type[S], name: str, *overrides: str) -> S:
     """A configuration of the package, parsed into its class."""
-    return parse(settings, configuration(name, *overrides))
+    return parse(settings, composed(name, overrides))

@@ -3,7 +3,7 @@
 import copy
 import functools
 
-from support.command_line import configuration
+import warp_resphys.overrides
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.io.settings import parse
 from warp_resphys.settings.run import RunSettings
@@ -11,7 +11,7 @@ from warp_resphys.settings.run import RunSettings
 
 @functools.cache
 def _composed(*overrides):
-    return parse(RunSettings, configuration("config", *overrides)).plain()
+    return parse(RunSettings, warp_resphys.overrides.composed("config", overrides)).plain()
 
 
 def composed(*overrides):

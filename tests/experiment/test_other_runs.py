@@ -13,7 +13,7 @@ from warp_resphys.data.input_response import wave_inputs
 from warp_resphys.data.marker_view import MarkerView
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator
-from warp_resphys.experiment.report import read_recordings
+from warp_resphys.experiment.report import RunReader
 from warp_resphys.experiment.sensitivity import sensitivities
 from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
@@ -164,7 +164,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     robot = load(folder, "sysid")
     begun = robot.begin(muscle_stress=[0.0, 0.0, 0.0]).body.q[0]
     assert 0.0 < float((begun - robot.simulator.rest_positions).abs().max()) < 1e-4  # It lies where it lay.
-    recordings = read_recordings(folder, configured, robot.simulator.body.mesh, {})
+    recordings = RunReader(folder, configured).recordings(robot.simulator.body.mesh, {})
     assert set(recordings.beside) == {label for label in recordings.nominal if label.startswith("Floor")} != set()
 
 

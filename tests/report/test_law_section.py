@@ -24,7 +24,8 @@ from warp_resphys.report.law_section import (
     uniaxial_stress,
     wording,
 )
-from warp_resphys.report.run_page import range_texts
+from warp_resphys.report.page import Cell
+from warp_resphys.report.run_page import range_table
 from warp_resphys.report.wording import number_text
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.learning import LawSettings
@@ -116,8 +117,9 @@ def test_terms_that_the_law_does_not_have_are_named():
 
 def test_where_the_force_fades_out_the_law_remains():
     metrics = {"errors_mm": {"law": {}}, "range": {"resphys": {"first_s": {"up": 0.0}}}}
-    (left,) = range_texts(metrics, ["50 g", "up"])
-    assert left.endswith("from the start (up). There the learned force fades out, and the law remains.")
+    table = range_table(metrics, ["50 g", "up"])
+    assert table.rows[0].cells == [Cell("1 of 2", "from the start (up)")]
+    assert table.note.endswith("fades out, and the law remains.")
 
 
 @pytest.mark.parametrize("direction", [None, ALONG, ACROSS])

@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from warp_resphys.experiment.report import read_trials
+from warp_resphys.experiment.report import RunReader
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.safe_files import read_json
 from warp_resphys.report import figures
@@ -93,7 +93,7 @@ def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(tmp_path):
 @pytest.mark.usefixtures("no_drawing")
 def test_errors_of_exactly_zero_are_a_report(tmp_path):
     write_vertex_run(tmp_path, SETTINGS, models=("reconstruction",))
-    trials = read_trials(tmp_path, SETTINGS)
+    trials = RunReader(tmp_path, SETTINGS).trials
     trials.positions["reconstruction"][:] = trials.target
     figure = error_over_time(trials.errors_mm, trials.times[0])
     assert "zero, or diverged, throughout" in [text.get_text() for text in figure.axes[0].texts]
@@ -108,7 +108,7 @@ def test_poses_have_no_time(tmp_path):
     write_vertex_run(
         tmp_path, SETTINGS, steps=3, begins="static", models=("simulation", "resphys")
     )  # As beside motions.
-    assert not read_trials(tmp_path, SETTINGS).moves
+    assert not RunReader(tmp_path, SETTINGS).trials.moves
 
 
 def test_arrays_that_do_not_fit_are_refused(tmp_path):
@@ -117,7 +117,7 @@ def test_arrays_that_do_not_fit_are_refused(tmp_path):
     write_vertex_run(other, SETTINGS, steps=20)
     (other / "rollouts.h5").replace(tmp_path / "rollouts.h5")
     with pytest.raises(DataFileError, match="shape"):
-        read_trials(tmp_path, SETTINGS)
+        _ = RunReader(tmp_path, SETTINGS).trials
 
 
 @pytest.mark.usefixtures("no_drawing")

@@ -27,7 +27,7 @@ from warp_resphys.report.data import Driven, at_times
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.motions import instants
 from warp_resphys.report.page import Cell, PageTable, Row
-from warp_resphys.report.run_page import range_texts
+from warp_resphys.report.run_page import range_table
 from warp_resphys.report.sections import (
     gain_text,
     horizon_table,
@@ -49,6 +49,7 @@ from warp_resphys.report.wording import (
 )
 from warp_resphys.settings.learning import RangeSettings
 
+TIMES = "\N{MULTIPLICATION SIGN}"
 DOWN = np.array([0.0, 0.0, -9.8])
 
 
@@ -295,13 +296,14 @@ def test_trials_out_of_range_are_counted_where_they_belong():
             "1.25": {"resphys": none, "simfree": none},
         },
     }
-    free, force = (text.replace(NO_BREAK_SPACE, " ") for text in range_texts(metrics, ["a", "b", "c"]))
-    assert free.startswith("SimFree: none of 3 roll-outs")
-    assert "higher" not in free
-    assert "ResPhys: 2 of 3 roll-outs left the training range, the first after 1.00 s (a)." in force
-    assert "none of 3 (1.25 times), 1 of 3 (1.5 times), the first after 0.25 s (d)" in force
-    (alone,) = range_texts({"range": {"resphys": {"first_s": {"a": 0.5}}}}, ["a"])
-    assert alone.startswith("ResPhys: the roll-out left")
+    table = range_table({**metrics, "errors_mm": {}}, ["a", "b", "c"])
+    assert table.columns == ["Of the test trials", f"Inputs {TIMES} 1.25", f"Inputs {TIMES} 1.5"]
+    rows = {row.head: [(c.text, c.small.replace(NO_BREAK_SPACE, " ")) for c in row.cells] for row in table.rows}
+    assert rows == {
+        "SimFree": [("none of 3", "")] * 3,
+        "ResPhys": [("2 of 3", "after 1.00 s (a)"), ("none of 3", ""), ("1 of 3", "after 0.25 s (d)")],
+    }
+    assert range_table({}, ["a"]) is None
 
 
 def test_numbers_have_sensible_digits():

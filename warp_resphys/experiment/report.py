@@ -5,6 +5,7 @@ Functions that read a file raise a DataFileError if the file is missing or damag
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -65,45 +66,7 @@ def make_report(context: StageContext) -> None:
     """
     from ..report import run_page  # matplotlib
 
-    folder, run = context.run_dir, context.settings
-    metrics, truth = collect_metrics(folder, run), read_if_there(common_folder(folder) / TRUTH)
-    body = build_body(run, run.payload_at)
-    mesh = body.mesh
-    trials, identification = read_trials(folder, run), read_if_there(folder / IDENTIFICATION)
-    law = {} if run.law is None else read_if_there(folder / LAW_FILE)
-    film, driven = read_film(folder, run, mesh), read_driven(folder, run)
-    channels = () if driven is None else driven.channels
-    dataset = Trials.read(common_folder(folder) / DATASET)
-    moved = dataset.contact_at(trials.names, body, dataset.time_step)  # (K + 1, R, O) inputs, by name
-    assert run.tip is not None
-    names = {name for model in identification.values() for name in model.get("parameters", {})}
-    simulator = build_simulator(run, run.simulation, payload_at=run.payload_at)
-    no_vertices = np.empty(0, dtype=np.int64)
-    data = RunReport(
-        metrics=metrics,
-        settings=run,
-        mesh=body.mesh,
-        fixed=body.fixed_vertices,
-        tip=no_vertices if trials.labels else select_vertices(mesh, **run.tip.arguments()),
-        chambers=_driven_chambers(build_chambers(run.chambers, mesh), channels),
-        tendons=_routes(body),
-        obstacles=ObstacleSurface.of(body, identification.get("sysid", {}).get("parameters")),
-        moved={name: {key: values[:, row] for key, values in moved.items()} for row, name in enumerate(trials.names)},
-        trials=trials,
-        film=film,
-        driven=driven,
-        recordings=read_recordings(folder, run, *_at_rest(mesh, trials, film)),
-        identification=identification,
-        law=law,
-        **(read_stretches(folder, mesh, trials, film) if law else {}),
-        start=configured_parameters(simulator, sorted(names)),
-        truth={**truth.get("material", {}), **true_contact(run)},
-        training={
-            model: epochs for model in LEARNED if (epochs := read_if_there(folder / training_file(model)).get("epochs"))
-        },
-        followed=read_followed(folder, run),
-    )
-    run_page.write_report(folder / REPORT, data)
+    run_page.write_report(context.run_dir / REPORT, RunReader(context.run_dir, context.settings).report())
 
 
 def make_folds_report(context: StageContext) -> None:
@@ -115,15 +78,14 @@ def make_folds_report(context: StageContext) -> None:
     from ..report import run_page  # matplotlib
 
     folder, run = context.run_dir, context.settings
-    metrics = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}
-    body = build_body(run, run.payload_at)
+    metrics, reader = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}, RunReader(folder, run)
     data = RunReport(
         metrics=metrics,
         settings=run,
-        mesh=body.mesh,
-        fixed=body.fixed_vertices,
+        mesh=reader.body.mesh,
+        fixed=reader.body.fixed_vertices,
         pages={trial: f"{fold_folder(trial)}/{REPORT}" for trial in metrics["folds"]},
-        recordings=read_recordings(folder, run, body.mesh, {}),
+        recordings=reader.recordings(reader.body.mesh, {}),
     )
     run_page.write_report(folder / REPORT, data)
 
@@ -195,139 +157,234 @@ def true_contact(run: RunSettings) -> dict[str, float]:
     return truth
 
 
-def read_trials(folder: Path, run: RunSettings) -> TrialResults:
-    """Observations of the test trials of a split and roll-outs of the models, up to the evaluated duration.
+class RunReader:
+    """The files of a split, as plain data of its page; each is read once.
 
-    Roll-outs with scaled inputs are left out.
+    Args:
+        folder: of the split.
+        run: its settings.
 
     Raises:
-        DataFileError: a file is missing or damaged, or the dataset and the roll-outs do not belong together.
+        DataFileError: a file that is read is missing or damaged, or files do not belong together.
     """
-    path = common_folder(folder) / DATASET
-    dataset = Trials.read(path)
-    bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
-    with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
-        rolled = tuple(map(str, file.attrs["names"]))
-        scaled = _read_scaled(folder)
-        test = [name for name in rolled if scaled is None or name not in scaled.names]
-        errors = read_json(folder / ERRORS)
-        models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
-        unknown = sorted(set(test) - set(dataset.names))
-        if unknown or not models:
-            what = f"names trials that {path} does not hold ({', '.join(unknown)})" if unknown else "holds no model"
-            raise DataFileError(f"{folder / ROLLOUTS} {what}: delete it and run the same command again.")
-        shape = (len(rolled), *dataset.observed.shape[1:])
-        positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
-        spread = (*shape[:2], len(owners(dataset.labels)))
-        spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in models if f"{m}_spread" in file}
-    half_widths = half_widths_of(dataset, test, errors, positions, spreads)
-    markers = run.markers
-    unseen = None if markers is None else marker_view_of(markers, dataset.labels, dataset.sets).unseen
-    rows = dataset.rows(test)
-    times, target = dataset.times[rows], dataset.observed[rows]
-    begins = tuple(dataset.begins[row] for row in rows)
-    seconds, length = run.trial_seconds, times.shape[1]
-    if seconds is not None:
-        target = np.where((times <= seconds)[..., None, None], target, np.nan)
-        length = max(1, int((times <= seconds).any(axis=0).sum()))
-    if set(begins) == {STATIC}:  # Static poses beside motions are padded to the same number of frames.
-        length = 1
-    return TrialResults(
-        names=tuple(test),
-        labels=owners(dataset.labels),
-        begins=begins,
-        times=times[:, :length],
-        target=as_markers(target[:, :length], dataset.labels),
-        positions={model: as_markers(points[:, :length], dataset.labels) for model, points in positions.items()},
-        bound=as_markers(bound, dataset.labels),
-        gravity=dataset.gravity,
-        time_step=dataset.time_step,
-        half_widths={model: widths[:, :length] for model, widths in half_widths.items()},
-        axes=tuple(axis for axis in range(3) if axis != unseen),
-    )
 
+    def __init__(self, folder: Path, run: RunSettings) -> None:
+        self.folder, self.run, self.common = folder, run, common_folder(folder)
 
-def read_stretches(folder: Path, mesh: Mesh, trials: TrialResults, film: Film | None) -> dict[str, Any]:
-    """Principal stretches at the centres of the cells, for the section on the law.
+    @cached_property
+    def body(self) -> Body:
+        """The undeformed body."""
+        return build_body(self.run, self.run.payload_at)
 
-    Where markers are observed, the test trials are the body of the film, which is simulated.
+    @cached_property
+    def dataset(self) -> Trials:
+        """All trials of the split."""
+        return Trials.read(self.common / DATASET)
 
-    Returns:
-        ``stretches``: the least and the largest one in the test trials, and in the training of the law.
-        ``outside``: the share of cells and states of the test trials outside of the training; None if it is not known.
-    """
-    learned = read_if_there(folder / LAW_FILE).get("stretches")
-    trained = {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
-    if trials.labels and film is None:
-        return {"stretches": trained, "outside": None}
-    name, bodies = "all test trials", trials.target
-    if trials.labels and film is not None:
-        name, bodies = f"the trial {film.trial}", next(reversed([*film.positions.values()]))
-    values = principal_stretches(mesh, bodies.reshape(-1, *bodies.shape[-2:]))
-    outside = None if learned is None else share_outside(values, *trained["the training"])
-    return {"stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained}, "outside": outside}
+    @cached_property
+    def scaled(self) -> Trials | None:
+        """Trials with scaled inputs, if there are any."""
+        path = self.common / SCALED_DATASET
+        return Trials.read(path) if path.is_file() else None
 
+    def report(self) -> RunReport:
+        """Returns all data of the page."""
+        run, body, trials = self.run, self.body, self.trials
+        identification = read_if_there(self.folder / IDENTIFICATION)
+        law = {} if run.law is None else read_if_there(self.folder / LAW_FILE)
+        moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
+        assert run.tip is not None
+        names = {name for model in identification.values() for name in model.get("parameters", {})}
+        histories = {model: read_if_there(self.folder / training_file(model)).get("epochs") for model in LEARNED}
+        return RunReport(
+            metrics=collect_metrics(self.folder, run),
+            settings=run,
+            mesh=body.mesh,
+            fixed=body.fixed_vertices,
+            tip=np.empty(0, np.int64) if trials.labels else select_vertices(body.mesh, **run.tip.arguments()),
+            chambers=self._driven_chambers(),
+            tendons=_routes(body),
+            obstacles=ObstacleSurface.of(body, identification.get("sysid", {}).get("parameters")),
+            moved={name: {key: x[:, row] for key, x in moved.items()} for row, name in enumerate(trials.names)},
+            trials=trials,
+            film=self.film,
+            driven=self.driven,
+            recordings=self.recordings(*self._at_rest()),
+            identification=identification,
+            law=law,
+            **(self._stretches(law) if law else {}),
+            start=configured_parameters(build_simulator(run, run.simulation, payload_at=run.payload_at), sorted(names)),
+            truth={**read_if_there(self.common / TRUTH).get("material", {}), **true_contact(run)},
+            training={model: epochs for model, epochs in histories.items() if epochs},
+            followed=self._followed(),
+        )
 
-def _read_scaled(folder: Path) -> Trials | None:
-    """Trials with scaled inputs, if there are any."""
-    path = common_folder(folder) / SCALED_DATASET
-    return Trials.read(path) if path.is_file() else None
+    @cached_property
+    def trials(self) -> TrialResults:
+        """Observations of the test trials and roll-outs of the models, up to the evaluated duration.
 
+        Roll-outs with scaled inputs are left out.
+        """
+        dataset, run = self.dataset, self.run
+        bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
+        errors = read_json(self.folder / ERRORS)
+        with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
+            rolled = tuple(map(str, file.attrs["names"]))
+            test = [name for name in rolled if self.scaled is None or name not in self.scaled.names]
+            models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
+            unknown = sorted(set(test) - set(dataset.names))
+            if unknown or not models:
+                what = f"names trials that {self.common / DATASET} does not hold ({', '.join(unknown)})"
+                what = what if unknown else "holds no model"
+                raise DataFileError(f"{self.folder / ROLLOUTS} {what}: delete it and run the same command again.")
+            shape = (len(rolled), *dataset.observed.shape[1:])
+            spread, known = (*shape[:2], len(owners(dataset.labels))), [m for m in models if f"{m}_spread" in file]
+            positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
+            spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in known}
+        half_widths = half_widths_of(dataset, test, errors, positions, spreads)
+        unseen = None if run.markers is None else marker_view_of(run.markers, dataset.labels, dataset.sets).unseen
+        rows = dataset.rows(test)
+        times, target = dataset.times[rows], dataset.observed[rows]
+        begins = tuple(dataset.begins[row] for row in rows)
+        seconds, length = run.trial_seconds, times.shape[1]
+        if seconds is not None:
+            target = np.where((times <= seconds)[..., None, None], target, np.nan)
+            length = max(1, int((times <= seconds).any(axis=0).sum()))
+        if set(begins) == {STATIC}:  # Static poses beside motions are padded to the same number of frames.
+            length = 1
+        return TrialResults(
+            names=tuple(test),
+            labels=owners(dataset.labels),
+            begins=begins,
+            times=times[:, :length],
+            target=as_markers(target[:, :length], dataset.labels),
+            positions={model: as_markers(points[:, :length], dataset.labels) for model, points in positions.items()},
+            bound=as_markers(bound, dataset.labels),
+            gravity=dataset.gravity,
+            time_step=dataset.time_step,
+            half_widths={model: widths[:, :length] for model, widths in half_widths.items()},
+            axes=tuple(axis for axis in range(3) if axis != unseen),
+        )
 
-def read_film(folder: Path, run: RunSettings, mesh: Mesh) -> Film | None:
-    """Bodies of the film, placed as their markers are seen; None if there is no film."""
-    with read_hdf5(folder / ROLLOUTS, "rollouts") as file:
-        if "film_steps" not in file:
+    @cached_property
+    def film(self) -> Film | None:
+        """Bodies of the film, placed as their markers are seen; None if there is no film."""
+        dataset, run = self.dataset, self.run
+        with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
+            if "film_steps" not in file:
+                return None
+            steps = read_array(file, "film_steps", (None,)).astype(np.float64)
+            models = [model for model in MODELS if f"{model}_film" in file]
+            shape = (len(steps), None, 3)
+            bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
+            trial, times = str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps
+        if dataset.bound is not None and run.markers is not None:
+            view = marker_view_of(run.markers, dataset.labels, dataset.sets)
+            if view.own:
+                has = np.flatnonzero(dataset.present[dataset.names.index(trial)]).tolist()
+                markers = bound_markers(run.markers, self.body.mesh, dataset.bound, dataset.labels)
+                view, at = view.select(has), {model: torch.from_numpy(q) for model, q in bodies.items()}
+                bodies = {model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()}
+        return Film(trial, times, bodies)
+
+    @cached_property
+    def driven(self) -> Driven | None:
+        """Driving inputs of all trials; None without actuators."""
+        dataset, scaled, quantity = self.dataset, self.scaled, driving_quantity(self.run)
+        if quantity is None or quantity.name not in dataset.inputs:
             return None
-        steps = read_array(file, "film_steps", (None,)).astype(np.float64)
-        models = [model for model in MODELS if f"{model}_film" in file]
-        shape = (len(steps), None, 3)
-        bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
-        trial, times = str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps
-    dataset = Trials.read(common_folder(folder) / DATASET)
-    if dataset.bound is not None and run.markers is not None:
-        view = marker_view_of(run.markers, dataset.labels, dataset.sets)
-        if view.own:
-            has = np.flatnonzero(dataset.present[dataset.names.index(trial)]).tolist()
-            markers, view = bound_markers(run.markers, mesh, dataset.bound, dataset.labels), view.select(has)
-            at = {model: torch.from_numpy(positions) for model, positions in bodies.items()}
-            bodies = {model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()}
-    return Film(trial, times, bodies)
+        values: dict[str, Any] = {}
+        for trials in filter(None, (dataset, scaled)):
+            values |= dict(zip(trials.names, trials.inputs[quantity.name], strict=True))
+        return Driven(
+            quantity,
+            dataset.channels[quantity.name],
+            values,
+            self.run.input_limit,
+            scaled=() if scaled is None else scaled.names,
+            poses=tuple(n for n, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC),
+        )
 
+    def recordings(self, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:
+        """Returns quality and registration of all trials; None without recordings.
 
-def read_followed(folder: Path, run: RunSettings) -> list[FollowedPath]:
-    """Paths that controllers followed in a simulated laboratory; empty without control."""
-    if run.control is None or not run.is_laboratory:
-        return []
-    followed = []
-    with read_hdf5(folder / DRIVEN, "driven") as file:
-        controllers = [*map(str, file.attrs["controllers"])]
-        for name in map(str, file.attrs["names"]):
-            shape, seconds = name.removesuffix("s").rsplit("_", 1)
-            path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
-            points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
-            by_name = dict(zip(controllers, points, strict=True))
-            followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
-    return followed
+        Args:
+            mesh: mesh of the body at rest.
+            moved: (3,) displacements of the markers from the undeformed body to the body at rest [m], by label.
+        """
+        markers = self.run.markers
+        if markers is None:
+            return None
+        beside = [] if self.run.fixed is not None else [*markers.reference]
+        known: dict[str, Any] = {**markers.tracked, **markers.reference}
+        nominal = {label: np.add(place, moved.get(label, 0.0)) for label, place in known.items()}
+        quality, registered = (read_json(self.common / name) for name in (QUALITY, REGISTRATION))
+        return Recordings(quality, registered, nominal, beside, mesh)
 
+    def _stretches(self, law: Mapping[str, Any]) -> dict[str, Any]:
+        """Principal stretches at the centres of the cells, for the section on the law.
 
-def read_driven(folder: Path, run: RunSettings) -> Driven | None:
-    """Driving inputs of all trials of a split; None without actuators."""
-    dataset, scaled = Trials.read(common_folder(folder) / DATASET), _read_scaled(folder)
-    quantity = driving_quantity(run)
-    if quantity is None or quantity.name not in dataset.inputs:
-        return None
-    values: dict[str, Any] = {}
-    for trials in (dataset, *([] if scaled is None else [scaled])):
-        values |= dict(zip(trials.names, trials.inputs[quantity.name], strict=True))
-    return Driven(
-        quantity,
-        dataset.channels[quantity.name],
-        values,
-        run.input_limit,
-        scaled=() if scaled is None else scaled.names,
-        poses=tuple(n for n, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC),
-    )
+        Where markers are observed, the test trials are the body of the film, which is simulated.
+
+        Returns:
+            ``stretches``: the least and the largest one in the test trials, and in the training of the law.
+            ``outside``: the share of cells and states of the test trials outside of the training; None if it is not
+            known.
+        """
+        trials, film, learned = self.trials, self.film, law.get("stretches")
+        trained = {} if learned is None else {"the training": (float(learned[0]), float(learned[1]))}
+        if trials.labels and film is None:
+            return {"stretches": trained, "outside": None}
+        name, bodies = "all test trials", trials.target
+        if trials.labels and film is not None:
+            name, bodies = f"the trial {film.trial}", next(reversed([*film.positions.values()]))
+        values = principal_stretches(self.body.mesh, bodies.reshape(-1, *bodies.shape[-2:]))
+        outside = None if learned is None else share_outside(values, *trained["the training"])
+        return {
+            "stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained},
+            "outside": outside,
+        }
+
+    def _followed(self) -> list[FollowedPath]:
+        """Paths that controllers followed in a simulated laboratory; empty without control."""
+        if self.run.control is None or not self.run.is_laboratory:
+            return []
+        followed = []
+        with read_hdf5(self.folder / DRIVEN, "driven") as file:
+            controllers = [*map(str, file.attrs["controllers"])]
+            for name in map(str, file.attrs["names"]):
+                shape, seconds = name.removesuffix("s").rsplit("_", 1)
+                path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
+                points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)
+                by_name = dict(zip(controllers, points, strict=True))
+                followed.append(FollowedPath(name=shape, seconds=float(seconds), path=path, points=by_name))
+        return followed
+
+    def _driven_chambers(self) -> tuple[Chamber, ...]:
+        """Chambers under pressure, in the order of the pressures."""
+        by_name = {chamber.name: chamber for chamber in build_chambers(self.run.chambers, self.body.mesh)}
+        names = () if self.driven is None or not by_name else self.driven.channels
+        if unknown := [name for name in names if name not in by_name]:
+            raise DataFileError(
+                f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
+                f"{', '.join(by_name)}: use the mesh with which the trials were imported."
+            )
+        return tuple(by_name[name] for name in names)
+
+    def _at_rest(self) -> tuple[Mesh, dict[str, FloatArray]]:
+        """Mesh of the body at rest, and displacement (3,) of each marker there [m], by label.
+
+        If trials begin at rest, this is the equilibrium of the uncorrected simulator without inputs; otherwise the body
+        is undeformed.
+        """
+        mesh, trials, film, model = self.body.mesh, self.trials, self.film, "simulation"
+        if film is None or model not in film.positions or film.trial not in trials.names:
+            return mesh, {}
+        row = trials.names.index(film.trial)
+        if trials.begins[row] != "rest":
+            return mesh, {}
+        moved = trials.positions[model][row, 0] - trials.bound
+        return Mesh(film.positions[model][0], mesh.cells), dict(zip(trials.labels, moved, strict=True))
 
 
 def _routes(body: Body) -> dict[str, FloatArray]:
@@ -339,51 +396,3 @@ def _routes(body: Body) -> dict[str, FloatArray]:
         elif isinstance(energy, Muscles):
             routes |= energy.lines(body.mesh)
     return routes
-
-
-def _driven_chambers(chambers: tuple[Chamber, ...], names: tuple[str, ...]) -> tuple[Chamber, ...]:
-    """Chambers under pressure, in the order of the pressures."""
-    if not chambers:
-        return ()
-    by_name = {chamber.name: chamber for chamber in chambers}
-    unknown = [name for name in names if name not in by_name]
-    if unknown:
-        raise DataFileError(
-            f"{DATASET} has pressures of {', '.join(unknown)}, but the body's chambers are "
-            f"{', '.join(by_name) or 'none'}: use the mesh with which the trials were imported."
-        )
-    return tuple(by_name[name] for name in names)
-
-
-def _at_rest(mesh: Mesh, trials: TrialResults, film: Film | None) -> tuple[Mesh, dict[str, FloatArray]]:
-    """Mesh of the body at rest, and displacement (3,) of each marker there [m], by label.
-
-    If trials begin at rest, this is the equilibrium of the uncorrected simulator without inputs; otherwise the body is
-    undeformed.
-    """
-    model = "simulation"
-    if film is None or model not in film.positions or film.trial not in trials.names:
-        return mesh, {}
-    row = trials.names.index(film.trial)
-    if trials.begins[row] != "rest":
-        return mesh, {}
-    moved = trials.positions[model][row, 0] - trials.bound
-    return Mesh(film.positions[model][0], mesh.cells), dict(zip(trials.labels, moved, strict=True))
-
-
-def read_recordings(folder: Path, run: RunSettings, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:
-    """Quality and registration of all trials; None without recordings.
-
-    Args:
-        folder: folder of the split.
-        run: settings of the run.
-        mesh: mesh of the body at rest.
-        moved: (3,) displacements of the markers from the undeformed body to the body at rest [m], by label.
-    """
-    if run.markers is None:
-        return None
-    beside = [] if run.fixed is not None else [*run.markers.reference]
-    known: dict[str, Any] = {**run.markers.tracked, **run.markers.reference}
-    nominal = {label: np.add(place, moved.get(label, 0.0)) for label, place in known.items()}
-    quality, registered = (read_json(common_folder(folder) / name) for name in (QUALITY, REGISTRATION))
-    return Recordings(quality, registered, nominal, beside, mesh)

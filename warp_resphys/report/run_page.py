@@ -14,7 +14,7 @@ from .error_section import error_section, training_section
 from .identification_section import identification_section
 from .law_section import law_section
 from .motion_section import motion_section
-from .page import Canvas, Items, Part, Text, write_page
+from .page import Canvas, Cell, PageTable, Part, Row, Text, write_page
 from .sections import (
     details_table,
     horizons_section,
@@ -41,12 +41,7 @@ _MOST_LABELS: Final = 6  # Markers that are named one by one.
 
 
 def write_report(path: Path, data: RunReport) -> None:
-    """Writes the page, see `write_page`.
-
-    Args:
-        path: The page's file, such as `report.html`.
-        data: Data of the page.
-    """
+    """Writes the page, such as `report.html`, see `write_page`."""
     said = verdict(data.metrics, data.settings)
     write_page(path, lambda canvas: (s(data, canvas) for s in SECTIONS), data.settings, said, data.metrics)
 
@@ -61,9 +56,8 @@ def details_section(data: RunReport, canvas: Canvas) -> Part:
     synthetic = "laboratory" in data.settings.targets
     blocks: list[Any] = [Text(_WITHOUT_RECORDINGS, "synthetic")] if synthetic else []
     blocks += [details_table(data.metrics, data.settings), Text(_what_is_measured(data), "what", note=True)]
-    if ranges := range_texts(data.metrics, [] if data.trials is None else data.trials.names):
-        blocks.append(Text("Roll-outs outside the training range", heading=True))
-        blocks.append(Items(ranges, "ranges"))
+    ranges = range_table(data.metrics, () if data.trials is None else data.trials.names)
+    blocks += [] if ranges is None else [ranges]
     return Part("Errors in detail", blocks)
 
 
@@ -119,45 +113,29 @@ def _contributions(metrics: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def when_text(first: Mapping[str, float]) -> str:
-    """Returns when the first of some trials left the training range, in words; empty without any.
-
-    Args:
-        first: Times [s] by trial.
-    """
-    if not first:
-        return ""
-    if not any(first.values()):
-        return f", from the start ({', '.join(first)})"
-    earliest = min(first, key=lambda trial: first[trial])
-    return f", the first after {first[earliest]:.2f} s ({earliest})"
-
-
-def range_texts(metrics: Mapping[str, Any], trials: Sequence[str]) -> list[str]:
-    """Returns a sentence for each model on how many roll-outs left its training range, and when.
+def range_table(metrics: Mapping[str, Any], trials: Sequence[str]) -> PageTable | None:
+    """Returns how many roll-outs left the training range, and when the first one did; None where it is not known.
 
     Args:
         metrics: With `range`, by model, whose `first_s` has the times [s] at which trials left; and `scales_range`,
             the same by scale of the inputs. Both may be missing.
         trials: Names of the test trials.
     """
-    sentences = []
-    left_by, beyond = metrics.get("range", {}), metrics.get("scales_range", {})
-    for model in (model for model in MODELS if model in left_by):
-        first = left_by[model]["first_s"]
-        count = f"{len(first) or 'none'} of {len(trials)} roll-outs" if len(trials) > 1 else "the roll-out"
-        never = " never" * (len(trials) == 1 and not first)
-        text = f"{MODELS[model].name}: {count}{never} left the training range{when_text(first)}."
-        if model == "resphys" and first and "law" in metrics.get("errors_mm", {}):
-            text += " There the learned force fades out, and the law remains."
-        scales = [scale for scale in sorted(beyond, key=float) if float(scale) != 1.0]
-        left = {scale: beyond[scale][model]["first_s"] for scale in scales}
-        if any(left.values()):
-            counts = [f"{len(left[scale]) or 'none'} of {len(trials)} ({float(scale):g} times)" for scale in scales]
-            earliest = when_text({trial: time for times in left.values() for trial, time in times.items()})
-            text += f" At higher inputs: {', '.join(counts)}{earliest}."
-        sentences.append(unbroken(text))
-    return sentences
+    scales = {scale: left for scale, left in metrics.get("scales_range", {}).items() if float(scale) != 1.0}
+    columns = {f"Inputs \N{MULTIPLICATION SIGN} {float(scale):g}": scales[scale] for scale in sorted(scales, key=float)}
+    columns = {"Of the test trials": metrics.get("range", {}), **columns}
+
+    def cell(first: Mapping[str, float]) -> Cell:
+        earliest = min(first, key=lambda trial: first[trial], default="")
+        when = f"after {first[earliest]:.2f} s ({earliest})" if earliest and first[earliest] else ""
+        when = f"from the start ({', '.join(first)})" if first and not any(first.values()) else when
+        return Cell(f"{len(first) or 'none'} of {len(trials)}", unbroken(when))
+
+    models = [model for model in MODELS if model in metrics.get("range", {})]
+    rows = [Row(MODELS[m].name, [cell(left[m]["first_s"]) for left in columns.values()]) for m in models]
+    fades = any(metrics["range"][m]["first_s"] for m in models if m == "resphys") and "law" in metrics["errors_mm"]
+    note = "There the learned force of ResPhys fades out, and the law remains." if fades else ""
+    return PageTable("Left the training range, the first one", [*columns], rows, note) if rows else None
 
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (

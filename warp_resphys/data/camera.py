@@ -243,9 +243,9 @@ class PlacedCamera:
 def jacobians(function: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> list[torch.Tensor]:
     """Jacobians (P, D, C) of a function (P, D) of P rows by each of its inputs (P, C)."""
     with torch.enable_grad():
-        own = [values.detach().clone().requires_grad_() for values in inputs]
-        result = function(*own)
-        rows = [torch.autograd.grad(column.sum(), own, retain_graph=True) for column in result.unbind(-1)]
+        variables = [values.detach().clone().requires_grad_() for values in inputs]
+        result = function(*variables)
+        rows = [torch.autograd.grad(column.sum(), variables, retain_graph=True) for column in result.unbind(-1)]
     return [torch.stack(parts, 1) for parts in zip(*rows, strict=True)]
 
 

@@ -40,29 +40,29 @@ class ObstacleSurface:
             parameters: Identified values by name, such as `obstacle_x_bar`; others are zero.
         """
         known, points, triangles = parameters or {}, [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)]
-        energies = [energy for _, own, _ in body.members for energy in own.energies]
+        energies = [energy for _, part, _ in body.members for energy in part.energies]
         contacts = [energy for energy in energies if isinstance(energy, Contact)]
-        obstacles = [own for contact in contacts for own in contact.obstacles.items()]
+        obstacles = [item for contact in contacts for item in contact.obstacles.items()]
         for name, obstacle in obstacles:
-            own, faces = surface_of(obstacle, _value(known, GROWTH.name, name), body.vertices)
+            corners, faces = surface_of(obstacle, _value(known, GROWTH.name, name), body.vertices)
             triangles.append(faces + sum(map(len, points)))
-            points.append(own)
+            points.append(corners)
         offsets = np.array(
             [[_value(known, q.name, name) for q in (*SHIFT, *TURN)] for name, _ in obstacles], dtype=np.float64
         ).reshape(-1, 6)
         places = offsets[:, :3] + np.reshape([o.position for _, o in obstacles], (-1, 3))
         axes = np.reshape([o.turn for _, o in obstacles], (-1, 3, 3))
-        owners = np.repeat(np.arange(len(obstacles)), [len(own) for own in points[1:]])
+        owners = np.repeat(np.arange(len(obstacles)), [len(corners) for corners in points[1:]])
         poses = _poses(places, offsets[:, 3:], axes)
         return cls(np.concatenate(points), np.concatenate(triangles), owners, poses, offsets, axes)
 
     def moved(self, inputs: Mapping[str, FloatArray]) -> "ObstacleSurface":
         """Returns the obstacles where inputs (O,) or (T, O) of contact by name put them; itself without such inputs."""
-        given = [inputs.get(quantity.name) for quantity in MOTION]
-        if all(values is None for values in given):
+        by_axis = [inputs.get(quantity.name) for quantity in MOTION]
+        if all(values is None for values in by_axis):
             return self
         still = np.zeros(len(self.offsets))
-        moves = np.stack(np.broadcast_arrays(*(still if values is None else values for values in given)), axis=-1)
+        moves = np.stack(np.broadcast_arrays(*(still if values is None else values for values in by_axis)), axis=-1)
         places, turns = self.places + moves[..., :3], self.offsets[:, 3:] + moves[..., 3:]
         return replace(self, poses=_poses(places, turns, self.axes))
 
@@ -73,7 +73,7 @@ class ObstacleSurface:
 
     @property
     def moves(self) -> bool:
-        """Whether it is given at several times."""
+        """Whether it has poses at several times."""
         return self.poses.ndim == 3
 
     @property

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
-from ..mesh.plotting import Picture
+from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from .coordinates import Coordinates, SymmetryPlane, rigid_weights
@@ -230,12 +230,10 @@ class Body:
                 f"positions to draw have shape {q.shape}, and environment is {environment}: give {self.vertices.shape} "
                 "positions, or such an array for each environment."
             )
-        at, picture = np.asarray(q[environment] if q.ndim == 3 else q, dtype=np.float64), Picture(screenshot, plotter)
-        for _, own, first in self.members:
-            mesh = own.mesh
-            picture.add(at[first:][: own.n_vertices], mesh.cells, mesh.element, mesh.regions, **options)
-        picture.add_points(at[self.fixed_vertices])
-        return picture.finished()
+        at = np.asarray(q[environment] if q.ndim == 3 else q, dtype=np.float64)
+        meshes = ((at[first:][: own.n_vertices], own.mesh) for _, own, first in self.members)
+        parts = ((points, mesh.cells, mesh.element, mesh.regions) for points, mesh in meshes)
+        return plot_parts(parts, at[self.fixed_vertices], screenshot, plotter, **options)
 
     @property
     def n_vertices(self) -> int:

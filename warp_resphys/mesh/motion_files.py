@@ -91,7 +91,7 @@ def write_vtk(
     if obstacles:
         sizes = [surface.points.shape[1] for surface in obstacles]
         firsts, number = np.cumsum([0, *sizes[:-1]]), np.repeat(np.arange(len(sizes)), sizes)
-        triangles = np.concatenate([own.triangles + first for own, first in zip(obstacles, firsts, strict=True)])
+        triangles = np.concatenate([solid.triangles + first for solid, first in zip(obstacles, firsts, strict=True)])
         points = np.concatenate([surface.points for surface in obstacles], axis=1)
         place = path.with_name(f"{path.stem}_obstacles.pvd")
         _write_series(place, times, points, ("triangle", triangles), ({"obstacle": number} for _ in times))
@@ -145,16 +145,16 @@ def write_usd(
     root = UsdGeom.Xform.Define(stage, "/robot")
     stage.SetDefaultPrim(root.GetPrim())
     meshes = {"/robot/body": MovingSurface("body", q[:, surface], triangles)}
-    meshes |= {f"/robot/obstacles/{Tf.MakeValidIdentifier(own.name)}": own for own in obstacles}
+    meshes |= {f"/robot/obstacles/{Tf.MakeValidIdentifier(solid.name)}": solid for solid in obstacles}
     if obstacles:
         UsdGeom.Xform.Define(stage, "/robot/obstacles")
     surfaces: list[tuple[Any, FloatArray]] = []
-    for place, own in meshes.items():
+    for place, solid in meshes.items():
         shape = UsdGeom.Mesh.Define(stage, place)
         shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(own.triangles), 3, dtype=np.int32)))
-        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(own.triangles.astype(np.int32).ravel()))
-        surfaces.append((shape, own.points))
+        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(solid.triangles), 3, dtype=np.int32)))
+        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(solid.triangles.astype(np.int32).ravel()))
+        surfaces.append((shape, solid.points))
     if markers.shape[1]:
         dots = UsdGeom.Points.Define(stage, "/robot/markers")
         size = _MARKER_SHARE * float(np.ptp(mesh.vertices, axis=0).max())

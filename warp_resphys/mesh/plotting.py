@@ -1,12 +1,12 @@
-"""Pictures of meshes by pyvista, which is imported when it is first used."""
+"""Drawing of meshes by pyvista, which is imported when it is first used."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..io.arrays import FloatArray, IntArray
 from .elements import ELEMENTS, Element
 
 BODY: Final = "#a9bccf"
@@ -14,66 +14,50 @@ REGIONS: Final = ("#56b4e9", "#e69f00", "#009e73", "#cc79a7", "#f0e442", "#0072b
 FIXED: Final = "#33485e"
 _DOT: Final = 8.0  # px
 
+Part = tuple[FloatArray, IntArray, Element, Mapping[str, IntArray]]
 
-class Picture:
-    """A picture of one or more meshes.
+
+def plot_parts(
+    parts: Iterable[Part],
+    dots: FloatArray | None = None,
+    screenshot: str | Path | None = None,
+    plotter: Any = None,
+    **options: Any,
+) -> Any:
+    """Draws meshes with their regions in colours, and returns the plotter.
 
     Args:
+        parts: of each mesh the points (N, 3) [m]; its cells (M, K), of which the corners are drawn; their kind; and
+            cells by name of their region, of which later ones cover earlier ones.
+        dots: (P, 3) points drawn as dots [m].
         screenshot: PNG file to draw off screen; None: a window, or a viewer in a notebook.
         plotter: a ``pyvista.Plotter`` to add to, which is shown by the caller; None: a new one.
+        options: of ``pyvista.Plotter.add_mesh``.
     """
+    import pyvista
 
-    def __init__(self, screenshot: str | Path | None = None, plotter: Any = None) -> None:
-        import pyvista
-
-        self._file, self._given, self._named = screenshot, plotter is not None, False
-        self._plotter: Any = pyvista.Plotter(off_screen=screenshot is not None) if plotter is None else plotter
-
-    def add(
-        self,
-        points: NDArray[np.float64],
-        cells: NDArray[np.int64],
-        element: Element,
-        regions: Mapping[str, NDArray[np.int64]],
-        **options: Any,
-    ) -> None:
-        """Adds a mesh, with its regions in colours.
-
-        Args:
-            points: (N, 3) [m].
-            cells: (M, K) vertices.
-            element: kind of the cells, of which the corners are drawn.
-            regions: cells by name; later ones cover earlier ones.
-            options: of ``pyvista.Plotter.add_mesh``.
-        """
-        import meshio
-        import pyvista
-
-        names, linear = list(regions), ELEMENTS[element.linear]
-        corners = cells[:, : linear.nodes]
-        region = np.full(len(cells), -1)
+    drawn: Any = pyvista.Plotter(off_screen=screenshot is not None) if plotter is None else plotter
+    named = False
+    for points, cells, element, regions in parts:
+        names, linear, region = list(regions), ELEMENTS[element.linear], np.full(len(cells), -1)
         for number, name in enumerate(names):
             region[regions[name]] = number
         for number in np.unique(region).tolist():
-            used, numbered = np.unique(own := corners[region == number], return_inverse=True)
-            grid = pyvista.from_meshio(meshio.Mesh(points[used], [(linear.file_type, numbered.reshape(own.shape))]))
+            corners = cells[region == number, : linear.nodes]
+            used, numbered = np.unique(corners, return_inverse=True)
+            kind = getattr(pyvista.CellType, linear.file_type.upper())
+            grid = pyvista.UnstructuredGrid({kind: numbered.reshape(corners.shape)}, points[used])
             look = {"color": BODY if number < 0 else REGIONS[number % len(REGIONS)], "show_edges": True}
             label = None if number < 0 else names[number]
-            self._named |= label is not None
-            self._plotter.add_mesh(grid, **{**look, "label": label, **options})
-
-    def add_points(self, points: NDArray[np.float64]) -> None:
-        """Adds points (P, 3) [m] as dots."""
-        if len(points):
-            self._plotter.add_points(points, color=FIXED, point_size=_DOT, render_points_as_spheres=True)
-
-    def finished(self) -> Any:
-        """Shows or writes the picture, unless the plotter was given, and returns the plotter."""
-        if not self._given:
-            if self._named:
-                self._plotter.add_legend()
-            if self._file is None:
-                self._plotter.show()
-            else:
-                self._plotter.screenshot(str(self._file))
-        return self._plotter
+            named |= label is not None
+            drawn.add_mesh(grid, **{**look, "label": label, **options})
+    if dots is not None and len(dots):
+        drawn.add_points(dots, color=FIXED, point_size=_DOT, render_points_as_spheres=True)
+    if plotter is None:
+        if named:
+            drawn.add_legend()
+        if screenshot is None:
+            drawn.show()
+        else:
+            drawn.screenshot(str(screenshot))
+    return drawn

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import MeshError
 from .elements import BY_NODES, ELEMENTS, FACES, Element
-from .plotting import Picture
+from .plotting import plot_parts
 
 LARGEST_COORDINATE = 1e50  # in any unit; products of three coordinates must be finite
 DEGENERATE_VOLUME = 1e-12  # smallest volume of a cell, over the cube of its longest edge
@@ -102,9 +102,7 @@ class Mesh:
         points = self.vertices if positions is None else np.asarray(positions, dtype=np.float64)
         if points.shape != self.vertices.shape:
             raise MeshError(f"positions to draw have shape {points.shape}: give {self.vertices.shape}")
-        picture = Picture(screenshot, plotter)
-        picture.add(points, self.cells, self.element, self.regions, **options)
-        return picture.finished()
+        return plot_parts([(points, self.cells, self.element, self.regions)], None, screenshot, plotter, **options)
 
     def __repr__(self) -> str:
         """Sizes and regions."""

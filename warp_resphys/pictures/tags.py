@@ -41,7 +41,7 @@ def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[Fl
         np.ascontiguousarray(image[..., ::-1])
     )
     seen = [] if numbers is None else zip(corners, numbers.ravel(), strict=True)
-    found = [own[0] for own, number in seen if number == tag.number]
+    found = [seen_corners[0] for seen_corners, number in seen if number == tag.number]
     if not found:
         return []
     distortion = None if lens.distortion is None else lens.distortion.numpy()
@@ -52,7 +52,7 @@ def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[Fl
         distortion,
         flags=cv2.SOLVEPNP_IPPE_SQUARE,
     )
-    right, up = (own / np.linalg.norm(own) for own in (right, up))
+    right, up = (edge / np.linalg.norm(edge) for edge in (right, up))
     axes = np.stack([right, up, np.cross(right, up)])  # from the scene to the tag
     poses = []
     for turn, shift in zip(turns, shifts, strict=True):

@@ -100,9 +100,7 @@ class BodyPicture:
 def mesh_picture(summary: MeshSummary, markers: FloatArray | None = None) -> BodyPicture:
     """Returns a body from outside and cut open; and translucent, with chambers and tendons in colours, if it has any.
 
-    Args:
-        summary: The body.
-        markers: (M, 3) [m], drawn as dots in the uncut views.
+    Markers (M, 3) [m] are dots in the uncut views.
     """
     vertices, dots = summary.mesh.vertices, np.empty((0, 3)) if markers is None else markers
     shown = dots[np.isfinite(dots).all(axis=1)]
@@ -124,10 +122,7 @@ def mesh_picture(summary: MeshSummary, markers: FloatArray | None = None) -> Bod
 def _layers(summary: MeshSummary, markers: FloatArray, line: float) -> list[list[Layer]]:
     """Layers of the body from outside, of its half behind a plane along it, and of what is in the translucent body.
 
-    Args:
-        summary: The body.
-        markers: (M, 3) [m].
-        line: Width of a thin line [px].
+    Markers are (M, 3) [m]; a thin line has a width of `line` [px].
     """
     mesh, triangles = summary.mesh, boundary_triangles(summary.mesh)
     vertices, size = mesh.vertices, float(np.ptp(mesh.vertices, axis=0).max())
@@ -174,11 +169,8 @@ def registration_picture(recordings: Recordings, fixed: IntArray) -> BodyPicture
     """Returns a translucent body, its measured markers on stems, and rings at their nominal positions, from two sides.
 
     Lines connect rings with the markers outside of them. Names and residuals of these markers, and of those that were
-    left out of the fit, are written beside them.
-
-    Args:
-        recordings: Of which the trial that fits worst is drawn, without markers that were not seen.
-        fixed: Vertices of the clamped region.
+    left out of the fit, are written beside them. The trial that fits worst is drawn, without markers that were not
+    seen, and with the clamped region of fixed vertices.
     """
     mesh, fit = recordings.mesh, recordings.registered[recordings.worst]
     labels = [label for label in fit["positions"] if label in recordings.nominal]
@@ -238,7 +230,7 @@ def _framed(
     """Axes and middle of each view of points (P, 3), half the width and height (2,) of all [m], and their size [px]."""
     turned = [view_axes(towards) for towards in towards_viewer]
     frames = [frame_of(points, axes, _MARGIN) for axes in turned]
-    half = np.max([own for _, own in frames], axis=0)
+    half = np.max([size for _, size in frames], axis=0)
     half = np.maximum(half, _NARROWEST * half.max())
     placed = [(axes, focus) for axes, (focus, _) in zip(turned, frames, strict=True)]
     return placed, half, [int(side) for side in np.ceil(_LONGER_SIDE * half / half.max())]

@@ -235,9 +235,9 @@ def _band_note(data: RunReport, bands: Mapping[str, FloatArray]) -> str:
     if not bands:
         return ""
     intervals = data.metrics["intervals"]
-    (own,) = (intervals["models"][model] for model in bands)
+    (kept,) = (intervals["models"][model] for model in bands)
     return (
         f" The band should contain {100.0 * intervals['level']:.0f} % of the measured coordinates, and contains "
-        f"{100.0 * own['coverage']:.0f} % of them; it is ± {mm_text(own['half_width_mm'])} wide on average, from "
+        f"{100.0 * kept['coverage']:.0f} % of them; it is ± {mm_text(kept['half_width_mm'])} wide on average, from "
         f"{_CALIBRATED[intervals['calibrated_on']]}."
     )

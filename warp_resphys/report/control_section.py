@@ -42,12 +42,9 @@ def control_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def followed_paths(paths: Sequence[FollowedPath], controllers: Mapping[str, str], plane: FloatArray) -> Figure:
-    """Draws paths and the paths of the controlled point, side by side in their plane.
+    """Draws paths and the paths of the controlled point, side by side in their plane (2, 3): its width and height.
 
-    Args:
-        paths: Paths and points.
-        controllers: Names in words of the controllers that are drawn.
-        plane: (2, 3) directions of the width and of the height.
+    Controllers are drawn in the order of their names, with their names in words.
     """
     columns = min(_COLUMNS, len(paths))
     rows = -(-len(paths) // columns)

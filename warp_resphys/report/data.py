@@ -65,10 +65,10 @@ class TrialResults:
 
     def of_tip(self, tip: IntArray) -> "TrialResults":
         """Returns the same trials with the mean of some vertices (P,) as the only marker."""
-        target, bound, *own = (
+        target, bound, *simulated = (
             q[..., tip, :].mean(-2, keepdims=True) for q in (self.target, self.bound, *self.positions.values())
         )
-        positions = dict(zip(self.positions, own, strict=True))
+        positions = dict(zip(self.positions, simulated, strict=True))
         return replace(self, labels=("tip",), target=target, bound=bound, positions=positions)
 
 
@@ -159,7 +159,7 @@ class RunReport:
             return self.obstacles
         steps = self.trials.time_step * np.arange(len(next(iter(inputs.values()))))
         return self.obstacles.moved(
-            {name: np.stack([np.interp(times, steps, x) for x in own.T], axis=1) for name, own in inputs.items()}
+            {name: np.stack([np.interp(times, steps, x) for x in values.T], axis=1) for name, values in inputs.items()}
         )
 
     @property
@@ -198,12 +198,7 @@ def trial_errors(metrics: Mapping[str, Any], others: Collection[str] = (), outsi
 
 
 def grouped_errors(metrics: Mapping[str, Any], settings: RunSettings) -> dict[str, Errors]:
-    """Returns the errors on the held-out trials by the title of their group: as in training, then with other loads.
-
-    Args:
-        metrics: of a split or of folds.
-        settings: of the run.
-    """
+    """Returns the errors on the held-out trials by the title of their group: as in training, then with other loads."""
     others = other_trials(settings)
     groups = {title: trial_errors(metrics, others, at > 0) for at, title in enumerate(settings.test_titles)}
     if all(groups.values()):

@@ -47,7 +47,10 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
     if by_phase := metrics.get("phases"):
-        rows = {phase.capitalize(): {m: own["mean"] for m, own in models.items()} for phase, models in by_phase.items()}
+        rows = {
+            phase.capitalize(): {m: summary["mean"] for m, summary in models.items()}
+            for phase, models in by_phase.items()
+        }
         note = "Rise: the first half second after the inputs grew. Hold: after that. Release: after they fell."
         blocks.append(model_table("Phase; mean error [mm]", numbers(rows), metrics["errors_mm"], note))
     if turned := metrics.get("orientations_deg"):
@@ -60,11 +63,7 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def mesh_text(check: Mapping[str, Any]) -> str:
-    """Returns sentences on what a finer mesh changes.
-
-    Args:
-        check: Content of `mesh_check.json`.
-    """
+    """Returns sentences on what a finer mesh changes, from `mesh_check.json`."""
     if "failed" in check:
         return f"The error of the mesh is not known: {check['failed']}"
     cells, finer = check["cells"]
@@ -99,18 +98,18 @@ def error_over_time(
     figure, lowest = figures.new_figure(3.5), list[float]()
     every = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)
     for axes, (title, rows) in zip(every.flat, groups.items(), strict=True):
-        for model, own in errors.items():
-            held, line = ~np.isnan(own[rows]), figures.model_line(model)
-            count = held.sum(axis=0)
-            mean = np.where(count > 0, np.where(held, own[rows], 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+        for model, values in errors.items():
+            seen, line = ~np.isnan(values[rows]), figures.model_line(model)
+            count = seen.sum(axis=0)
+            mean = np.where(count > 0, np.where(seen, values[rows], 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
             shown = figures.positive(mean)
             if window is not None:
                 axes.plot(times, shown, color=line["color"], linewidth=0.6, alpha=0.45)
                 shown = figures.positive(median_filter(mean, float(times[1] - times[0]), window))
                 settled = shown[len(shown) // 10 :]
                 lowest += [float(np.nanmin(settled))] if np.isfinite(settled).any() else []
-            elif len(own[rows]) > 1 and (model == "sysid" or line["linestyle"] == "-"):
-                low, high = (figures.positive(extreme.reduce(own[rows], axis=0)) for extreme in (np.fmin, np.fmax))
+            elif len(values[rows]) > 1 and (model == "sysid" or line["linestyle"] == "-"):
+                low, high = (figures.positive(extreme.reduce(values[rows], axis=0)) for extreme in (np.fmin, np.fmax))
                 axes.fill_between(times, low, high, color=line["color"], alpha=0.15, linewidth=0)
             axes.plot(times, shown, **line)
         axes.set(title=title, xlabel="time [s]", xlim=(0.0, times[-1]))

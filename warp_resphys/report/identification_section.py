@@ -82,8 +82,7 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
 def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]]]]) -> Figure:
     """Draws the best loss so far over the evaluations of each start, with a panel for each identification.
 
-    Args:
-        histories: By identification: for every start its records with `loss`, one for each evaluation.
+    The starts of an identification have a record with `loss` for each evaluation.
     """
     figure = figures.new_figure(2.6)
     panels = list(figure.subplots(1, len(histories), sharey=True, squeeze=False).flat)
@@ -120,16 +119,16 @@ def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], tr
 
 def own_table(identified: Mapping[str, Any]) -> PageTable | None:
     """Returns the values of single trials and sessions, with their standard deviations; None if there are none."""
-    own, deviations = identified.get("own", {}), identified.get("own_deviation", {})
-    if not own:
+    values, deviations = identified.get("own", {}), identified.get("own_deviation", {})
+    if not values:
         return None
-    parameters = list(dict.fromkeys(split_name(name)[0] for name in own))
-    owners = list(dict.fromkeys(split_name(name)[1] for name in own))
+    parameters = list(dict.fromkeys(split_name(name)[0] for name in values))
+    owners = list(dict.fromkeys(split_name(name)[1] for name in values))
     wording = {parameter: parameter_wording(parameter) for parameter in parameters}
     rows = []
     for owner in owners:
         names = {own_name(parameter, owner): factor for parameter, (_, _, factor) in wording.items()}
-        cells = [identified_cell(own.get(name), factor, deviations.get(name)) for name, factor in names.items()]
+        cells = [identified_cell(values.get(name), factor, deviations.get(name)) for name, factor in names.items()]
         rows.append(Row(owner, cells))
     columns = [f"{words} [{unit}]" if unit else words for words, unit, _ in wording.values()]
     note = "Identified with the prior; of validation and test trials, from their first frames."
@@ -178,10 +177,7 @@ def digits(value: float | None, factor: float, deviation: float | None = None) -
 def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, float]) -> str:
     """Returns a sentence on the identified displacements of markers and recordings from their nominal positions.
 
-    Args:
-        name: Of the model.
-        placed: Its placement.
-        lengths: Of rigid bodies [m], by which an angle is a root mean square displacement of their points.
+    The angle of a rigid body is the root mean square displacement of its points over its length [m].
     """
     labels, offsets = [*placed["offsets"]], np.array([*placed["offsets"].values()])
     away = dict(zip(owners(labels), 1e3 * np.linalg.norm(as_markers(offsets, labels), axis=1), strict=True))
@@ -192,21 +188,15 @@ def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, f
         f"{furthest} the most, by {away[furthest]:.1f} mm; the recordings are shifted by {1e3 * shift:.1f} mm and "
         f"rotated by {math.degrees(turn):.1f}°"
     )
-    for body, own in corners_of(labels).items():
-        angle = root_mean_square(offsets[own] - offsets[own].mean(axis=0)) / lengths[body]
+    for body, corners in corners_of(labels).items():
+        angle = root_mean_square(offsets[corners] - offsets[corners].mean(axis=0)) / lengths[body]
         text += f"; {body} is turned by {math.degrees(angle):.1f}° on what carries it"
     text += "."
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
 def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, RangeSettings]) -> str:
-    """Returns sentences on the parameters that the data do not determine or separate; empty without uncertainties.
-
-    Args:
-        name: Of the model.
-        identified: Its identification.
-        ranges: Of the parameters, with their priors.
-    """
+    """Returns sentences on the parameters of a model that the data do not determine; empty without uncertainties."""
     uncertainty = identified.get("uncertainty")
     if not uncertainty:
         return ""

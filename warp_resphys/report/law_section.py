@@ -88,11 +88,7 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def law_text(law: Mapping[str, Any]) -> str:
-    """Returns a sentence on whether the identified law is used, and why.
-
-    Args:
-        law: From metrics.json, with `accepted`, `validation` and the model `against` which it was tested.
-    """
+    """Returns a sentence on whether the identified law of metrics.json is used, and why."""
     checked, base = law["validation"], model_words(law.get("against", "simulation"))
     where = f"{checked.get('split', 'validation')} trials ({', '.join(checked['trials'])})"
     head = f"The identified law is {'used' if law['accepted'] else 'not used'}"
@@ -248,17 +244,27 @@ def _classes(law: Mapping[str, Any]) -> list[Block]:
     tried = law.get("classes", ())
     if not tried:
         return []
-    weak = any(own.get("residual") is not None for own in tried)
+    weak = any(tried_class.get("residual") is not None for tried_class in tried)
     columns = ["Coefficients", *(["Force residual"] if weak else []), "Validation error"]
-    rows, chosen = [], next((own for own in tried if own["groups"] == law["groups"]), None)
-    for own in tried:
-        words = in_a_row([_GROUPS.get(group, group) for group in own["groups"]])
+    rows, chosen = [], next((tried_class for tried_class in tried if tried_class["groups"] == law["groups"]), None)
+    for tried_class in tried:
+        words = in_a_row([_GROUPS.get(group, group) for group in tried_class["groups"]])
         head = f"With {words}" if words else "Shape and volume alone (neo-Hookean)"
         cells = [
-            Cell(str(sum(wording(name)[0][1] not in _NOT_FACTORS for name, value in own["constants"].items() if value)))
+            Cell(
+                str(
+                    sum(
+                        wording(name)[0][1] not in _NOT_FACTORS
+                        for name, value in tried_class["constants"].items()
+                        if value
+                    )
+                )
+            )
         ]
-        cells += [Cell(_share(own.get("residual")))] if weak else []
-        rows.append(Row(head, [*cells, Cell(_share(own.get("validation")))], "chosen" * (own is chosen)))
+        cells += [Cell(_share(tried_class.get("residual")))] if weak else []
+        rows.append(
+            Row(head, [*cells, Cell(_share(tried_class.get("validation")))], "chosen" * (tried_class is chosen))
+        )
     note = (
         "Validation errors are root mean squares over the amplitude of the motion. The smallest class that was close "
         "enough to the best one was chosen"
@@ -301,11 +307,11 @@ def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
     """Returns the moduli of a material at small strains; None for one with regions."""
     if material.regions:
         return None
-    own = make_material(material.model, **material.constants)
+    elastic = make_material(material.model, **material.constants)
     if material.model == "law":
-        return small_strain({name: float(torch.as_tensor(value)) for name, value in own.constants.items()})
-    tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in own.constants.items()}
-    mu, lame = np.asarray(own.law.lame).T @ [float(modulus) for modulus in own.moduli(tensors)]
+        return small_strain({name: float(torch.as_tensor(value)) for name, value in elastic.constants.items()})
+    tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in elastic.constants.items()}
+    mu, lame = np.asarray(elastic.law.lame).T @ [float(modulus) for modulus in elastic.moduli(tensors)]
     return SmallStrain(float(mu), float(lame))
 
 

@@ -43,9 +43,7 @@ _LEVELS: Final = 255  # Of the errors of a model, from zero to the largest.
 def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion | None:
     """Returns the motion that is drawn: that of the film or, where vertices are observed, of the worst trial.
 
-    Args:
-        data: Data of the page.
-        every_model: Whether it has all models, rather than the two that are compared in pictures.
+    It has the two models that are compared in pictures, or every model.
     """
     trials, film = data.trials, data.film
     if trials is None:
@@ -168,14 +166,9 @@ def _instants_figure(
 
 
 def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], caption: str, alt: str) -> ViewInSpace:
-    """Returns the view of all bodies of a motion.
+    """Returns the view of all bodies of a motion, of which some models are shown at first.
 
-    Args:
-        name: Its identifier on the page.
-        motion: With a target, vertices are compared with it; without one, markers are compared.
-        shown: Models that are shown at first.
-        caption: Below the view.
-        alt: Description of the view.
+    With a target, vertices are compared with it; without one, markers are compared.
     """
     mesh, obstacles, surface = motion.mesh, motion.obstacles, surface_vertices(motion.mesh)
     rest, faces = mesh.vertices[surface], np.searchsorted(surface, boundary_triangles(mesh))

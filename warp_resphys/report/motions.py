@@ -84,7 +84,9 @@ class ComparedMotion:
     def at(self, frames: Sequence[int] | IntArray) -> "ComparedMotion":
         """Returns the motion at some of its frames."""
         chosen = np.asarray(frames, dtype=np.int64)
-        positions, markers = ({m: q[chosen] for m, q in own.items()} for own in (self.positions, self.markers))
+        positions, markers = (
+            {m: q[chosen] for m, q in by_model.items()} for by_model in (self.positions, self.markers)
+        )
         target = None if self.target is None else self.target[chosen]
         shown = replace(self, times=self.times[chosen], measured=self.measured[chosen], target=target)
         return replace(shown, positions=positions, markers=markers, obstacles=self.obstacles.at(chosen))

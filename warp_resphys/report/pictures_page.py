@@ -69,10 +69,10 @@ class PictureResult:
 
 def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
     """Returns what is best, by how much and on how many poses, and advice; of poses of the training without others."""
-    shown = [own for own in results if own.tested] or results
+    shown = [result for result in results if result.tested] or results
     errors = {model: _mean(shown, model) for model in _MODELS}
     best, second = sorted(("sysid", min(_NAMES, key=lambda model: errors[model])), key=lambda model: errors[model])
-    lower = sum(own.distance(best) < own.distance(second) for own in shown)
+    lower = sum(result.distance(best) < result.distance(second) for result in shown)
     names = {"sysid": "the identified simulator", **_NAMES}
     share, which = (
         share_text(1.0 - errors[best] / errors[second]),
@@ -83,7 +83,9 @@ def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
     doubts = [] if shown[0].tested else ["no pose was kept back"]
     if abs(errors["sysid"] - errors["simulation"]) < (1.0 - _BETTER) * errors["simulation"]:
         doubts.append("these poses hardly depend on the material, and do not test it")
-    if lost := [own.pose for own in results if (common := own.overlap["sysid"]) is not None and common < _COVERED]:
+    if lost := [
+        result.pose for result in results if (common := result.overlap["sysid"]) is not None and common < _COVERED
+    ]:
         doubts.append(f"{listed(lost)} hardly overlap: check the camera, the mesh and the mask")
     advice = [f"Check before use: {'; '.join(doubts)}."] if doubts else []
     return [f"{text[0].upper()}{text[1:]}.", *advice]
@@ -122,11 +124,13 @@ def write_pictures_report(
     played, as_played = settings.simulated, {**dict.fromkeys(TILTS, 0.0), **NEUTRAL}
     truth = {} if played is None else {**as_played, **start, **played.material, **played.corrections}
     columns = ["Data sheet", "Identified", *(["True"] if truth else []), "At a bound"]
-    panels = [(own, picture(own.pose, own.drawn)) for own in results if own.outline_mm["sysid"] is not None]
-    clouds = [own for own in results if own.cloud_mm["sysid"] is not None]
+    panels = [
+        (result, picture(result.pose, result.drawn)) for result in results if result.outline_mm["sysid"] is not None
+    ]
+    clouds = [result for result in results if result.cloud_mm["sysid"] is not None]
     # Pictures without outlines are shown as well, where there is nothing else to see.
-    panels = panels or [(own, picture(own.pose, own.drawn)) for own in results if not clouds]
-    up = [-np.array(settings.poses[own.pose].gravity or run.gravity) for own in clouds]
+    panels = panels or [(result, picture(result.pose, result.drawn)) for result in results if not clouds]
+    up = [-np.array(settings.poses[result.pose].gravity or run.gravity) for result in clouds]
 
     def sections(canvas: Canvas) -> Iterator[Part]:
         drawn: list[Block] = [draw_outlines(panels, outlines, canvas.folder / "outlines.png")] if panels else []
@@ -158,7 +162,7 @@ def distance_table(results: Sequence[PictureResult]) -> PageTable:
     others = {
         name: key
         for name, key in others.items()
-        if any(getattr(own, key)["sysid"] not in (None, own.distance("sysid")) for own in results)
+        if any(getattr(result, key)["sysid"] not in (None, result.distance("sysid")) for result in results)
     }
     rows = []
     for result in results:
@@ -176,12 +180,7 @@ def _text(value: float | None) -> str:
 
 
 def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], outlines: Path, path: Path) -> Drawn:
-    """Draws the outlines on the middle picture of every pose into a PNG file.
-
-    Args:
-        panels: results with their pictures (H, W, 3).
-        outlines: file of the outlines.
-        path: of the PNG file.
+    """Draws the outlines in a file on the middle picture (H, W, 3) of every pose, into a PNG file.
 
     Raises:
         DataFileError: the file of the outlines is damaged.
@@ -230,18 +229,15 @@ def draw_outlines(panels: Sequence[tuple[PictureResult, NDArray[np.uint8]]], out
 def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Path, path: Path) -> Drawn:
     """Draws the first cloud of every pose on the body of each model into a PNG file, in colours of the distance.
 
-    Args:
-        panels: results, with the direction (3,) upwards.
-        outlines: file with the clouds.
-        path: of the PNG file.
+    Poses have the direction (3,) upwards.
 
     Raises:
-        DataFileError: the file is damaged.
+        DataFileError: the file with the clouds is damaged.
     """
     clouds = list[tuple[PictureResult, list[tuple[FloatArray, ...]]]]()
     with read_hdf5(outlines, "outlines") as file:
         for result, up in panels:
-            number = next(own for own in file[result.pose] if f"{_FIRST}_places" in file[f"{result.pose}/{own}"])
+            number = next(frame for frame in file[result.pose] if f"{_FIRST}_places" in file[f"{result.pose}/{frame}"])
             clouds.append((result, _seen_from_the_side(file[f"{result.pose}/{number}"], up)))
     most = max(float(np.quantile(distances, _SHOWN)) for _, seen in clouds for _, distances, _ in seen[1:])
     figure = Figure(figsize=(len(_MODELS) * _CLOUD_PANEL, len(clouds) * _CLOUD_PANEL * 0.8), layout="constrained")
@@ -267,7 +263,9 @@ def draw_clouds(panels: Sequence[tuple[PictureResult, FloatArray]], outlines: Pa
         "Measured points on the simulated body (grey) as seen from the side, above with the mean of their distances: "
         "the undeformed body, the simulator with the parameters of the data sheet, and the identified one."
     )
-    alt = "; ".join(f"{own.pose}: {', '.join(_text(own.cloud_mm[model]) for model in _MODELS)} mm" for own, _ in panels)
+    alt = "; ".join(
+        f"{result.pose}: {', '.join(_text(result.cloud_mm[model]) for model in _MODELS)} mm" for result, _ in panels
+    )
     return Drawn.of(path, f"Clouds of points on bodies. Mean distances of the three models: {alt}.", caption)
 
 

@@ -39,25 +39,24 @@ def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
     """Returns the errors of all models with their deviations and intervals, beside those that were published.
 
     With two groups of test trials, each has a column; published errors are of trials as in training.
-
-    Args:
-        metrics: Of a split or of folds.
-        settings: Of the run.
     """
     errors, groups, idle = metrics["errors_mm"], grouped_errors(metrics, settings), untrained(metrics)
     published = published_beside(published_errors(settings.name), list(errors))
-    beside = {"Published": {model: Cell.of(own) for model, own in published.items()}}
+    beside = {"Published": {model: Cell.of(error) for model, error in published.items()}}
     columns: dict[str, dict[str, Cell]] = {}
     if len(groups) > 1:
-        parts = {title: {m: error_cell(x, with_interval=True) for m, x in own.items()} for title, own in groups.items()}
+        parts = {
+            title: {m: error_cell(x, with_interval=True) for m, x in by_model.items()}
+            for title, by_model in groups.items()
+        }
         first, last = parts.items()
         columns = dict([first, *beside.items(), last])
     else:
         reconstructed = metrics.get("errors_vs_reconstruction_mm", {})
-        own: Errors = next(iter(groups.values()), {})
+        by_model: Errors = next(iter(groups.values()), {})
         columns = {
             "Mean error": {model: Cell.of(error_parts(summary)) for model, summary in errors.items()},
-            "90 % interval": {m: Cell(text) for m, x in own.items() if (text := interval_text(x))},
+            "90 % interval": {m: Cell(text) for m, x in by_model.items() if (text := interval_text(x))},
             "Against the reconstruction": {m: Cell.of(error_parts(summary)) for m, summary in reconstructed.items()},
             **beside,
         }
@@ -66,7 +65,7 @@ def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
     for model, (name, meaning, _) in MODELS.items():
         if model in errors or model in published or model in missing:
             small = "no force: no epoch of its training was kept" if model in idle else missing.get(model, meaning)
-            rows.append(Row(name, [own.get(model, Cell(NONE)) for own in columns.values()], small=small))
+            rows.append(Row(name, [by_model.get(model, Cell(NONE)) for by_model in columns.values()], small=small))
     return PageTable("All models [mm]", list(columns), rows)
 
 
@@ -128,18 +127,13 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     note += " Each trial links to the page of the fold in which it is the test." if data.pages else ""
     tables = [model_table("Test trial [mm]", rows, data.metrics["errors_mm"], note, data.pages, small)] if rows else []
     fits = [fold["free_fits"] for fold in folds if "free_fits" in fold]
-    merged = {model: [row for own in fits for row in own.get(model, ())] for model in _CHAIN}
+    merged = {model: [row for by_model in fits for row in by_model.get(model, ())] for model in _CHAIN}
     tables += rest_table(merged, data.driven)
     return Part("Trial by trial", tables) if tables else None
 
 
 def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven | None) -> list[PageTable]:
-    """Returns a table of what could explain the errors that remain; empty without fits.
-
-    Args:
-        fits: Of metrics.json, by model; the model with the smallest error is shown.
-        driven: Inputs that drive the trials.
-    """
+    """Returns a table of what could explain the remaining error of the model that has the least; empty without fits."""
     means = {model: fmean(row["as_is_mm"] for row in rows) for model, rows in fits.items() if rows}
     model = min(means, key=lambda name: means[name], default="")
     shown = [key for key in _REFITTED if any(key in row["left_mm"] for row in fits.get(model, ()))]
@@ -169,12 +163,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven |
 
 
 def gain_text(fits: Sequence[Mapping[str, Any]], driven: Driven) -> str:
-    """Returns what the refitted gains suggest; empty with fewer than three inputs, or where they remove little error.
-
-    Args:
-        fits: Of a model, by trial.
-        driven: Inputs of the trials.
-    """
+    """Returns what refitted gains suggest; empty with fewer than three inputs, or where they remove little error."""
     known = [row for row in fits if "scale" in row["values"] and row["name"] in driven.values]
     sizes = np.array([float(np.abs(driven.values[row["name"]]).max()) for row in known])
     gains = np.array([100.0 * row["values"]["scale"] for row in known])
@@ -203,11 +192,9 @@ def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 
 def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
-    """Returns the errors over the first seconds of the roll-outs, with published ones below.
+    """Returns the errors over the first seconds of the roll-outs, with published ones below; None without any.
 
-    Args:
-        metrics: With `horizons` (a summary by seconds and model); None is returned without them.
-        published: Published errors by seconds and model.
+    Both the metrics' `horizons` and the published errors are by seconds and model.
     """
     horizons, rows = metrics.get("horizons", {}), {}
     for horizon in sorted(horizons, key=float):
@@ -241,10 +228,10 @@ def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
     mounted = {trial: fit["mounting"] for trial, fit in residuals.items() if "mounting" in fit}
     if not mounted:
         return None
-    names = list(dict.fromkeys(name for own in mounted.values() for name in own))
+    names = list(dict.fromkeys(name for poses in mounted.values() for name in poses))
     rows = []
-    for trial, own in mounted.items():
-        known = [own.get(name) for name in names]
+    for trial, poses in mounted.items():
+        known = [poses.get(name) for name in names]
         cells = [(f"{x['distance_mm']:.2f}", f"{x['angle_deg']:.2f}") if x else (NONE, NONE) for x in known]
         rows.append(Row(trial, [Cell(text) for pair in cells for text in pair]))
     columns = [f"{name} [{unit}]" for name in names for unit in ("mm", "degrees")]
@@ -270,7 +257,7 @@ def residual_table(residuals: Mapping[str, Any]) -> PageTable:
         rows = [Row(t, [*(cell(fit, label) for label in labels), rms[t]]) for t, fit in residuals.items()]
         return PageTable(head, [*labels, last], rows, note)
     known = {t: {x: mm for x, mm in fit["residual_mm"].items() if mm is not None} for t, fit in residuals.items()}
-    worst = {t: max(own, key=own.__getitem__) for t, own in known.items()}
+    worst = {t: max(by_marker, key=by_marker.__getitem__) for t, by_marker in known.items()}
     rows = [Row(t, [cell(fit, worst[t]), Cell(worst[t]), rms[t]]) for t, fit in residuals.items()]
     return PageTable(head, ["Largest", "Marker", last], rows, note)
 

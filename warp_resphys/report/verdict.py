@@ -60,8 +60,10 @@ class Doubt(NamedTuple):
 
 def known_errors(errors: Errors, without: Collection[str] = ()) -> Known:
     """Returns the errors of the models whose roll-outs are all defined, without some models."""
-    finite = {m: [x for x in own if x is not None] for m, own in errors.items() if m in _RANKED and m not in without}
-    return {model: own for model, own in finite.items() if own and len(own) == len(errors[model])}
+    finite = {
+        m: [x for x in values if x is not None] for m, values in errors.items() if m in _RANKED and m not in without
+    }
+    return {model: values for model, values in finite.items() if values and len(values) == len(errors[model])}
 
 
 def best_of(known: Known, models: Collection[str]) -> str:
@@ -77,14 +79,12 @@ def best_pair(known: Known) -> tuple[str, str]:
 def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
     """Returns the mean errors, with a column for each group of test trials and each factor of the inputs.
 
-    Of the models without physics, the best one of each column is shown.
-
-    Args:
-        metrics: metrics.json of a split or of folds.
-        settings: of the run.
+    Of the models without physics, the best one of each column is shown. The metrics are of a split or of folds.
     """
     groups, idle = grouped_errors(metrics, settings), untrained(metrics)
-    columns = {title: {model: error_cell(own) for model, own in errors.items()} for title, errors in groups.items()}
+    columns = {
+        title: {model: error_cell(by_model) for model, by_model in errors.items()} for title, errors in groups.items()
+    }
     plain = {title: best_of(known_errors(errors), BASELINES) for title, errors in groups.items()}
     for scale, errors in sorted(metrics.get("scales", {}).items(), key=lambda item: float(item[0])):
         if float(scale) != 1.0:
@@ -99,9 +99,9 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
         cells = [columns[title].get(model, Cell("")) for title, model in plain.items()]
         rows.append(Row(f"without physics ({', '.join(named)})", cells, mark * (best in BASELINES)))
     rows += [
-        Row(text, [own.get(model, Cell("")) for own in columns.values()], mark * (model == best))
+        Row(text, [by_model.get(model, Cell("")) for by_model in columns.values()], mark * (model == best))
         for model, text in _ROWS.items()
-        if any(model in own for own in columns.values())
+        if any(model in by_model for by_model in columns.values())
     ]
     of = "vertices" if settings.markers is None else "markers"
     lacking = [f"{model_words(model)} ({why})" for model, why in missing_baselines(metrics).items()]
@@ -139,12 +139,7 @@ def less_error(best: str, second: str, share: float) -> str:
 
 
 def verdict(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
-    """Returns a sentence on what is best, by how much and on how many trials, and at most two sentences of advice.
-
-    Args:
-        metrics: metrics.json of a split or of folds.
-        settings: of the run.
-    """
+    """Returns a sentence on what is best, by how much and on how many trials, and at most two sentences of advice."""
     groups, idle = [*grouped_errors(metrics, settings).values()], untrained(metrics)
     if not groups or not {*_RANKED} & groups[-1].keys():
         return []
@@ -226,10 +221,10 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
     folds, count = folds_in(metrics), len(next(iter(known.values()), ()))
     error = fmean(known[model]) if model else math.inf
     placed = [fold["placement"] for fold in folds if "placement" in fold]
-    if (turned := max((own["turned_deg"] for own in placed), default=0.0)) > _TURNED:
+    if (turned := max((placement["turned_deg"] for placement in placed), default=0.0)) > _TURNED:
         text = f"the markers are rotated by {turned:.1f}° from their registration"
         yield Doubt(text, "check the positions and axes of the markers")
-    if (rms := max((own["rms_mm"] for own in placed), default=0.0)) > error:
+    if (rms := max((placement["rms_mm"] for placement in placed), default=0.0)) > error:
         yield Doubt(f"the markers at rest fit their positions to {mm_text(rms)} only", "measure the positions again")
     checks = [fold["mesh_check"] for fold in folds if "moved_mm" in fold.get("mesh_check", {})]
     base = checks[0]["model"] if checks and model in ("law", "resphys") else "simulation"  # that the model improves
@@ -260,12 +255,12 @@ def _bounds(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> It
     for model, group in _GROUPS.items():
         ranges = (None if settings is None else getattr(settings, group)) or {}
         start, values = (metrics.get(key, {}).get(model, {}) for key in ("first_guesses", "parameters"))
-        for name, own in ((name, own) for name, own in ranges.items() if name in values):
-            key, close = f"identify.{group}.{name}", _CLOSE * (own.upper - own.lower)
-            ends = {end: getattr(own, end) for end in ("lower", "upper")}
+        for name, limits in ((name, limits) for name, limits in ranges.items() if name in values):
+            key, close = f"identify.{group}.{name}", _CLOSE * (limits.upper - limits.lower)
+            ends = {end: getattr(limits, end) for end in ("lower", "upper")}
             if end := next((end for end, bound in ends.items() if abs(values[name] - bound) <= close), ""):
                 mend = f"widen {key}.{end}" if ends[end] else f"remove it from the fit (~{key})"
                 yield Doubt(f"{in_sentence(name)} is at its {end} bound, {with_unit(name, ends[end])}", mend)
-            elif own.prior is None and abs(values[name] - start.get(name, math.nan)) <= close:
+            elif limits.prior is None and abs(values[name] - start.get(name, math.nan)) <= close:
                 fact = f"{in_sentence(name)} stayed at its first guess, {with_unit(name, values[name])}"
                 yield Doubt(fact, "raise identify.starts")

@@ -236,9 +236,9 @@ class LiveTwin:
             packets, now = list(self._listener.packets()), time.perf_counter()
             if len(packets) > 1 and now - self._drained > _BEHIND:
                 self.twin.restart("after it had fallen behind")
-                held = {name: value for packet in packets for name, value in packet.inputs.items()}
+                latest = {name: value for packet in packets for name, value in packet.inputs.items()}
                 plans = [packet.plan for packet in packets if packet.plan is not None]
-                packets = [replace(packets[-1], inputs=held, plan=plans[-1] if plans else None)]
+                packets = [replace(packets[-1], inputs=latest, plan=plans[-1] if plans else None)]
             self._drained = now
             yield from packets
             return

@@ -29,13 +29,10 @@ from .experiment.duration import announcement
 from .experiment.evaluate import evaluate
 from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.folds import Fold, run_folds, workers_for
-from .experiment.identify import identify
-from .experiment.identify_law import identify_law
 from .experiment.laboratory import run_laboratory
-from .experiment.learn import train
+from .experiment.learning_stages import identify, identify_law, reconstruct, train
 from .experiment.mesh_check import check_mesh
 from .experiment.prediction_intervals import intervals_of_folds
-from .experiment.reconstruct import reconstruct
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes

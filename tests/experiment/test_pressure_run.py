@@ -16,7 +16,7 @@ from support.segment_run import TRACKED, place_segment
 from warp_resphys import pipeline
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.trials import Trials
-from warp_resphys.experiment import learn
+from warp_resphys.experiment import learning_stages
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.errors import ResphysError
@@ -111,7 +111,7 @@ def test_forces_are_learned_as_they_are_in_the_rest_shape(finished, monkeypatch)
         keep = lambda network, train, *rest, frame=frame: learned.update({frame: train})  # noqa: E731
         monkeypatch.setattr(fitting, "Trainer", keep)
         experiment = Experiment(stage.model_copy(update={"force_frame": frame}), finished)
-        assert learn.fitting_of(experiment, "resphys").trainer(stage.training)[1].force_frame == frame
+        assert learning_stages.fitting_of(experiment, "resphys").trainer(stage.training)[1].force_frame == frame
     turned, kept = (learned[frame] for frame in ("corotated", "world"))
     frames = force_frames(experiment.model_simulator("resphys"), "corotated")
     size = float(kept.outputs[0].abs().max())

@@ -21,7 +21,7 @@ from optuna.trial import BaseTrial, FixedTrial, Trial, TrialState
 from sqlalchemy.exc import SQLAlchemyError
 
 from ..experiment.experiment import LEARNED, Experiment
-from ..experiment.learn import fitting_of
+from ..experiment.learning_stages import fitting_of
 from ..experiment.splits import folds_of, split_of
 from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.progress import show

@@ -1,0 +1,168 @@
+"""Stages of the learning: each reads files, calls a function of the library and writes files."""
+
+import math
+
+import numpy as np
+
+from ..data.rigid_bodies import corners_of
+from ..data.trials import Trials, evenly
+from ..energies.catalogue import read_law
+from ..io.fan_out import ALONE, Workers
+from ..io.parts import Checkpoint, Parts
+from ..io.resuming import StageContext, package_versions
+from ..io.safe_files import atomic_hdf5, create, resume_checkpoint, write_checkpoint, write_json
+from ..learning import identification, law_search, reconstruction
+from ..learning.fitting import Fitting, Snapshot, fit
+from ..learning.placement import Accuracy
+from ..settings.stage_keys import StageSettings
+from .build import choose_device
+from .experiment import LAW, MODELS, SIMFREE, Experiment
+from .files import (
+    IDENTIFICATION,
+    LAW_FILE,
+    RECONSTRUCTION,
+    read_if_there,
+    reconstruction_file,
+    training_file,
+    weights_file,
+)
+
+
+def identify(context: StageContext) -> None:
+    """Writes identification.json: all configured parameters, and optionally E and nu alone.
+
+    E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
+    the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
+    training trials. An interrupted run keeps its finished searches.
+    """
+    settings: StageSettings = context.settings
+    wanted, names = settings.identify, settings.split.train
+    experiment, kept, found = Experiment(settings, context.run_dir), Checkpoint(context), {}
+    names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
+    for model, parameters in {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}.items():
+        if not parameters:
+            continue
+        result = identification.identify(
+            *(experiment.simulator(MODELS[model][0]), experiment.motions, parameters, wanted.first_guess),
+            names=names,
+            held_out=[name for name in settings.split.names if name not in names],
+            accuracy=_accuracy(settings, experiment.dataset) if model == "sysid" else None,
+            seconds=min(filter(None, (settings.trial_seconds, wanted.seconds)), default=None),
+            starts=wanted.starts,
+            candidates=wanted.candidates,
+            max_evaluations=wanted.max_evaluations,
+            tolerance=wanted.tolerance,
+            seed=settings.seed,
+            once=kept.within(model),
+            title=context.name,
+        )
+        found[model] = result.plain()
+    write_json(context.run_dir / IDENTIFICATION, found)
+    kept.path.unlink(missing_ok=True)
+
+
+def _accuracy(settings: StageSettings, dataset: Trials) -> Accuracy | None:
+    """Prior standard deviations of marker places; None if they are not identified."""
+    wanted, markers, bound = settings.identify.placement, settings.markers, dataset.bound
+    if wanted is None or markers is None or bound is None:
+        return None
+    turn, mounting = (None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting))
+    centre = np.mean([*markers.reference.values()] or [*markers.tracked.values()], axis=0).tolist()
+    bodies = tuple((own.start, bound[own] - bound[own].mean(axis=0)) for own in corners_of(dataset.labels).values())
+    return Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies, centre)
+
+
+def identify_law(context: StageContext) -> None:
+    """Writes law.json: the law, its posterior, the classes that were tried, and whether it is used.
+
+    A law of another run stays as it is; the parameters of actuators and of the medium are identified with it.
+    A run that is interrupted keeps the classes of the weak form and the finished searches.
+
+    Raises:
+        DataFileError: the file of the law is missing, damaged or of another version.
+    """
+    settings: StageSettings = context.settings
+    experiment, kept, file = Experiment(settings, context.run_dir, "count"), Checkpoint(context), settings.law.file
+    known = None if file is None else read_law(file)
+    law = law_search.identify_law(
+        *(experiment.simulator("identified"), experiment.motions),
+        {} if settings.identified is None else settings.identify.parameters,
+        identified=experiment.identified("sysid"),
+        train=settings.split.train,
+        validation=settings.split.validation,
+        settings=settings.law,
+        seconds=settings.trial_seconds,
+        known=known,
+        once=kept.once,
+        title=context.name,
+    )
+    content = law.plain()
+    if known is None:
+        content["data"], content["versions"] = {"name": settings.name, "trials": law.trials}, package_versions()
+    else:
+        accepted = known.get("accepted_there", known.get("accepted", True))
+        content = {**known, **content, "accepted_there": accepted, "file": file}
+    write_json(context.run_dir / LAW_FILE, content)
+    kept.path.unlink(missing_ok=True)
+
+
+def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
+    """Writes reconstruction_<model>.h5, see `ReconstructedTrials`, and adds to reconstruction.json.
+
+    The summary has the distance between reconstructed and observed points.
+    """
+    settings: StageSettings = context.settings
+    experiment, model, folder = Experiment(settings, context.run_dir), settings.model, context.run_dir
+    parts = Parts.of(context, workers, settings.batch)
+    found = reconstruction.reconstruct(
+        experiment.model_simulator(model),
+        experiment.motions,
+        settings.reconstructed,
+        parameters=experiment.identified(model),
+        settings=settings.reconstruction,
+        parts=parts,
+    )
+    with atomic_hdf5(folder / reconstruction_file(model), "reconstruction", {"names": [*found.names]}) as file:
+        for name, unit in reconstruction.UNITS.items():  # One array at a time, as many trials take much memory.
+            create(file, name, found.read(name), unit, time_axis=1)
+    errors = found.read("error")
+    summary = {"mean_mm": float(np.nanmean(errors)), "max_mm": float(np.nanmax(errors))}
+    write_json(folder / RECONSTRUCTION, {**read_if_there(folder / RECONSTRUCTION), model: summary})
+    parts.remove()
+
+
+def train(context: StageContext) -> None:
+    """Trains a model; writes <model>.safetensors, with the selected weights, and training_<model>.json.
+
+    An interrupted training resumes.
+    """
+    settings: StageSettings = context.settings
+    model, folder, name = settings.model, context.run_dir, context.name
+    checkpoint = folder / f"{name}.safetensors"
+    resumed = resume_checkpoint(checkpoint, "training", context.fingerprint)
+
+    def save(kept: Snapshot) -> None:
+        write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
+
+    learned = fit(fitting_of(Experiment(settings, folder), model), settings.training, name, resumed, save)
+    write_json(folder / training_file(model), learned.training)
+    learned.write(folder / weights_file(model), context.fingerprint)
+    checkpoint.unlink(missing_ok=True)
+
+
+def fitting_of(experiment: Experiment, model: str) -> Fitting:
+    """Returns what the network of a model is fitted to."""
+    settings, split, data_driven = experiment.settings, experiment.settings.split, model == SIMFREE
+    return Fitting(
+        experiment.model_simulator(model),
+        experiment.motions,
+        experiment.reconstructed("resphys" if data_driven else model),
+        split.train,
+        split.validation,
+        experiment.identified(model),
+        data_driven,
+        settings.force_frame,
+        settings.range_guard,
+        experiment.sources(model)[0] == LAW,
+        choose_device(settings.device),
+    )

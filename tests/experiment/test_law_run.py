@@ -15,8 +15,8 @@ from warp_resphys.experiment.simulate import build_target, initial_state
 from warp_resphys.experiment.splits import all_trials
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.safe_files import read_json
-from warp_resphys.learning import law_search
 from warp_resphys.learning.baselines import BASELINES
+from warp_resphys.learning.identification import law_search
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.stepping.inputs import Inputs

@@ -14,9 +14,9 @@ from warp_resphys.data.marker_view import MarkerView
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator
 from warp_resphys.experiment.report import RunReader
-from warp_resphys.experiment.sensitivity import sensitivities
 from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
+from warp_resphys.learning.identification.sensitivity import sensitivities
 from warp_resphys.learning.replay import exact
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.robot.loading import load
@@ -225,13 +225,12 @@ def test_inputs_with_a_zero_that_differs_from_trial_to_trial(folder):
 
 def check_sensitivities(experiment, names):
     """Derivatives of the markers are differences of roll-outs, by the zero of the trial where it has its own."""
-    found = sensitivities(experiment, "sysid", names)
+    simulator, identified = experiment.model_simulator("sysid"), experiment.identified("sysid")
+    found = sensitivities(simulator, experiment.motions, names, identified)
     parameters, step = experiment.parameters("sysid"), 1e-4
     for name in names:
-        replay = experiment.motions.replay(
-            exact(experiment.model_simulator("sysid")), [name], experiment.identified("sysid")
-        )
-        start = experiment.motions.start(replay, experiment.identified("sysid"))
+        replay = experiment.motions.replay(exact(simulator), [name], identified)
+        start = experiment.motions.start(replay, identified)
         own = {"tendon_tension_zero": f"tendon_tension_zero@{name}", "youngs_modulus": "youngs_modulus"}
         for key, moved in own.items():
             size = step * (float(parameters[moved]) if key == "youngs_modulus" else 1.0)

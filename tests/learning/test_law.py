@@ -11,8 +11,8 @@ import torch
 from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies import make_material
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.law import _constants, fit_classes
-from warp_resphys.learning.weak_form import KnownMotion, NormalEquations, WeakForm
+from warp_resphys.learning.identification.law import _constants, fit_classes
+from warp_resphys.learning.identification.weak_form import KnownMotion, NormalEquations, WeakForm
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
 TIP = select_vertices(MESH, x=0.08)

@@ -12,8 +12,9 @@ from warp_resphys import Body, Corotated, Inputs, ObservedMotions, Simulator, bo
 from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.learning.evaluation import evaluate
-from warp_resphys.learning.law import LawClass, Score, branches_of, strong_names
-from warp_resphys.learning.law_search import _LawSearch, identify_law
+from warp_resphys.learning.identification.law import LawClass, branches_of, strong_names
+from warp_resphys.learning.identification.law_scores import Score
+from warp_resphys.learning.identification.law_search import _LawSearch, identify_law
 from warp_resphys.settings.learning import LawSettings
 
 SHEAR = 100e3  # Pa

@@ -8,7 +8,7 @@ import warp_resphys as wr
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.fitting import Fitting, fit_force
-from warp_resphys.learning.identification import identify
+from warp_resphys.learning.identification.identification import identify
 from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.learning.reconstruction import reconstruct
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings

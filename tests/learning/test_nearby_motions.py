@@ -10,7 +10,7 @@ from warp_resphys import Body, Corotated, Simulator, Tendons
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.learning.misfit import Misfit
+from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch

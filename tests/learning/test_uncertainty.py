@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, redundancy, uncertainty_of
 from warp_resphys.learning.parameters import Bounds
-from warp_resphys.learning.uncertainty import LinearMisfit, LinearTrial, redundancy, uncertainty_of
 
 BOUNDS = {"stiffness": Bounds(1.0, 3.0), "damping": Bounds(0.1, 10.0, logarithmic=True)}
 UNIT = np.array([0.5, 0.25])

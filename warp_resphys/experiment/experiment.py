@@ -16,8 +16,9 @@ from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
 from ..io.safe_files import read_array, read_hdf5, read_json
 from ..learning.correction import Learned
+from ..learning.identification.identification import Identification
 from ..learning.networks import NextState, ResidualForce, StateMap
-from ..learning.observed_motions import Identified, ObservedMotions
+from ..learning.observed_motions import ObservedMotions
 from ..learning.parameters import split_name
 from ..learning.reconstruction import ReconstructedTrials
 from ..settings.body import MaterialSettings, SimulatorSettings
@@ -149,10 +150,9 @@ class Experiment:
         own = {name: value for name, value in sysid.get("own", {}).items() if split_name(name)[0] in parameters}
         return {"parameters": parameters, "own": own, "placement": sysid.get("placement")}
 
-    def identified(self, model: str) -> Identified:
+    def identified(self, model: str) -> Identification:
         """Returns the identified parameters of a model's simulator and its marker places; empty without any."""
-        found = self.identification(model)
-        return Identified(**{key: found[key] for key in ("parameters", "own", "placement") if key in found})
+        return Identification.from_plain(self.identification(model))
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator, by name, and those of trials; empty without any."""

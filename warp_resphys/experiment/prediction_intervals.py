@@ -14,11 +14,17 @@ from ..io.arrays import FloatArray
 from ..io.safe_files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
 from ..learning.error_tables import counted
+from ..learning.identification.sensitivity import (
+    Sensitivity,
+    free_fits,
+    left_out_changes,
+    parameter_spread,
+    sensitivities,
+)
 from ..learning.intervals import LEVEL, Intervals, Predicted, coverage
 from ..learning.without_physics import without_physics
 from .experiment import SIMFREE, Experiment
 from .files import ROLLOUTS
-from .sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
 
 Linear = Mapping[str, Mapping[str, Sensitivity]]  # derivatives by model and trial
 
@@ -38,9 +44,12 @@ def linearised(experiment: Experiment, names: Sequence[str], uncertain: bool = F
     for model in INTERVAL_MODELS if experiment.dataset.bound is not None else ():
         if model == SIMFREE or model not in experiment.models:
             continue
-        if not uncertain or experiment.identification(model).get("uncertainty"):
-            kind = experiment.sources(model)[0]
-            made[kind] = made[kind] if kind in made else sensitivities(experiment, model, names)
+        identified = experiment.identified(model)
+        if not uncertain or identified.uncertainty is not None:
+            kind, simulator = experiment.sources(model)[0], experiment.model_simulator(model)
+            if kind not in made:
+                batch = experiment.settings.batch
+                made[kind] = sensitivities(simulator, experiment.motions, names, identified, batch)
             own[model] = made[kind]
     return own
 
@@ -49,7 +58,8 @@ def spreads_of(
     experiment: Experiment, names: Sequence[str], linear: Linear, left_out: bool = False
 ) -> dict[str, FloatArray]:
     """Variances (R, T, M) of markers and rigid bodies due to the parameters [m^2], by model, see `parameter_spread`."""
-    spreads = {model: parameter_spread(experiment, model, names, own, left_out) for model, own in linear.items()}
+    dataset, identified = experiment.dataset, experiment.identified
+    spreads = {m: parameter_spread(dataset, names, identified(m), own, left_out) for m, own in linear.items()}
     return {model: spread for model, spread in spreads.items() if spread is not None}
 
 
@@ -58,10 +68,10 @@ def remaining(
 ) -> dict[str, Any]:
     """Entry ``free_fits`` of errors.json, see `free_fits`, by model; empty if nothing could be fitted."""
     observed = dict(zip(names, counted(experiment.motions, experiment.settings.split.train, names), strict=True))
-    fits = {
-        model: free_fits(experiment, observed, dict(zip(names, simulated[model][: len(names)], strict=True)), own)
-        for model, own in linear.items()
-    }
+    fits = {}
+    for model, own in linear.items():
+        predicted = dict(zip(names, simulated[model][: len(names)], strict=True))
+        fits[model] = free_fits(experiment.dataset, observed, predicted, own)
     return {"free_fits": fits} if any(fits.values()) else {}
 
 
@@ -83,7 +93,7 @@ def intervals_of(
     learned = [row for row, name in enumerate(names) if name in settings.split.train]
     observed[learned, experiment.motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
     linear = linearised(experiment, names, uncertain=True)
-    changes = {model: left_out_changes(experiment, model, names, own) for model, own in linear.items()}
+    changes = {m: left_out_changes(dataset, names, experiment.identified(m), own) for m, own in linear.items()}
     simulated, *_ = without_physics(experiment.motions, names, settings.split.train, left_out=True)
     simulated |= {m: x if (change := changes.get(m)) is None else x + change for m, x in calibrating.items()}
     calibrating_spreads = spreads_of(experiment, names, linear, left_out=True)

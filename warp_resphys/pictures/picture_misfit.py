@@ -25,9 +25,9 @@ from typing_extensions import override
 from ..data.camera import CORRECTIONS, PlacedCamera
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..learning.misfit import BoundedMisfit
+from ..learning.identification.misfit import BoundedMisfit
+from ..learning.identification.uncertainty import LinearMisfit, LinearTrial
 from ..learning.parameters import Bounds, split_name
-from ..learning.uncertainty import LinearMisfit, LinearTrial
 from .released_force import RELEASE_DELAY
 from .seen import Photo, SeenPose, Shape
 

@@ -16,7 +16,7 @@ import torch
 
 from ..energies.catalogue import make_material
 from ..io.arrays import FloatArray
-from ..learning.law import VISCOSITIES
+from ..learning.identification.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from . import figures

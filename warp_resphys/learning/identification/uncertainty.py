@@ -22,9 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..io.arrays import FloatArray
-from .parameters import Bounds
-from .placement import Nuisances
+from ...io.arrays import FloatArray
+from ..parameters import Bounds
+from .nuisances import Nuisances
 
 _UNIFORM = 12.0  # reciprocal variance of a parameter in its range, as a fraction of it
 

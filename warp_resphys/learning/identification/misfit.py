@@ -20,13 +20,14 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..io.arrays import FloatArray
-from ..io.errors import ConvergenceError, InputError
-from ..stepping.state import State
-from .parameters import Bounds, check_names, split_name
-from .placement import Accuracy, DisplacedMarkers, NuisanceFit, Nuisances
-from .replay import Replay, Start, exact
-from .trial_batch import TrialBatch
+from ...io.arrays import FloatArray
+from ...io.errors import ConvergenceError, InputError
+from ...stepping.state import State
+from ..parameters import Bounds, check_names, split_name
+from ..placement import Accuracy, DisplacedMarkers
+from ..replay import Replay, Start, exact
+from ..trial_batch import TrialBatch
+from .nuisances import NuisanceFit, Nuisances
 from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, redundancy, uncertainty_of
 
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
@@ -141,7 +142,7 @@ class Misfit(BoundedMisfit):
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
         known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
-        delay: standard deviation of the delay of motions that their inputs begin [s]; see `placement.NuisanceFit`.
+        delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisances.NuisanceFit`.
         shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
 
     Attributes:

@@ -20,17 +20,17 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
-from ..data.rigid_bodies import independent
-from ..data.trials import RELEASED, RESTING, Trials
-from ..dynamics.simulator import Simulator
-from ..io.arrays import FloatArray
-from ..io.errors import ConvergenceError
-from ..io.progress import Progress
-from ..linalg.least_squares import Point, UnitBox, minimise
+from ...data.rigid_bodies import independent
+from ...data.trials import RELEASED, RESTING, Trials
+from ...dynamics.simulator import Simulator
+from ...io.arrays import FloatArray
+from ...io.errors import ConvergenceError
+from ...io.progress import Progress
+from ...linalg.least_squares import Point, UnitBox, minimise
+from ..observed_motions import Identified, ObservedMotions
+from ..parameters import Bounds, Limits, configured_parameters, own_name, split_name
+from ..placement import Accuracy
 from .misfit import BoundedMisfit, Misfit
-from .observed_motions import Identified, ObservedMotions
-from .parameters import Bounds, Limits, configured_parameters, own_name, split_name
-from .placement import Accuracy
 from .uncertainty import Uncertainty
 
 log = logging.getLogger(__name__)
@@ -70,6 +70,11 @@ class Identification(Identified):
         """Returns the identification as JSON data."""
         own = ("own", "own_deviation")
         return {key: value for key, value in asdict(self).items() if value or key not in own}
+
+    @staticmethod
+    def from_plain(plain: Mapping[str, Any]) -> "Identification":
+        """Returns the identification that `plain` wrote."""
+        return _PLAIN.validate_python(plain)
 
 
 _PLAIN = TypeAdapter(Identification)
@@ -271,7 +276,7 @@ def refined_searches(
         def work(before: Identification | None = before, ends: IsLast = ends) -> dict[str, Any]:
             return asdict(search(*begin(before), is_last=ends))
 
-        results.append(_PLAIN.validate_python(once(str(number), work)))
+        results.append(Identification.from_plain(once(str(number), work)))
         if ends(results[-1].loss):
             break
     return results

@@ -3,13 +3,15 @@
 Derivatives are made up, and so are the errors that are made of them.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from warp_resphys.data.rigid_bodies import arms
-from warp_resphys.experiment.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread
+from warp_resphys.learning.identification.identification import Identification
+from warp_resphys.learning.identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread
 from warp_resphys.settings.motions import CORNERS
 
 RANDOM = np.random.default_rng(0)
@@ -24,20 +26,23 @@ WITHOUT = {
     "deviation": {"youngs_modulus": 4e3, "density": 50.0},
     "correlation": np.eye(2).tolist(),
 }
+UNLIMITED = {"poorest": {}, "poorest_deviation": 0.0, "ranges": dict.fromkeys(("youngs_modulus", "density"), 1e12)}
 IDENTIFIED = {
     "uncertainty": {
         "deviation": {"youngs_modulus": 2e3, "density": 40.0},
         "correlation": [[1.0, 0.5], [0.5, 1.0]],
+        **UNLIMITED,
         "left_out": {"a": WITHOUT},
     },
     "placement": {"sessions": {"monday": {}}, "new_session": np.diag(NEW_SESSION).tolist()},
 }
 
 
-def experiment(labels=("A", "B"), identified=IDENTIFIED, session=SESSIONS.get, **inputs):
-    observed = np.zeros((2, 1, len(labels), 3))
-    dataset = SimpleNamespace(observed=observed, labels=labels, session=session, inputs=inputs)
-    return SimpleNamespace(dataset=dataset, identification=lambda model: identified)
+def trials(labels=("A", "B"), session=SESSIONS.get, **inputs):
+    return SimpleNamespace(observed=np.zeros((2, 1, len(labels), 3)), labels=labels, session=session, inputs=inputs)
+
+
+FOUND = Identification.from_plain(IDENTIFIED)
 
 
 def sensitivity(frames=1, **sizes):
@@ -59,7 +64,7 @@ def due_to(name, deviation, correlation):
 
 def test_a_new_session_adds_the_prior_of_its_placement():
     uncertainty = IDENTIFIED["uncertainty"]
-    spread = parameter_spread(experiment(), "sysid", NAMES, LINEAR)
+    spread = parameter_spread(trials(), NAMES, FOUND, LINEAR)
     of_parameters = [due_to(name, uncertainty["deviation"], uncertainty["correlation"]) for name in NAMES]
     np.testing.assert_allclose(spread[0], of_parameters[0])
     added = np.einsum("tmck,k->tmc", LINEAR["b"].by_placement ** 2, NEW_SESSION**2).mean(-1)
@@ -73,30 +78,31 @@ def test_the_position_of_a_rigid_body_does_not_vary_with_its_orientation():
     moved = np.stack([np.tile([1e-4, 0.0, 0.0], (4, 1)), turning], -1)  # (4, 3, 2)
     slopes = {"density": moved[None, ..., 0], "youngs_modulus": moved[None, ..., 1]}
     identified = {
-        "uncertainty": {"deviation": dict.fromkeys(slopes, 1.0), "correlation": np.eye(2).tolist()},
+        "uncertainty": {"deviation": dict.fromkeys(slopes, 1.0), "correlation": np.eye(2).tolist(), **UNLIMITED},
         "placement": {"sessions": {"monday": {}}, "new_session": np.eye(2).tolist()},
     }
-    plate = experiment(tuple(f"plate {corner}" for corner in CORNERS), identified)
+    plate, found = trials(tuple(f"plate {corner}" for corner in CORNERS)), Identification.from_plain(identified)
     linear = dict.fromkeys(NAMES, Sensitivity(corners[None], slopes, moved[None]))
-    spread = parameter_spread(plate, "sysid", NAMES, linear)
+    spread = parameter_spread(plate, NAMES, found, linear)
     np.testing.assert_allclose(spread, np.array([[[1e-8 / 3.0]], [[2e-8 / 3.0]]]))
 
 
 def test_a_trial_is_predicted_without_itself():
-    spread = parameter_spread(experiment(), "sysid", ["a"], LINEAR, left_out=True)
+    spread = parameter_spread(trials(), ["a"], FOUND, LINEAR, left_out=True)
     np.testing.assert_allclose(spread[0], due_to("a", WITHOUT["deviation"], WITHOUT["correlation"]))
-    changes = left_out_changes(experiment(), "sysid", NAMES, LINEAR)
+    changes = left_out_changes(trials(), NAMES, FOUND, LINEAR)
     slopes, places = LINEAR["a"].by_parameter, LINEAR["a"].by_placement
     expected = 30.0 * slopes["density"] - 2e3 * slopes["youngs_modulus"] + places @ np.array(WITHOUT["placement"])
     np.testing.assert_allclose(changes[0], expected)
     assert not changes[1].any()
-    assert left_out_changes(experiment(), "sysid", ["b"], LINEAR) is None
-    for uncertainty in (None, {"deviation": {}}):  # of identifications that left out nothing
-        assert left_out_changes(experiment(identified={"uncertainty": uncertainty}), "sysid", NAMES, LINEAR) is None
+    assert left_out_changes(trials(), ["b"], FOUND, LINEAR) is None
+    alone = replace(FOUND, uncertainty=replace(FOUND.uncertainty, left_out={}))
+    for found in (Identification(), alone):  # which left out nothing
+        assert left_out_changes(trials(), NAMES, found, LINEAR) is None
 
 
 ROUNDING = 1e-9  # mm
-DRIVEN = experiment(session=lambda name: name[0], pressure=np.ones((1, 3, 1)), payload=np.ones((1, 1)))
+DRIVEN = trials(session=lambda name: name[0], pressure=np.ones((1, 3, 1)), payload=np.ones((1, 1)))
 
 
 def driven(frames=40):

@@ -16,22 +16,21 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ..data.markers import WHOLE_STATE, WholeState
-from ..data.rigid_bodies import independent
-from ..data.trials import RELEASED, evenly
-from ..dynamics.simulator import Simulator
-from ..energies.catalogue import make_material
-from ..energies.convex_material import ConvexMaterial
-from ..energies.materials import MASS_DAMPING
-from ..fem.integration_points import principal_stretches
-from ..io.arrays import FloatArray
-from ..settings.learning import LawSettings
+from ...data.markers import WholeState
+from ...data.rigid_bodies import independent
+from ...data.trials import RELEASED, evenly
+from ...dynamics.simulator import Simulator
+from ...energies.catalogue import make_material
+from ...energies.convex_material import ConvexMaterial
+from ...energies.materials import MASS_DAMPING
+from ...settings.learning import LawSettings
+from ..observed_motions import Identified, ObservedMotions
+from ..parameters import Bounds, Limits, Prior
 from .identification import Identification, IsLast, Once, first_points, refined_searches, search_parameters, shown
 from .law import (
     VISCOSITIES,
     IdentifiedLaw,
     LawClass,
-    Score,
     bounds_of_constant,
     branches_of,
     family,
@@ -41,10 +40,8 @@ from .law import (
     is_shape,
     strong_names,
 )
+from .law_scores import Score, scores_of, stretches_in
 from .misfit import Misfit
-from .observed_motions import Identified, ObservedMotions
-from .parameters import Bounds, Limits, Prior
-from .replay import Replay
 from .weak_form import KnownMotion, WeakForm
 
 _OF_MASS: Final = ("density", MASS_DAMPING)
@@ -212,7 +209,7 @@ class _LawSearch:
             at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
             loss=best.found.loss,
             classes=[{**asdict(own), "validation": score} for own, score in tried],
-            stretches=self._stretches(best.law.constants, best.others),
+            stretches=self._stretches(best),
             trials=self.names(whole=True),
             **self._tested(best.score),
         )
@@ -233,14 +230,14 @@ class _LawSearch:
             deviation=law.get("deviation", {}) | _deviation(found),
             at_bounds=[*law.get("at_bounds", ()), *found.at_bounds],
             model=law["model"],
-            **self._tested(self._errors(simulator, values, 1)[0]) | {"accepted": True},
+            **self._tested(self._scores(simulator, values, 1)[0]) | {"accepted": True},
         )
 
     def _tested(self, score: Score) -> dict[str, Any]:
         """Whether a law helps, and its errors and those without it on the trials that laws are tested on."""
         shared = {name: self.base.tensor([value]) for name, value in self.identified.parameters.items()}
         counting = replace(self.base, solver=replace(self.base.settings, on_failure="count"))
-        below, split = self._errors(counting, shared, 1)[0], "validation" if self.validation else "training"
+        below, split = self._scores(counting, shared, 1)[0], "validation" if self.validation else "training"
         errors = {"trials": list(self.checked), "split": split, "law": score.error, "below": below.error}
         return {"accepted": score.beats(below), "validation": errors}
 
@@ -258,39 +255,17 @@ class _LawSearch:
         values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
         for name, value in {**self.others, **(others or {})}.items():
             values[name] = simulator.tensor([value]).expand(len(laws))
-        return self._errors(simulator, values, len(laws))
+        return self._scores(simulator, values, len(laws))
 
-    def _errors(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> list[Score]:
+    def _scores(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> list[Score]:
         """Returns the errors of a simulator with some sets of parameters on the trials that laws are tested on."""
-        frames: list[list[FloatArray]] = [[] for _ in range(sets)]
-        begin = self.early or 0.0
-        with torch.no_grad():
-            for replay, start in self.motions.replays(simulator, self.checked, self.identified):
-                own = replay.trials if self.seconds is None else replay.trials.first(self.seconds)
-                squares = Replay(simulator, replay.observe, own)
-                errors = squares.errors(squares(start, values)).square().sum((3, 4))  # (E, R, T)
-                seen = own.seen.sum(2)
-                means = errors / (seen.clamp_min(1) * own.amplitude.square()[:, None])
-                for row, inside in enumerate((own.times >= begin) & (seen > 0)):
-                    for number in range(sets) if bool(inside.any()) else ():
-                        frames[number].append(means[number, row, inside].double().cpu().numpy())
-        return [Score(tuple(own)) for own in frames]
+        replays = self.motions.replays(simulator, self.checked, self.identified)
+        return scores_of(replays, values, sets, self.early or 0.0, self.seconds)
 
-    def _stretches(self, constants: Mapping[str, float], others: Mapping[str, float]) -> list[float]:
-        """Returns the least and the largest principal stretch in the trials, simulated where markers are seen."""
-        dataset, mesh, names = self.motions.dataset, self.base.body.mesh, self.names(whole=True)
-        if self.states:
-            bodies = [dataset.observed[dataset.rows(names)]]
-        else:
-            simulator = self.simulator(constants)
-            values = {name: simulator.tensor([value]) for name, value in others.items()}
-            with torch.no_grad():
-                bodies = [
-                    Replay(simulator, WHOLE_STATE, replay.trials)(replace(start, shift=None), values).cpu().numpy()
-                    for replay, start in self.motions.replays(simulator, names, self.identified)
-                ]
-        parts = [principal_stretches(mesh, own.reshape(-1, *mesh.vertices.shape)) for own in bodies]
-        return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
+    def _stretches(self, law: _Refined) -> list[float]:
+        """Returns the least and the largest principal stretch in the training trials."""
+        simulator = self.simulator(law.law.constants)
+        return stretches_in(self.motions, self.names(whole=True), simulator, law.others, self.identified)
 
     def _from_states(self) -> list[LawClass]:
         """Returns the classes of the weak form."""

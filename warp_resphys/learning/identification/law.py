@@ -10,19 +10,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations
-from statistics import fmean
 from typing import Any, Final
 
 import numpy as np
 import torch
 
-from ..dynamics.simulator import Simulator
-from ..energies.catalogue import law_content, unit_of
-from ..energies.convex_material import ConvexMaterial
-from ..energies.materials import Material
-from ..io.arrays import FloatArray
-from .parameters import Bounds, Prior
-from .uncertainty import redundancy
+from ...dynamics.simulator import Simulator
+from ...energies.catalogue import law_content, unit_of
+from ...energies.convex_material import ConvexMaterial
+from ...energies.materials import Material
+from ...io.arrays import FloatArray
+from ..parameters import Bounds, Prior
 from .weak_form import Candidate, NormalEquations, WeakForm
 
 MODULUS: Final = ("c10", "bulk_1")  # of the smallest class, a neo-Hookean solid
@@ -37,8 +35,6 @@ _FINER: Final = math.radians(15.0)  # of the finer directions about the best coa
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
 _STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
 _TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
-_CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
-_SIGNIFICANT: Final = 2.0  # standard errors
 
 
 @dataclass(frozen=True)
@@ -80,40 +76,6 @@ class IdentifiedLaw:
         hidden = ("simulator", "trials")
         known = {key: value for key, value in vars(self).items() if value is not None and key not in hidden}
         return {**known, **law_content(self.model, self.constants)}
-
-
-@dataclass(frozen=True)
-class Score:
-    """Errors of a simulator on trials: in each frame the mean square over the squared amplitude of the trial."""
-
-    frames: tuple[FloatArray, ...]  # (T,) of each trial
-
-    @property
-    def error(self) -> float:
-        """Root mean square over the amplitude, over all trials; infinite if one failed."""
-        if not self.frames:
-            return math.inf
-        square = fmean(float(own.mean()) for own in self.frames)
-        return math.sqrt(square) if math.isfinite(square) else math.inf
-
-    def beats(self, other: "Score") -> bool:
-        """Whether the error is at most half, or its mean square smaller by two standard errors.
-
-        Frames are correlated in time, so that a short trial may show no less than a large gain. Of static poses the
-        standard error is that of the trials' mean; one pose has none, and its error must be smaller by 5 %.
-        """
-        if not math.isfinite(self.error) or self.error <= _CLEARLY * other.error:
-            return self.error < other.error
-        less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
-        means = np.array([d.mean() for d in less])
-        if max(len(d) for d in less) > 1:
-            variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
-            doubt = math.sqrt(sum(variance)) / len(less)
-        elif len(less) > 1:
-            doubt = float(means.std(ddof=1)) / math.sqrt(len(less))
-        else:
-            return self.error < _CLOSER * other.error
-        return float(means.mean()) > _SIGNIFICANT * doubt
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,14 @@ import scipy.linalg
 import scipy.optimize
 import torch
 
-from ..dynamics.simulator import Simulator
-from ..energies.hysteresis import PLASTIC_STRAIN
-from ..energies.solid import VISCOUS_STRAIN
-from ..energies.tendon_forces import SEGMENT_TENSION
-from ..io.arrays import FloatArray
-from ..io.errors import InputError
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
+from ...dynamics.simulator import Simulator
+from ...energies.hysteresis import PLASTIC_STRAIN
+from ...energies.solid import VISCOUS_STRAIN
+from ...energies.tendon_forces import SEGMENT_TENSION
+from ...io.arrays import FloatArray
+from ...io.errors import InputError
+from ...stepping.inputs import Inputs
+from ...stepping.state import State
 
 Candidate = Mapping[str, float]  # values of parameters that give one unit of a coefficient, the others being zero
 

@@ -15,18 +15,21 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..data.marker_view import ViewedMarkers
-from ..data.markers import Markers
-from ..data.rigid_bodies import as_markers, owners
-from ..dynamics.simulator import Simulator
-from ..io.arrays import FloatArray
-from ..io.errors import ConvergenceError, listed
-from ..io.progress import Progress
-from ..learning.metrics import mean_distance
-from ..learning.parameters import HUNG, configured_parameters, own_name, split_name
-from ..learning.placement import DisplacedMarkers, Placement, by_placement, placement_of
-from ..learning.replay import Replay, exact
-from .experiment import Experiment
+from ...data.marker_view import ViewedMarkers
+from ...data.markers import Markers
+from ...data.rigid_bodies import as_markers, owners
+from ...data.trials import Trials
+from ...dynamics.simulator import Simulator
+from ...io.arrays import FloatArray
+from ...io.errors import ConvergenceError, listed
+from ...io.parts import cut
+from ...io.progress import Progress
+from ..metrics import mean_distance
+from ..observed_motions import ObservedMotions
+from ..parameters import HUNG, configured_parameters, own_name, split_name
+from ..placement import DisplacedMarkers, Placement, by_placement, placement_of
+from ..replay import exact
+from .identification import Identification
 
 log = logging.getLogger(__name__)
 
@@ -49,65 +52,65 @@ class Sensitivity:
     by_placement: FloatArray | None
 
 
-def _responses(experiment: Experiment) -> dict[str, str]:
-    """Parameters for a scale and a zero of the inputs that drive an experiment, by name, with their word."""
-    driven = [name for name, values in experiment.dataset.inputs.items() if name not in HUNG and values.any()]
+def _responses(trials: Trials) -> dict[str, str]:
+    """Parameters for a scale and a zero of the inputs that drive trials, by name, with their word."""
+    driven = [name for name, values in trials.inputs.items() if name not in HUNG and values.any()]
     return {f"{name}_{word}": word for name in driven for word in ("factor", "zero")}
 
 
-def sensitivities(experiment: Experiment, model: str, names: Sequence[str]) -> dict[str, Sensitivity]:
-    """Returns the derivatives of trials by the parameters of a model's simulator and the gains and zeros of its inputs.
+def sensitivities(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    names: Sequence[str],
+    identified: Identification,
+    batch: int | None = None,
+) -> dict[str, Sensitivity]:
+    """Returns the derivatives of trials by the parameters of a simulator and the gains and zeros of its inputs.
 
     Args:
-        experiment: the experiment.
-        model: a model with markers and identified parameters.
+        simulator: of which the parameters were identified.
+        motions: trials with markers.
         names: names of the trials; those that cannot be simulated are left out, which a warning says.
+        identified: parameters and their uncertainty.
+        batch: largest number of trials that are simulated together; None for all.
     """
-    simulator, found = exact(experiment.model_simulator(model)), dict[str, Sensitivity]()
-    moved = (experiment.identification(model).get("uncertainty") or {}).get("deviation", {})
-    inputs = experiment.dataset.inputs
-    for name, word in _responses(experiment).items():
-        size = 1.0 if word == "factor" else float(np.abs(inputs[name.removesuffix("_zero")]).max())
-        moved = {name: size} | moved
+    simulator, found, moved = exact(simulator), dict[str, Sensitivity](), dict[str, float]()
+    for name, word in _responses(motions.dataset).items():
+        inputs = motions.dataset.inputs[name.removesuffix(f"_{word}")]
+        moved = {name: 1.0 if word == "factor" else float(np.abs(inputs).max())} | moved
+    moved |= {} if identified.uncertainty is None else identified.uncertainty.deviation
     moved = {name: _DIFFERENCE * size for name, size in moved.items()}
-    configured = configured_parameters(simulator, moved)
-    values = {name: simulator.tensor([value]) for name, value in configured.items()} | experiment.parameters(model)
     with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
-        for whole in experiment.dataset.batches(names):
-            size = experiment.settings.batch or len(whole)
-            for batch in (whole[first : first + size] for first in range(0, len(whole), size)):
-                try:
-                    found |= _of_batch(experiment, model, simulator, batch, values, moved)
-                except ConvergenceError as error:
-                    log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(batch), error)
-                progress.advance(len(batch))
+        for _, some in (part for whole in motions.dataset.batches(names) for part in cut(whole, batch)):
+            try:
+                found |= _of_batch(simulator, motions, some, identified, moved)
+            except ConvergenceError as error:
+                log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(some), error)
+            progress.advance(len(some))
     return found
 
 
 def _of_batch(
-    experiment: Experiment,
-    model: str,
     simulator: Simulator,
+    motions: ObservedMotions,
     names: Sequence[str],
-    values: Mapping[str, torch.Tensor],
+    identified: Identification,
     moved: Mapping[str, float],
 ) -> dict[str, Sensitivity]:
-    """Derivatives of trials of one of `Experiment.batches`, from values (1,) of all parameters and steps of some."""
-    replay, observe, dataset = (
-        experiment.motions.replay(simulator, names, experiment.identified(model)),
-        experiment.motions.observe,
-        experiment.dataset,
-    )
-    start, placement = experiment.motions.start(replay, experiment.identified(model)), None
+    """Derivatives of trials of one of `Trials.batches`, from steps of parameters."""
+    observe, trials = motions.observe, motions.dataset
+    replay, placement = motions.replay(simulator, names, identified), None
+    start = motions.start(replay, identified)
     if isinstance(observe, Markers) and not isinstance(observe, ViewedMarkers):
-        assert dataset.bound is not None
-        count, plain = len(dataset.labels), experiment.identification(model).get("placement")
-        placement = Placement.none(count, experiment.like.new_tensor(np.mean(dataset.bound, axis=0)))
-        if plain is not None:
-            placement = placement_of(plain, dataset.labels, dataset.session(names[0])).to(experiment.like)
-        replay, start = DisplacedMarkers.replay(Replay(simulator, observe, replay.trials), start)
+        assert trials.bound is not None
+        placement = Placement.none(len(trials.labels), simulator.tensor(np.mean(trials.bound, axis=0)))
+        if identified.placement is not None:
+            placement = placement_of(identified.placement, trials.labels, trials.session(names[0]))
+            placement = placement.to(simulator.rest_positions)
+        replay, start = DisplacedMarkers.replay(motions.replay(simulator, names), start)
+    configured = {name: simulator.tensor([x]) for name, x in configured_parameters(simulator, moved).items()}
+    sets = {name: x.repeat(1 + len(moved)) for name, x in {**configured, **identified.values(simulator)}.items()}
     rows = {parameter: row for row, parameter in enumerate(moved, 1)}
-    sets = {name: value.repeat(1 + len(moved)) for name, value in values.items()}
     for name in sets:
         if (parameter := split_name(name)[0]) in moved:
             sets[name][rows[parameter]] += moved[parameter]
@@ -128,18 +131,22 @@ def _of_batch(
 
 
 def parameter_spread(
-    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity], left_out: bool = False
+    trials: Trials,
+    names: Sequence[str],
+    identified: Identification,
+    linear: Mapping[str, Sensitivity],
+    left_out: bool = False,
 ) -> FloatArray | None:
-    """Returns the variance of predicted markers under the posterior of a model's identified parameters.
+    """Returns the variance of predicted markers under the posterior of identified parameters.
 
     The variance is to first order, J S J^T with the derivatives J of the markers by the parameters and the covariance S
     of these, so that it grows with the distance from the trials that determine them. In a session without identified
     trials, the prior of its placement adds its variance. The ranges of the parameters limit their covariance.
 
     Args:
-        experiment: the experiment.
-        model: with identified parameters.
-        names: names of the R trials; those without derivatives have no spread.
+        trials: of the motions.
+        names: names of R trials; those without derivatives have no spread.
+        identified: parameters and their uncertainty.
         linear: derivatives by trial, from `sensitivities`.
         left_out: whether the posterior of a trial that was identified from is that without it.
 
@@ -147,29 +154,27 @@ def parameter_spread(
         Means (R, T, M) over the coordinates, of markers and of the positions of rigid bodies [m^2]; None if the
         uncertainty of the parameters is not known.
     """
-    identified, dataset = experiment.identification(model), experiment.dataset
-    uncertainty, placement = identified.get("uncertainty"), identified.get("placement") or {}
+    uncertainty, placement = identified.uncertainty, identified.placement or {}
     if uncertainty is None:
         return None
-    parameters, own = [*uncertainty["deviation"]], identified.get("own_deviation", {})
-    ranges = [uncertainty.get("ranges", {}).get(name, np.inf) for name in parameters]
-    spread = np.zeros((len(names), dataset.observed.shape[1], len(owners(dataset.labels))))
+    ranges = np.array([*uncertainty.ranges.values()])
+    spread = np.zeros((len(names), trials.observed.shape[1], len(owners(trials.labels))))
     for row, name in ((row, name) for row, name in enumerate(names) if name in linear):
-        posterior = uncertainty.get("left_out", {}).get(name, uncertainty) if left_out else uncertainty
-        deviation = np.array([posterior["deviation"][parameter] for parameter in parameters])
-        correlation, session = np.array(posterior["correlation"]), dataset.session(name)
-        for at, parameter in enumerate(parameters):
-            of_trial = (own.get(own_name(parameter, owner)) for owner in (name, session))
+        posterior = uncertainty.left_out.get(name, uncertainty) if left_out else uncertainty
+        deviation, correlation = np.array([*posterior.deviation.values()]), np.array(posterior.correlation)
+        session = trials.session(name)
+        for at, parameter in enumerate(posterior.deviation):
+            of_trial = (identified.own_deviation.get(own_name(parameter, owner)) for owner in (name, session))
             if (known := next((value for value in of_trial if value is not None), None)) is not None:
                 deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
                 correlation[at, at] = 1.0
         root = deviation[:, None] * _root(correlation, deviation / ranges)
-        slopes = np.stack([linear[name].by_parameter[parameter] for parameter in parameters])
-        moved = as_markers(np.einsum("eTmc,ei->iTmc", slopes, root), dataset.labels)
+        slopes = np.stack([linear[name].by_parameter[parameter] for parameter in posterior.deviation])
+        moved = as_markers(np.einsum("eTmc,ei->iTmc", slopes, root), trials.labels)
         spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
         places = linear[name].by_placement
         if "sessions" in placement and session not in placement["sessions"] and places is not None:
-            moved = as_markers(places @ np.array(placement["new_session"]), dataset.labels, -3)
+            moved = as_markers(places @ np.array(placement["new_session"]), trials.labels, -3)
             spread[row, : len(moved)] += np.nan_to_num(np.square(moved).sum(-1).mean(-1))
     return spread
 
@@ -190,27 +195,27 @@ def _root(correlation: FloatArray, shares: FloatArray) -> FloatArray:
 
 
 def left_out_changes(
-    experiment: Experiment, model: str, names: Sequence[str], linear: Mapping[str, Sensitivity]
+    trials: Trials, names: Sequence[str], identified: Identification, linear: Mapping[str, Sensitivity]
 ) -> FloatArray | None:
-    """Returns by what predictions of trials change if a model's parameters are identified without them, to first order.
+    """Returns by what predictions of trials change if parameters are identified without them, to first order.
 
     Returns:
         (R, T, M, 3) [m]; None if no trial changes, as those from which nothing was identified.
     """
-    left_out = (experiment.identification(model).get("uncertainty") or {}).get("left_out", {})
-    changes = np.zeros((len(names), *experiment.dataset.observed.shape[1:]))
+    left_out = {} if identified.uncertainty is None else identified.uncertainty.left_out
+    changes = np.zeros((len(names), *trials.observed.shape[1:]))
     used = [row for row, name in enumerate(names) if name in left_out and name in linear]
     for row in used:
         slopes, without = linear[names[row]], left_out[names[row]]
-        change = sum(slopes.by_parameter[name] * by for name, by in without["change"].items())
-        if without["placement"] is not None and slopes.by_placement is not None:
-            change = change + slopes.by_placement @ np.array(without["placement"])
+        change = sum(slopes.by_parameter[name] * by for name, by in without.change.items())
+        if without.placement is not None and slopes.by_placement is not None:
+            change = change + slopes.by_placement @ np.array(without.placement)
         changes[row, : len(slopes.points)] = change
     return changes if used else None
 
 
 def free_fits(
-    experiment: Experiment,
+    trials: Trials,
     observed: Mapping[str, FloatArray],
     simulated: Mapping[str, FloatArray],
     linear: Mapping[str, Sensitivity],
@@ -222,40 +227,42 @@ def free_fits(
     tested trials of a session share. What the trials do not determine is left out.
 
     Args:
-        experiment: the experiment.
+        trials: of the motions.
         observed: (T, M, 3) markers by trial [m], NaN in frames that do not count.
         simulated: (T, M, 3) predicted markers by trial [m].
         linear: derivatives by trial; those without are left out.
     """
-    labels, words = experiment.dataset.labels, _responses(experiment)
-    counts = {name: len(own.points) for name, own in linear.items()}  # one frame of a pose
+    counts = {name: len(of_trial.points) for name, of_trial in linear.items()}  # one frame of a pose
     errors = {n: (simulated[n] - seen)[: counts[n]] for n, seen in observed.items() if n in linear}
     errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
 
     def mean(error: FloatArray) -> float:
         """Mean error of a trial [mm], of its errors (T, M, 3), as the table of errors has it."""
-        own = as_markers(error, labels)
-        return float(np.nanmean(mean_distance(own, 0.0 * own)))
+        of_markers = as_markers(error, trials.labels)
+        return float(np.nanmean(mean_distance(of_markers, 0.0 * of_markers)))
 
     left: dict[str, dict[str, float]] = {name: {} for name in errors}
     values: dict[str, dict[str, float]] = {name: {} for name in errors}
+    words = _responses(trials)
     for name, error in errors.items():
         for quantity, word in (("scale", "factor"), ("zero", "zero")):  # all inputs move together
             columns = [linear[name].by_parameter[n] for n, other in words.items() if other == word]
-            if columns and (own := _least([error], [np.sum(columns, axis=0)[..., None]])) is not None:
-                left[name][quantity] = mean(error + np.sum(columns, axis=0) * own[0])
-                values[name][quantity] = float(own[0])
-    for session in dict.fromkeys(map(experiment.dataset.session, errors)):
-        members = [name for name in errors if experiment.dataset.session(name) == session]
+            slope = np.sum(columns, axis=0)
+            if columns and (best := _least([error], [slope[..., None]])) is not None:
+                left[name][quantity] = mean(error + slope * best[0])
+                values[name][quantity] = float(best[0])
+    for session in dict.fromkeys(map(trials.session, errors)):
+        members = [name for name in errors if trials.session(name) == session]
         places = [slopes for name in members if (slopes := linear[name].by_placement) is not None]
         if len(places) < len(members):
             continue
-        own_errors = [errors[name] for name in members]
-        sizes = [float(np.sqrt(np.nanmean(np.square(error)))) or 1.0 for error in own_errors]  # Trials count alike.
-        scaled = ([x / size for x, size in zip(of, sizes, strict=True)] for of in (own_errors, places))
-        if (own := _least(*scaled)) is not None:
+        sizes = [float(np.sqrt(np.nanmean(np.square(errors[name])))) or 1.0 for name in members]  # Trials count alike.
+        scaled = (
+            [x / size for x, size in zip(of, sizes, strict=True)] for of in ([errors[n] for n in members], places)
+        )
+        if (best := _least(*scaled)) is not None:
             for name, slopes in zip(members, places, strict=True):
-                left[name]["places"] = mean(errors[name] + slopes @ own)
+                left[name]["places"] = mean(errors[name] + slopes @ best)
     return [{"name": n, "as_is_mm": mean(e), "left_mm": left[n], "values": values[n]} for n, e in errors.items()]
 
 

@@ -1,0 +1,212 @@
+"""Marker places and delays of trials that fit best for each set of physical parameters (variable projection).
+
+Both are nuisance parameters with a normal prior around zero: the marker places of `placement`, and the time by which
+the inputs of each trial act later than recorded, as clocks differ, frames are lost, and a valve opens when it likes. A
+delay moves a motion in time, so that it needs no simulation of its own. For each set of physical parameters, they take
+the values with the least sum of squares, prior included (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...io.arrays import FloatArray
+from ...stepping.rollout import sample
+from ..placement import Accuracy, Placement, by_placement
+from ..replay import Replay, Start
+
+_FURTHEST, _TRIED = 3.0, 61  # largest delay, in expected deviations, and number of delays from which the search begins
+_TURNS, _STEPS = 4, 6  # Gauss-Newton steps of places, as rotations by a few degrees are nearly linear; with delays
+_LONGEST = 0.5  # change of a delay in a step, in expected deviations
+_DIFFERENCE = 1e-2  # of the time between frames, for the derivative by a delay
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """The best places and delays for one set of parameters.
+
+    Attributes:
+        columns: (R, D, K) derivatives of the weighted residuals of each group, in standard deviations of the prior;
+            empty if nothing was fitted.
+        rows: (K,) weighted residuals of the prior.
+        sessions: placement of the markers in each session; empty if it is exact.
+        common: placement in a session that is not known.
+        moves: (3 M + 6, k) change of the offsets, the shift and the turn of a session by the first k nuisances.
+    """
+
+    columns: Sequence[FloatArray] = ()
+    rows: FloatArray = field(default_factory=lambda: np.zeros(0))
+    sessions: Mapping[str, Placement] = field(default_factory=dict)
+    common: Placement | None = None
+    moves: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def plain(self, labels: Sequence[str]) -> dict[str, Any] | None:
+        """Returns the placements as JSON data: the common one, and those of the named `sessions`; None without any."""
+        if self.common is None:
+            return None
+        named = {session: placement.plain(labels) for session, placement in self.sessions.items() if session}
+        return self.common.plain(labels) | ({"sessions": named} if named else {})
+
+
+class NuisanceFit:
+    """Fits places and delays to simulated points, by Gauss-Newton.
+
+    The unknowns are in standard deviations of the prior: the common placement; what each session's differs from it by,
+    if there are several; and the delays of trials whose motion inputs begin, with those of their starts.
+
+    Args:
+        replays: groups of trials, whose points are `DisplacedMarkers` where places are uncertain.
+        weights: (R,) of each trial's squared errors [1/m^2], by group.
+        accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
+        delay: standard deviation of the delay of motions that inputs begin [s]; zero: they have that of their start.
+    """
+
+    def __init__(
+        self,
+        replays: Sequence[tuple[Replay, Start]],
+        weights: Sequence[torch.Tensor],
+        accuracy: Accuracy | None,
+        delay: float,
+    ) -> None:
+        self._replays, self._weights = [*replays], [*weights]
+        self._accuracy, self._delay = accuracy, delay
+        self._centre = weights[0].new_tensor([*(accuracy or Accuracy()).centre])
+        self._moves: dict[str | None, torch.Tensor] = {}  # None: of the common placement
+        self._places = 0
+        if accuracy is not None:
+            names = [*dict.fromkeys(replay.trials.session for replay, _ in replays)]
+            names = names if len(names) > 1 else []
+            common = accuracy.directions(replays[0][0].trials.observed)
+            shares = torch.eye(len(names)).to(common) * accuracy.between_sessions
+            for name, share in zip((None, *names), (torch.zeros(len(names)), *shares), strict=True):
+                self._moves[name] = torch.cat([common, *(own * common for own in share)], 1)
+            self._moves.setdefault(replays[0][0].trials.session, common)
+            self._places = self._moves[None].shape[1]
+        self._late, count = list[slice | None](), self._places
+        for replay, start in replays:
+            is_late = delay > 0.0 and start.at_rest and replay.trials.observed.shape[1] > 2
+            self._late.append(slice(count, count + len(start.delay)) if is_late else None)
+            count += len(start.delay) if is_late else 0
+        self._count = count
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is nothing to fit."""
+        return self._count == 0
+
+    def __call__(self, series: Sequence[torch.Tensor], prior_weight: float) -> tuple[list[torch.Tensor], Nuisances]:
+        """Residuals with the best places and delays for the first set of parameters, at which the loss is stationary.
+
+        While the weight of the prior is not known, places and delays are nominal.
+
+        Args:
+            series: (E, R, T, M or 4 M, 3) simulated points at the frames, by group [m].
+            prior_weight: of the squared nuisance parameters in standard deviations.
+
+        Returns:
+            (E, R, T, M, 3) by group [m], and what was fitted.
+        """
+        solution = self._centre.new_zeros(self._count)
+        for (_, start), late in zip(self._replays, self._late, strict=True):
+            if late is not None:
+                solution[late] = start.delay / self._delay
+        if self.is_empty or not prior_weight:
+            return [self._errors(n, own, solution) for n, own in enumerate(series)], Nuisances()
+        first = [own[:1].detach() for own in series]
+        with torch.no_grad():
+            for _ in range(_TURNS if self._accuracy is not None and self._accuracy.turn else 1):
+                solution = self._improved(first, solution, prior_weight, self._places)
+            if self._count > self._places:
+                solution = self._on_grid(first, solution, prior_weight)
+                for _ in range(_STEPS):
+                    solution = self._improved(first, solution, prior_weight, self._count)
+            columns = [own.flatten(1, 3).double().cpu().numpy() for _, own in self._linearised(first, solution)]
+        placed = {name: self._placement(name, solution) for name in self._moves}
+        sessions = dict.fromkeys(replay.trials.session for replay, _ in self._replays if placed)
+        fitted = Nuisances(
+            columns=columns,
+            rows=math.sqrt(prior_weight) * solution.double().cpu().numpy(),
+            sessions={session: placed[session] for session in sessions},
+            common=placed.get(None),
+            moves={name: own.double().cpu().numpy() for name, own in self._moves.items() if name is not None},
+        )
+        return [self._errors(n, own, solution) for n, own in enumerate(series)], fitted
+
+    def _placement(self, session: str | None, solution: torch.Tensor) -> Placement:
+        moved = self._moves[session] @ solution[: self._places]
+        return Placement(moved[:-6].view(-1, 3), moved[-6:-3], moved[-3:], self._centre)
+
+    def _points(self, number: int, points: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
+        """(E, R, T, M or 4 M, 3) points of a group, later by its delays."""
+        late, (replay, start) = self._late[number], self._replays[number]
+        if late is None:
+            return points
+        times, delay = replay.trials.times, self._delay * solution[late] - start.delay
+        step, at = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(points), 1)
+        series, beyond = points.flatten(0, 1), (at - times.max()).clamp_min(0.0)[..., None, None]
+        ahead = beyond * (series[:, -1:] - series[:, -2:-1]) / step  # straight on after the last frame
+        return (sample(series, at, step) + ahead).unflatten(0, points.shape[:2])
+
+    def _errors(self, number: int, points: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
+        """(E, R, T, M, 3) residuals of a group [m]."""
+        replay, points = self._replays[number][0], self._points(number, points, solution)
+        if self._accuracy is None:
+            return replay.errors(points)
+        return replay.errors(self._placement(replay.trials.session, solution).places(points)[0])
+
+    def _linearised(
+        self, first: Sequence[torch.Tensor], solution: torch.Tensor
+    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Weighted residuals (R, T, M, 3) of each group and their derivatives (R, T, M, 3, K)."""
+        result = []
+        for number, (points, weight) in enumerate(zip(first, self._weights, strict=True)):
+            replay, late, root = self._replays[number][0], self._late[number], weight.sqrt()[:, None, None, None]
+            errors = self._errors(number, points, solution)[0]
+            columns = errors.new_zeros(*errors.shape, self._count)
+            if self._accuracy is not None:
+                own = self._placement(replay.trials.session, solution)
+                placed = own.places(self._points(number, points, solution)[0])
+                slopes = by_placement(own, *placed) * replay.trials.seen[..., None, None]
+                columns[..., : self._places] = slopes @ self._moves[replay.trials.session]
+            if late is not None:
+                step, rows = _DIFFERENCE * float(replay.trials.times[0, 1]), torch.arange(len(errors))
+                ends = []
+                for by in (step, -step):
+                    moved = solution.clone()
+                    moved[late] += by / self._delay
+                    ends.append(self._errors(number, points, moved)[0])
+                columns[rows, ..., late.start + rows] = (ends[0] - ends[1]) * self._delay / (2.0 * step)
+            result.append((errors * root, columns * root[..., None]))
+        return result
+
+    def _improved(
+        self, first: Sequence[torch.Tensor], solution: torch.Tensor, prior_weight: float, count: int
+    ) -> torch.Tensor:
+        """The solution after a step of the first unknowns of a number."""
+        normal, right = prior_weight * torch.eye(count).to(solution), torch.zeros_like(solution[:count])
+        for residual, columns in self._linearised(first, solution) if count else ():
+            jacobian = columns[..., :count].flatten(0, 3)
+            normal = normal + jacobian.T @ jacobian
+            right = right - jacobian.T @ (residual.flatten() - jacobian @ solution[:count])
+        change = torch.linalg.solve(normal, right) - solution[:count]
+        change[self._places :].clamp_(-_LONGEST, _LONGEST)
+        return torch.cat([solution[:count] + change, solution[count:]])
+
+    def _on_grid(self, first: Sequence[torch.Tensor], solution: torch.Tensor, prior_weight: float) -> torch.Tensor:
+        """The solution with the best delays of a grid for each trial."""
+        grid, best = torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(solution), solution.clone()
+        for number, (points, late) in enumerate(zip(first, self._late, strict=True)):
+            if late is None:
+                continue
+            costs = []
+            for by in grid:
+                moved = solution.clone()
+                moved[late] += by
+                squares = self._errors(number, points, moved)[0].square().sum((1, 2, 3))
+                costs.append(self._weights[number] * squares + prior_weight * moved[late].square())
+            best[late] += grid[torch.stack(costs).argmin(0)]
+        return best

@@ -9,8 +9,6 @@ from .points import MatrixPoints, VectorPoints
 
 wp.set_module_options({"enable_backward": False})
 
-ZERO = wp.float64(0.0)
-
 
 @wp.kernel
 def sum_blocks(
@@ -65,51 +63,48 @@ def cell_blocks(
             blocks_out[b, first + c] = block
 
 
-@wp.kernel
-def cell_pair_blocks(
-    active: wp.array[int],  # (B) zero: skip the environment
-    points: MatrixPoints,
-    tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
-    pairs: wp.array2d[int],  # (K (K + 1) / 2, 2) rows a >= columns c
-    block_offset: int,
-    blocks_out: wp.array2d[wp.mat33d],
-):
-    """`cell_blocks` with one thread per block: more arithmetic, but every block is written once."""
-    b, cell, pair = wp.tid()
-    if active[b] == 0:
-        return
-    a, c = pairs[pair, 0], pairs[pair, 1]
-    total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for q in range(points.per_cell):
-        p = cell * points.per_cell + q
-        g, h = points.operators[p, a], points.operators[p, c]
-        t = tangent[b, p]
-        total += (g[0] * h[0]) * t[0] + (g[1] * h[1]) * t[2] + (g[2] * h[2]) * t[5]
-        total += (g[1] * h[0]) * t[1] + (g[0] * h[1]) * wp.transpose(t[1])
-        total += (g[2] * h[0]) * t[3] + (g[0] * h[2]) * wp.transpose(t[3])
-        total += (g[2] * h[1]) * t[4] + (g[1] * h[2]) * wp.transpose(t[4])
-    blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
+@wp.func
+def matrix_block(t: wp.array[wp.mat33d], g: wp.vec3d, h: wp.vec3d) -> wp.mat33d:
+    """Returns the stiffness between nodes with the operators g and h, from a tangent's six blocks."""
+    total = (g[0] * h[0]) * t[0] + (g[1] * h[1]) * t[2] + (g[2] * h[2]) * t[5]
+    total += (g[1] * h[0]) * t[1] + (g[0] * h[1]) * wp.transpose(t[1])
+    total += (g[2] * h[0]) * t[3] + (g[0] * h[2]) * wp.transpose(t[3])
+    return total + (g[2] * h[1]) * t[4] + (g[1] * h[2]) * wp.transpose(t[4])
 
 
-@wp.kernel
-def line_pair_blocks(
-    active: wp.array[int],  # (B) zero: skip the environment
-    points: VectorPoints,
-    tangent: wp.array3d[wp.mat33d],  # (B, P, 1)
-    pairs: wp.array2d[int],
-    block_offset: int,
-    blocks_out: wp.array2d[wp.mat33d],
-):
-    """`cell_pair_blocks` of an energy that is a function of a vector."""
-    b, cell, pair = wp.tid()
-    if active[b] == 0:
-        return
-    a, c = pairs[pair, 0], pairs[pair, 1]
-    total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
-    for q in range(points.per_cell):
-        p = cell * points.per_cell + q
-        total += (points.operators[p, a] * points.operators[p, c]) * tangent[b, p, 0]
-    blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
+@wp.func
+def vector_block(t: wp.array[wp.mat33d], g: wp.float64, h: wp.float64) -> wp.mat33d:
+    """Returns the same from a tangent's only block."""
+    return (g * h) * t[0]
+
+
+@generated
+def pair_kernel(width: int) -> Any:
+    """Returns `cell_blocks`, for operators of a width of 1 or 3, with one thread per block.
+
+    That is more arithmetic, but every block is written once.
+    """
+    points_type, block = (VectorPoints, vector_block) if width == 1 else (MatrixPoints, matrix_block)
+
+    @wp.kernel(module=named_module(f"hessian_blocks.{width}"))
+    def pair_blocks(
+        active: wp.array[int],  # (B) zero: skip the environment
+        points: points_type,
+        tangent: wp.array3d[wp.mat33d],  # (B, P, 6 or 1)
+        pairs: wp.array2d[int],  # (K (K + 1) / 2, 2) rows a >= columns c
+        block_offset: int,
+        blocks_out: wp.array2d[wp.mat33d],
+    ):
+        b, cell, pair = wp.tid()
+        if active[b] == 0:
+            return
+        total = wp.mat33d()
+        for q in range(points.per_cell):
+            p = cell * points.per_cell + q
+            total += block(tangent[b, p], points.operators[p, pairs[pair, 0]], points.operators[p, pairs[pair, 1]])
+        blocks_out[b, block_offset + cell * pairs.shape[0] + pair] = total
+
+    return pair_blocks
 
 
 @generated
@@ -132,7 +127,7 @@ def scatter_kernel(scalar: Any) -> Any:
         b, block = wp.tid()
         if active[b] == 0:
             return
-        total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+        total = wp.mat33d()
         for entry in range(block_start[block], block_start[block + 1]):
             source = contribution[entry]
             if source >= 0:
@@ -172,7 +167,7 @@ def projection_kernel(scalar: Any) -> Any:
         if active[b] == 0:
             return
         block, row, column = blocks[t, 0], blocks[t, 1], blocks[t, 2]
-        total = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
+        total = wp.mat33d()
         for r in range(3):
             for c in range(3):
                 at = address[block, 3 * r + c]

@@ -90,11 +90,32 @@ def value_reader(vector: Any) -> Any:
     return read_values
 
 
+@wp.func
+def matrix_product(t: wp.array[wp.mat33d], df: wp.mat33d) -> wp.mat33d:
+    """Returns the product of a tangent's six blocks with a change of F."""
+    columns = wp.transpose(df)
+    x = columns[0]
+    y = columns[1]
+    z = columns[2]
+    return wp.matrix_from_cols(
+        t[0] * x + wp.transpose(t[1]) * y + wp.transpose(t[3]) * z,
+        t[1] * x + t[2] * y + wp.transpose(t[4]) * z,
+        t[3] * x + t[4] * y + t[5] * z,
+    )
+
+
+@wp.func
+def vector_product(t: wp.array[wp.mat33d], dx: wp.vec3d) -> wp.vec3d:
+    """Returns the product of a tangent's only block with a change of a vector."""
+    return t[0] * dx
+
+
 @generated
-def gather_kernels(width: int) -> SimpleNamespace:
-    """Returns kernels from stresses to forces, for operators with three components or one."""
+def set_kernels(width: int) -> SimpleNamespace:
+    """Returns kernels from stresses to forces and from tangents to stresses, for operators of a width of 1 or 3."""
     module = named_module(f"points.{width}")
     points_type, shape = (VectorPoints, wp.vec3d) if width == 1 else (MatrixPoints, wp.mat33d)
+    see, product = (vector_at, vector_product) if width == 1 else (matrix_at, matrix_product)
 
     @wp.kernel(module=module)
     def gather(
@@ -136,7 +157,17 @@ def gather_kernels(width: int) -> SimpleNamespace:
             total += stress[b, p] * points.operators[p, a]
         force_out[b, entry] = total
 
-    return SimpleNamespace(gather=gather, cell_forces=cell_forces)
+    @wp.kernel(module=module)
+    def tangent_product(
+        points: points_type,
+        tangent: wp.array3d[wp.mat33d],  # (B, P, 6 or 1)
+        direction: wp.array2d[wp.vec3d],  # (B, N) [m]
+        stress_out: wp.array2d[shape],  # (B, P) its derivative in that direction
+    ):
+        b, p = wp.tid()
+        stress_out[b, p] = product(tangent[b, p], see(points, direction, b, p))
+
+    return SimpleNamespace(gather=gather, cell_forces=cell_forces, tangent_product=tangent_product)
 
 
 @wp.kernel
@@ -180,37 +211,3 @@ def project(
     """Removes the components of vectors that are normal to symmetry planes."""
     b, r = wp.tid()
     vectors_out[b, vertices[r]] = projections[r] * vectors_out[b, vertices[r]]
-
-
-@wp.kernel
-def tangent_product(
-    points: MatrixPoints,
-    tangent: wp.array3d[wp.mat33d],  # (B, P, 6)
-    direction: wp.array2d[wp.vec3d],  # (B, N) [m]
-    stress_out: wp.array2d[wp.mat33d],  # (B, P) dP in that direction [J]
-):
-    """Derivative of the stress in a direction."""
-    b, p = wp.tid()
-    df = matrix_at(points, direction, b, p)
-    t = tangent[b, p]
-    columns = wp.transpose(df)
-    x = columns[0]
-    y = columns[1]
-    z = columns[2]
-    stress_out[b, p] = wp.matrix_from_cols(
-        t[0] * x + wp.transpose(t[1]) * y + wp.transpose(t[3]) * z,
-        t[1] * x + t[2] * y + wp.transpose(t[4]) * z,
-        t[3] * x + t[4] * y + t[5] * z,
-    )
-
-
-@wp.kernel
-def line_tangent_product(
-    points: VectorPoints,
-    tangent: wp.array3d[wp.mat33d],  # (B, P, 1)
-    direction: wp.array2d[wp.vec3d],  # (B, N) [m]
-    stress_out: wp.array2d[wp.vec3d],  # (B, P)
-):
-    """Derivative of the stress in a direction, for an energy that is a function of a vector."""
-    b, p = wp.tid()
-    stress_out[b, p] = tangent[b, p, 0] * vector_at(points, direction, b, p)

@@ -17,13 +17,13 @@ import warp as wp
 import warp_resphys.kernels
 from warp_resphys.kernels.axial import MUSCLE
 from warp_resphys.kernels.elasticity import solid_kernels
-from warp_resphys.kernels.hessian_blocks import projection_kernel, scatter_kernel
+from warp_resphys.kernels.hessian_blocks import pair_kernel, projection_kernel, scatter_kernel
 from warp_resphys.kernels.lanes import cell_step, cell_tangent
 from warp_resphys.kernels.laws import point_kernels
 from warp_resphys.kernels.lbfgs import lbfgs_kernels
 from warp_resphys.kernels.line_search import accept_kernel
 from warp_resphys.kernels.materials import corotated
-from warp_resphys.kernels.points import gather_kernels
+from warp_resphys.kernels.points import set_kernels
 from warp_resphys.kernels.tiled_cholesky import tiled_kernels
 
 wp.set_module_options({"enable_backward": False})
@@ -34,11 +34,11 @@ FOLDER = Path(warp_resphys.kernels.__file__).parent
 def kernels():
     """One of every kernel of the package, by file and name."""
     names = [info.name for info in pkgutil.walk_packages([str(FOLDER)], "warp_resphys.kernels.")]
-    made = [*map(importlib.import_module, names), point_kernels(MUSCLE), *map(gather_kernels, (1, 3))]
+    made = [*map(importlib.import_module, names), point_kernels(MUSCLE), *map(set_kernels, (1, 3))]
     made += [make(wp.float64) for make in (lbfgs_kernels, tiled_kernels)]
     made += [solid_kernels(corotated.LAW)]
     found = [kernel for holder in made for kernel in vars(holder).values() if isinstance(kernel, wp.Kernel)]
-    found += [make(wp.float64) for make in (accept_kernel, projection_kernel, scatter_kernel)]
+    found += [make(wp.float64) for make in (accept_kernel, projection_kernel, scatter_kernel)] + [pair_kernel(3)]
     found += [make(corotated.LAW) for make in (cell_step, cell_tangent)]
     return {(Path(inspect.getsourcefile(kernel.func)).name, kernel.func.__name__): kernel for kernel in found}
 

@@ -107,7 +107,7 @@ class HessianAssembly:
             kernel, threads = kernels.cell_blocks, s.nodes_per_cell
             if p.by_cells or s.width == 1:
                 pairs = np.stack(np.tril_indices(s.nodes_per_cell), axis=1).astype(np.int32)
-                kernel, threads = kernels.line_pair_blocks if s.width == 1 else kernels.cell_pair_blocks, len(pairs)
+                kernel, threads = kernels.pair_kernel(s.width), len(pairs)
                 inputs.append(p.upload(pairs, int))
             out = [warp_view(blocks, wp.mat33d)]
             commands.append(p.record(kernel, (p.batch, s.cells, threads), [*inputs, offset], out))

@@ -32,10 +32,10 @@ def _kernels(energies: Sequence[PlacedEnergy], device: torch.device, dtype: torc
     scalar = wp.float64 if dtype == torch.float64 else wp.float32
     solids = [placed.energy for placed in energies if isinstance(placed.energy, Solid)]
     return [
-        *(points.gather_cells, points.gather_kernels(3).gather, reductions.masked_norm),
+        *(points.gather_cells, points.set_kernels(3).gather, reductions.masked_norm),
         *(solid.kernel(device) for solid in solids),
         *(
-            hessian_blocks.cell_blocks,
+            hessian_blocks.pair_kernel(3) if device.type == "cuda" else hessian_blocks.cell_blocks,
             hessian_blocks.scatter_kernel(scalar),
             minimisation.begin,
             lbfgs_kernels(scalar).project,

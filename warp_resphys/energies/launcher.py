@@ -104,7 +104,7 @@ class Launcher:
         With ``by_cells``, or many points and several of them in a cell, there are two launches, which read the stress
         of a cell once for all its nodes.
         """
-        outputs, kernels = [warp_view(out, wp.vec3d)], points.gather_kernels(s.width)
+        outputs, kernels = [warp_view(out, wp.vec3d)], points.set_kernels(s.width)
         if not self.by_cells and (s.points_per_cell == 1 or s.n_points < _MANY_POINTS):
             inputs = [s.points, s.start, s.incident, stress]
             return self.record(kernels.gather, (self.batch, out.shape[1]), inputs, outputs)
@@ -118,7 +118,7 @@ class Launcher:
     def product(self, s: Any, tangent: Any, direction: Any, stress: Any) -> Any:
         """Returns a launch that computes a set's stress from its tangent (B, P, blocks) and a direction (B, N)."""
         inputs = [s.points, tangent, direction]
-        kernel = points.line_tangent_product if s.width == 1 else points.tangent_product
+        kernel = points.set_kernels(s.width).tangent_product
         return self.record(kernel, (self.batch, s.n_points), inputs, [stress])
 
     def capture(self, *commands: Any) -> "CapturedGraph | LaunchSequence":

@@ -1,11 +1,10 @@
-"""The scripted policy, the adapter to Stable-Baselines3, trained policies, and the speed of environments."""
+"""The scripted policy, the adapter to Stable-Baselines3, and trained policies."""
 
 import json
 from functools import partial
 
 import numpy as np
 import pytest
-from benchmarks.steps import environments
 
 from support.main_job import end_of
 from warp_resphys import cli
@@ -130,12 +129,3 @@ def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong):
     code, err = end_of(cli.main, "warp-resphys", "train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
     assert code == 2
     assert err.startswith(f"error: {wrong.split('=')[0]}")
-
-
-@pytest.mark.slow
-def test_speeds_are_those_of_all_robots(folder):
-    rows = environments(folder, [1, 2], 1, "cpu")
-    assert [row["robots"] for row in rows] == [1, 2]
-    for row in rows:
-        assert row["actions_per_s"] == pytest.approx(1e3 * row["robots"] / row["action_ms"])
-        assert row["steps_per_s"] == pytest.approx(5 * row["actions_per_s"])

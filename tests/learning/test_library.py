@@ -6,12 +6,14 @@ import torch
 
 import warp_resphys as wr
 from warp_resphys.data.markers import WHOLE_STATE
+from warp_resphys.io.fan_out import Workers
+from warp_resphys.io.parts import Parts
 from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.fitting import Fitting, fit_force
 from warp_resphys.learning.identification.identification import identify
 from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.learning.reconstruction import reconstruct
-from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
+from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0))
@@ -109,6 +111,23 @@ def test_the_network_has_the_actuation_as_input():
     assert float(evaluate(simulator, motion(1), force).mean()) < 0.2 * float(uncorrected.mean())
     factor = identify(simulator, motion(0, 1, 2), {"tendon_tension_factor": (0.5, 3.0)})
     assert factor.parameters["tendon_tension_factor"] == pytest.approx(1.5, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_workers_training_through_the_simulator_and_recurrent_networks_are_for_functions_too(robot):
+    wrong, seen = beam(200e3), let_go(robot, 0.04, 0.07, 0.1, 0.13, known_start=True)
+    found = reconstruct(wrong, seen, parts=Parts("reconstruct", Workers(2), batch=1))
+    np.testing.assert_array_equal(found.read("force"), reconstruct(wrong, seen).read("force"))
+    modes = {"position_modes": 3, "velocity_modes": 3, "force_modes": 4, "layers": 1, "width": 16}
+    one = {"validation": ["motion 3"], "network": NetworkSettings(**modes)}
+    looped = fit_force(wrong, seen, found, **one, in_the_loop=InTheLoopSettings(epochs=3))
+    one["network"] = NetworkSettings(**modes, recurrent=8)
+    recurrent = fit_force(wrong, seen, found, **one, trainer=TrainerSettings(epochs=10, sequence=10))
+    uncorrected, *errors = (
+        evaluate(wrong, seen, force, names=["motion 3"]).mean() for force in (None, looped, recurrent)
+    )
+    assert errors[0] < 0.4 * uncorrected
+    assert errors[1] < 0.1 * uncorrected
 
 
 def test_forces_from_markers_bring_the_markers_there(robot):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
 from support.regions import beam, two_boxes
@@ -39,11 +40,11 @@ def test_composed_points_give_the_same_deformation_gradients():
 
 
 def test_glue_to_a_vertex_that_is_glued_is_resolved():
-    one, two = np.array([1.0]), np.array([0.25, 0.75])
-    chain = Coordinates.of(4, {1: (np.array([0]), one), 2: (np.array([0, 1]), two), 3: (np.array([2]), one)})
+    pairs = ([1, 2, 2, 3], [0, 0, 1, 2])
+    chain = Coordinates.of(scipy.sparse.csr_array(([1.0, 0.25, 0.75, 1.0], pairs), (4, 4)))
     np.testing.assert_allclose(chain.matrix.toarray()[:, 0], np.ones(4))
     with pytest.raises(InputError, match="determine each other"):
-        Coordinates.of(2, {0: (np.array([1]), one), 1: (np.array([0]), one)})
+        Coordinates.of(scipy.sparse.csr_array(([1.0, 1.0], ([0, 1], [1, 0])), (2, 2)))
 
 
 MESH, ENDS = two_boxes()

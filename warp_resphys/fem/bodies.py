@@ -15,7 +15,7 @@ from ..io.errors import InputError
 from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
-from .coordinates import Coordinates, SymmetryPlane, rigid_weights
+from .coordinates import Coordinates, SymmetryPlane, dependence, rigid_weights
 from .integration_points import Discretisation, Points, discretise
 
 MASS_MODES = ("row_sum", "per_vertex")
@@ -282,7 +282,7 @@ class Body:
                 they are glued to.
             MeshError: an unknown region.
         """
-        weights: dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
+        weights = scipy.sparse.csr_array((self.n_vertices, self.n_vertices))
         controls: dict[str, NDArray[np.int64]] = {}
         part_of_vertex: dict[int, str] = {}
         for name in self.rigid:
@@ -299,19 +299,17 @@ class Body:
                 raise InputError(f"the rigid parts {other!r} and {name!r} share vertices: make them one region.")
             part_of_vertex |= dict.fromkeys(vertices.tolist(), name)
             controls[name], part_weights = rigid_weights(self.mesh.vertices, vertices, name, self.symmetry)
-            weights |= part_weights
+            weights += part_weights
         for glue in self.glued:
             glued = self._glued_weights(glue, part_of_vertex)
-            if twice := weights.keys() & glued.keys():
-                raise InputError(f"vertex {min(twice)} is glued twice: leave it out of the glue to {glue.to!r}.")
-            weights |= glued
-        coordinates = Coordinates.of(self.n_vertices, weights)
-        return controls, coordinates.with_planes(self.symmetry, self.mesh.vertices, self.fixed_vertices)
+            twice = np.flatnonzero(np.diff(weights.indptr) * np.diff(glued.indptr))
+            if len(twice):
+                raise InputError(f"vertex {twice[0]} is glued twice: leave it out of the glue to {glue.to!r}.")
+            weights += glued
+        return controls, Coordinates.of(weights).with_planes(self.symmetry, self.mesh.vertices, self.fixed_vertices)
 
-    def _glued_weights(
-        self, glue: Glue, rigid: Mapping[int, str]
-    ) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Returns control vertices and weights of glued vertices, from the shape functions of the containing cells."""
+    def _glued_weights(self, glue: Glue, rigid: Mapping[int, str]) -> scipy.sparse.csr_array:
+        """Returns weights (N, N) of control vertices in glued ones, from shape functions of the containing cells."""
         vertices = np.unique(_vertex_indices(glue.vertices, self.n_vertices, "glued vertices"))
         cells = self.mesh.cells[self.mesh.region(glue.to)]
         for what, others in (("fixed", self.fixed_vertices), ("part of a rigid part", np.array(list(rigid)))):
@@ -328,7 +326,7 @@ class Body:
                 f"vertex {vertices[far]} is {places.outside[far]:.3g} m from the region {glue.to!r} that it is glued "
                 f"to, farther than the tolerance of {glue.tolerance:g} m: move the meshes together, or raise it."
             )
-        return {int(i): (cells[c], w) for i, c, w in zip(vertices, places.cells, places.weights, strict=True)}
+        return dependence(self.n_vertices, vertices, cells[places.cells], places.weights)
 
     @cached_property
     def mass_volume(self) -> scipy.sparse.csr_array:

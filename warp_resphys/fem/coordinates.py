@@ -8,7 +8,7 @@ the Hessian in r, W^T H W, is assembled without forming H. A control vertex in a
 position x0 moves along the plane only: P = I - n n^T and o = (I - P) x0; for all other vertices P = I.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
@@ -19,7 +19,7 @@ import torch
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
-from .integration_points import Points
+from .integration_points import Points, padded_operators
 
 P = TypeVar("P", bound=Points)
 _ROUNDING = 1e-9  # weights up to this size are zero but for rounding
@@ -76,24 +76,19 @@ class Coordinates:
     offsets: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (R, 3) o of the sliding vertices [m]
 
     @classmethod
-    def of(cls, n_vertices: int, weights: Mapping[int, tuple[IntArray, FloatArray]]) -> "Coordinates":
-        """Builds the map from the control vertices and weights of each dependent vertex.
+    def of(cls, dependence: scipy.sparse.csr_array) -> "Coordinates":
+        """Builds the map from the weights (N, N) of the control vertices in each dependent vertex.
 
         A dependent vertex may be a weighted sum of other dependent vertices; these are substituted.
 
         Raises:
             InputError: two vertices determine each other.
         """
-        dependent = np.array(sorted(weights), dtype=np.int64)
-        if not len(dependent):
-            return cls(n_vertices, dependent, scipy.sparse.csr_array((0, n_vertices)))
+        n_vertices, dependent = dependence.shape[0], np.flatnonzero(np.diff(dependence.indptr))
         free = np.ones(n_vertices)
         free[dependent] = 0.0
-        rows = np.repeat(dependent, [len(weights[i][0]) for i in dependent])
-        columns, values = (np.concatenate([weights[i][k] for i in dependent]) for k in (0, 1))
-        given = scipy.sparse.csr_array((values, (rows, columns)), (n_vertices, n_vertices))
-        matrix = scipy.sparse.csr_array(scipy.sparse.diags_array(free) + given)
-        for _ in range(len(dependent)):
+        matrix = scipy.sparse.csr_array(scipy.sparse.diags_array(free) + dependence)
+        for _ in dependent:
             if not matrix[:, dependent].nnz:
                 break
             matrix = scipy.sparse.csr_array(matrix @ matrix)
@@ -158,50 +153,34 @@ class Coordinates:
         free[self.dependent] = 0.0
         return scipy.sparse.csr_array(scipy.sparse.diags_array(free) + identity[:, self.dependent] @ self.weights)
 
-    @cached_property
-    def _rows(self) -> dict[int, tuple[IntArray, FloatArray]]:
-        """Control vertices and weights of each dependent vertex."""
-        w = self.weights
-        return {
-            int(vertex): (w.indices[w.indptr[k] : w.indptr[k + 1]], w.data[w.indptr[k] : w.indptr[k + 1]])
-            for k, vertex in enumerate(self.dependent)
-        }
-
     def compose(self, points: P) -> P:
         """Returns points whose operators act on control vertices."""
         touched = np.flatnonzero(np.isin(points.nodes, self.dependent).any(axis=1))
         if not len(touched):
             return points
-        lists: list[tuple[IntArray, FloatArray]] = []
-        for cell in touched:
-            nodes, operators = points.nodes[cell], points.gradients[cell]  # (K,), (Q, K, 1 or 3)
-            sums = dict[int, FloatArray]()
-            for a, node in enumerate(nodes.tolist()):
-                controls, weights = self._rows.get(node, (np.array([node]), np.ones(1)))
-                for control, weight in zip(controls.tolist(), weights, strict=True):
-                    sums[control] = sums.get(control, 0.0) + weight * operators[:, a]
-            lists.append((np.array(list(sums), dtype=np.int64), np.stack(list(sums.values()), axis=1)))
-        width = max(points.nodes.shape[1], *(len(nodes) for nodes, _ in lists))
-        cells, per_cell, old, components = points.gradients.shape
+        cells, per_cell, k, components = points.gradients.shape
+        rows = self.matrix[points.nodes[touched].ravel()]  # (T K, N)
+        node = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
+        operators = points.gradients[touched].swapaxes(1, 2).reshape(-1, per_cell, components)[node]
+        first = rows.indices[rows.indptr[:-1:k]]  # a control vertex of each cell
+        own, composed = padded_operators(node // k, rows.indices, rows.data[:, None, None] * operators, first)
+        width = max(k, own.shape[1])
         # Cells are padded with their first vertex and a zero operator.
         nodes = np.repeat(points.nodes[:, :1], width, axis=1)
-        operators = np.zeros((cells, per_cell, width, components))
-        nodes[:, :old], operators[:, :, :old] = points.nodes, points.gradients
-        for cell, (own, operator) in zip(touched, lists, strict=True):
-            nodes[cell], operators[cell] = own[0], 0.0
-            nodes[cell, : len(own)], operators[cell, :, : len(own)] = own, operator
-        return replace(points, nodes=nodes, gradients=operators)
+        gradients = np.zeros((cells, per_cell, width, components))
+        nodes[:, :k], gradients[:, :, :k] = points.nodes, points.gradients
+        nodes[touched], gradients[touched] = first[:, None], 0.0
+        nodes[touched, : own.shape[1]] = own
+        gradients[touched, :, : own.shape[1]] = composed.swapaxes(1, 2)
+        return replace(points, nodes=nodes, gradients=gradients)
 
     @cached_property
     def points(self) -> Points:
         """One point per dependent vertex, whose operator gives the vertex's position."""
-        width = int(np.diff(self.weights.indptr).max())
-        nodes = np.zeros((len(self.dependent), width), dtype=np.int64)
-        operators = np.zeros((len(self.dependent), 1, width, 1))
-        for row, (controls, weights) in enumerate(self._rows.values()):
-            nodes[row], nodes[row, : len(controls)] = controls[0], controls
-            operators[row, 0, : len(controls), 0] = weights
-        return Points(nodes, operators)
+        w, count = self.weights, len(self.dependent)
+        rows, first = np.repeat(np.arange(count), np.diff(w.indptr)), w.indices[w.indptr[:-1]]
+        nodes, operators = padded_operators(rows, w.indices, w.data[:, None, None], first)
+        return Points(nodes, operators.swapaxes(1, 2))
 
 
 def weighted_sum(weights: torch.Tensor, fields: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -342,9 +321,15 @@ def barycentric(corners: FloatArray, places: FloatArray) -> FloatArray:
 
 def rigid_weights(
     vertices: FloatArray, members: IntArray, name: str, planes: Sequence[SymmetryPlane] = ()
-) -> tuple[IntArray, dict[int, tuple[IntArray, FloatArray]]]:
-    """Returns the four control vertices of a rigid part, and control vertices and weights of its other vertices."""
+) -> tuple[IntArray, scipy.sparse.csr_array]:
+    """Returns the four control vertices of a rigid part, and their weights (N, N) in its other vertices."""
     controls = control_vertices(vertices, members, name, planes)
     others = np.setdiff1d(members, controls)
     weights = barycentric(vertices[controls], vertices[others])
-    return controls, {int(i): (controls, w) for i, w in zip(others, weights, strict=True)}
+    return controls, dependence(len(vertices), others, np.tile(controls, (len(others), 1)), weights)
+
+
+def dependence(n_vertices: int, vertices: IntArray, controls: IntArray, weights: FloatArray) -> scipy.sparse.csr_array:
+    """Returns the weights (S, K) of control vertices (S, K) in vertices (S,) as a matrix (N, N)."""
+    pairs = np.repeat(vertices, controls.shape[1]), controls.ravel()
+    return scipy.sparse.csr_array((weights.ravel(), pairs), (n_vertices, n_vertices))

@@ -245,18 +245,34 @@ def mean_gradients(
     parts = shares.tocoo()
     vertex, cell = parts.row, parts.col
     share = parts.data / np.asarray(shares.sum(axis=1)).ravel()[vertex]
-    node = cells[cell].ravel()
-    keys, inverse = np.unique(np.repeat(vertex, k) * n + node, return_inverse=True)
-    operator = np.zeros((len(keys), 3))
-    np.add.at(operator, inverse, (share[:, None, None] * gradients[cell]).reshape(-1, 3))
-    row, column = keys // n, keys % n
-    place = np.arange(len(keys)) - np.searchsorted(row, np.arange(n))[row]
-    width = int(place.max()) + 1
-    nodes = np.repeat(np.arange(n)[:, None], width, axis=1)
-    padded = np.zeros((n, width, 3))
-    nodes[row, place] = column
-    padded[row, place] = operator
-    return nodes, padded
+    operators = (share[:, None, None] * gradients[cell]).reshape(-1, 3)
+    return padded_operators(np.repeat(vertex, k), cells[cell].ravel(), operators, np.arange(n))
+
+
+def padded_operators(
+    rows: NDArray[np.int64], nodes: NDArray[np.int64], operators: Array, padding: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array]:
+    """Sums the operators of each node in a row, and pads the rows to one width.
+
+    Args:
+        rows: (E,) row of each operator.
+        nodes: (E,) vertex on which it acts.
+        operators: (E, ...) operators.
+        padding: (R,) vertex of each row that fills it up, with operators of zero.
+
+    Returns:
+        (R, W) vertices of each row and (R, W, ...) their operators.
+    """
+    count = int(nodes.max()) + 1
+    keys, inverse = np.unique(rows * count + nodes, return_inverse=True)
+    sums = np.zeros((len(keys), *operators.shape[1:]))
+    np.add.at(sums, inverse, operators)
+    row, column = np.divmod(keys, count)
+    place = np.arange(len(keys)) - np.searchsorted(row, np.arange(len(padding)))[row]
+    padded_nodes = np.repeat(padding[:, None], int(place.max()) + 1, axis=1)
+    padded = np.zeros((*padded_nodes.shape, *operators.shape[1:]))
+    padded_nodes[row, place], padded[row, place] = column, sums
+    return padded_nodes, padded
 
 
 def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[np.float64]:

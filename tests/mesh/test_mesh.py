@@ -123,29 +123,6 @@ def test_boundary_encloses_the_cells_of_a_distorted_mesh_with_a_cavity() -> None
     assert enclosed_volume(mesh) == pytest.approx(cell_volumes(mesh).sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize("size", [(0.1, 0, 1), (1, np.nan, 1), (1, 1), 0.1])
-def test_bad_sizes_are_refused(size: tuple[float, ...]) -> None:
-    with pytest.raises(MeshError, match="size of a box must be three positive lengths"):
-        box_hexahedra(size)
-
-
-@pytest.mark.parametrize("divisions", [(1, 0, 1), (1, 2.0, 1), (1, 1), (True, True, True)])
-def test_bad_divisions_are_refused(divisions: tuple[int, ...]) -> None:
-    with pytest.raises(MeshError, match="divisions of a box must be three positive integers"):
-        box_tetrahedra(divisions=divisions)
-
-
-def test_order_and_kind_are_checked() -> None:
-    with pytest.raises(MeshError, match="order of tetrahedra must be 1 or 2, not 3"):
-        box_tetrahedra(order=3)
-    with pytest.raises(MeshError, match="hexahedra have 8, 20 or 27 nodes, not 26"):
-        box_hexahedra(nodes=26)
-    with pytest.raises(MeshError, match="nodes of tetrahedron10 cannot be added to hexahedron cells"):
-        quadratic(box_hexahedra(), "tetrahedron10")
-    with pytest.raises(MeshError, match="nodes of a quadratic element cannot be added to tetrahedron10 cells"):
-        quadratic(box_tetrahedra(order=2))
-
-
 def test_selection_of_a_plane_and_of_an_edge() -> None:
     mesh = box_hexahedra()
     assert select_vertices(mesh, x=0.0).tolist() == list(range(16))
@@ -155,33 +132,38 @@ def test_selection_of_a_plane_and_of_an_edge() -> None:
     assert select_vertices(mesh, x=[0.1, 0.2], y=(-1.0, 0.0)).tolist() == [160, 161, 162, 163]
 
 
-def test_empty_selections_are_refused() -> None:
-    mesh = box_hexahedra()
-    with pytest.raises(
-        MeshError, match=r"x = 0\.2 m: .* give a range for a face that is not flat, as in x=\[0, 0\.01\]"
-    ):
-        select_vertices(mesh, x=0.2)
-    with pytest.raises(MeshError, match=r"x = 0\.011 to 0\.019 m"):
-        select_vertices(mesh, x=[0.011, 0.019])
-    with pytest.raises(MeshError, match="at least one of the coordinates"):
-        select_vertices(mesh)
-    for wrong in ([0.02, 0.01], [0.0, 0.01, 0.02], [], float("nan"), [0.0, float("inf")]):
-        with pytest.raises(MeshError, match=r"a selection of vertices at x = .*: give one number, or two that rise"):
-            select_vertices(mesh, x=wrong)
+SIZE, DIVISIONS = "size of a box must be three positive lengths", "divisions of a box must be three positive integers"
+BEAM = box_hexahedra()
+REFUSED = [
+    *((lambda size=size: box_hexahedra(size), SIZE) for size in ((0.1, 0, 1), (1, np.nan, 1), (1, 1), 0.1)),
+    *(
+        (lambda counts=counts: box_tetrahedra(divisions=counts), DIVISIONS)
+        for counts in ((1, 0, 1), (1, 2.0, 1), (1, 1), (True, True, True))
+    ),
+    (lambda: box_tetrahedra(order=3), "order of tetrahedra must be 1 or 2, not 3"),
+    (lambda: box_hexahedra(nodes=26), "hexahedra have 8, 20 or 27 nodes, not 26"),
+    (lambda: quadratic(BEAM, "tetrahedron10"), "nodes of tetrahedron10 cannot be added to hexahedron cells"),
+    (lambda: quadratic(box_tetrahedra(order=2)), "of a quadratic element cannot be added to tetrahedron10 cells"),
+    (lambda: Mesh(np.zeros((4, 2)), np.zeros((1, 4), int)), "^vertices must be"),
+    (lambda: Mesh(np.zeros((4, 3), complex), np.zeros((1, 4), int)), "^vertices must be"),
+    (lambda: Mesh(np.zeros((4, 3)), np.zeros((1, 5), int)), "^cells must be"),
+    (lambda: Mesh(np.zeros((4, 3)), np.zeros((1, 4))), "^cells must be"),
+    (lambda: select_vertices(BEAM, x=0.2), r"x = 0\.2 m: .* a range for a face that is not flat, as in x=\[0, 0\.01\]"),
+    (lambda: select_vertices(BEAM, x=[0.011, 0.019]), r"x = 0\.011 to 0\.019 m"),
+    (lambda: select_vertices(BEAM), "at least one of the coordinates"),
+    *(
+        (lambda at=at: select_vertices(BEAM, x=at), r"vertices at x = .*: give one number, or two that rise")
+        for at in ([0.02, 0.01], [0.0, 0.01, 0.02], [], float("nan"), [0.0, float("inf")])
+    ),
+    (lambda: read_mesh(__file__, units="inch"), "m, cm, mm, not inch"),
+    (lambda: read_mesh(__file__, order=3), "order of a mesh must be 1 or 2, not 3"),
+]
 
 
-@pytest.mark.parametrize(
-    ("vertices", "cells", "which"),
-    [
-        (np.zeros((4, 2)), np.zeros((1, 4), int), "vertices"),
-        (np.zeros((4, 3), complex), np.zeros((1, 4), int), "vertices"),
-        (np.zeros((4, 3)), np.zeros((1, 5), int), "cells"),
-        (np.zeros((4, 3)), np.zeros((1, 4)), "cells"),
-    ],
-)
-def test_bad_shapes_and_types_are_refused(vertices: np.ndarray, cells: np.ndarray, which: str) -> None:
-    with pytest.raises(MeshError, match=f"^{which} must be"):
-        Mesh(vertices, cells)
+@pytest.mark.parametrize(("make", "message"), REFUSED)
+def test_bad_arguments_are_refused(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(MeshError, match=message):
+        make()
 
 
 TURNED = [4, 5, 6, 7, 0, 1, 2, 3]
@@ -331,14 +313,6 @@ def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sent
     path.write_text("*ELSET, ELSET=all, GENERATE\n1, 10000000000\n")
     with pytest.raises(MeshError, match=r"big\.inp: it takes more than 20\d\d MiB of memory"):
         read_mesh(path)
-
-
-def test_arguments_of_reading_are_checked(tmp_path: Path) -> None:
-    path = write(tmp_path / "box.vtk", box_tetrahedra())
-    with pytest.raises(MeshError, match="m, cm, mm, not inch"):
-        read_mesh(path, units="inch")
-    with pytest.raises(MeshError, match="order of a mesh must be 1 or 2, not 3"):
-        read_mesh(path, order=3)
 
 
 @pytest.mark.slow

@@ -47,12 +47,12 @@ class Corotation:
                 p.record(kernels.cell_gradients, (p.batch, s.cells), [s.points, operators, positions], [gradient]),
                 p.record(kernels.sum_at_vertices, shape, [s.start, s.incident, s.nodes_per_cell, gradient], [total]),
             ]
-        held = np.zeros(shape[1], dtype=np.int32)
-        held[p.coordinates.sliding.cpu().numpy()] = 1
-        commands.append(p.record(kernels.rotation, shape, [p.upload(held, int), total], [rotation]))
-        own = [p.upload(vertices.astype(np.int32), int), before, rotation]
+        slides = np.zeros(shape[1], dtype=np.int32)
+        slides[p.coordinates.sliding.cpu().numpy()] = 1
+        commands.append(p.record(kernels.rotation, shape, [p.upload(slides, int), total], [rotation]))
+        inputs = [p.upload(vertices.astype(np.int32), int), before, rotation]
         self._compute = p.capture(*commands)
-        self._compare = p.capture(p.record(kernels.rotation_since, (p.batch, len(vertices)), own, [since]))
+        self._compare = p.capture(p.record(kernels.rotation_since, (p.batch, len(vertices)), inputs, [since]))
 
     def record(self, active: torch.Tensor | None = None) -> None:
         """Records the rotations at the potential's positions as those of new factors of environments (B,), or all."""

@@ -77,11 +77,15 @@ class _Minimisation:
         start, *others = (None if tensor is None else tensor.detach() for tensor in tensors)
         assert start is not None
 
-        def work(rows: slice, own: Workspace, minimiser: Minimiser) -> tuple[torch.Tensor, SolveReport]:
+        def work(rows: slice, workspace: Workspace, minimiser: Minimiser) -> tuple[torch.Tensor, SolveReport]:
             follows = None if self.follows is None else self.follows[rows]
-            return _minimise(own, minimiser, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others)))
+            return _minimise(
+                workspace, minimiser, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others))
+            )
 
-        results = self._in_shards(lambda own: own.minimiser(self.purpose, self.settings), work, start[0].numel())
+        results = self._in_shards(
+            lambda workspace: workspace.minimiser(self.purpose, self.settings), work, start[0].numel()
+        )
         self.report = _joined([report for _, report in results])
         return results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
 
@@ -96,12 +100,12 @@ class _Minimisation:
         single = self.settings.factors == "single"
         types = (torch.float32, torch.float64) if single else (torch.float64,)
 
-        def prepare(own: Workspace) -> list[ExactHessian]:
-            own.potential.prepare_adjoint()
-            return [own.hessian(self.settings.linear_solver, dtype) for dtype in types]
+        def prepare(workspace: Workspace) -> list[ExactHessian]:
+            workspace.potential.prepare_adjoint()
+            return [workspace.hessian(self.settings.linear_solver, dtype) for dtype in types]
 
-        def work(rows: slice, own: Workspace, hessians: list[ExactHessian]) -> tuple[torch.Tensor | None, ...]:
-            return _adjoint(own, hessians, self.names, needed, *(_rows(t, rows) for t in (gradient, x, *terms)))
+        def work(rows: slice, workspace: Workspace, hessians: list[ExactHessian]) -> tuple[torch.Tensor | None, ...]:
+            return _adjoint(workspace, hessians, self.names, needed, *(_rows(t, rows) for t in (gradient, x, *terms)))
 
         try:
             gradients = self._in_shards(prepare, work, gradient[0].numel())
@@ -114,7 +118,7 @@ class _Minimisation:
     ) -> list[T]:
         """Returns the results of work in all shards, each with what was prepared for it in this thread."""
         with self.workspace.potential.lock:
-            parts = [(rows, own, prepare(own)) for rows, own in self.workspace.parts]
+            parts = [(rows, workspace, prepare(workspace)) for rows, workspace in self.workspace.parts]
             with threads_for(unknowns, len(parts)):
                 return in_threads(lambda part: work(*part), parts)
 

@@ -47,15 +47,15 @@ def warn_of_cells(body: Body, placed: Sequence[PlacedEnergy], q: FloatArray, val
     """
     warned = False
     solids = [
-        (item, item.energy, own) for item, own in zip(placed, values, strict=True) if isinstance(item.energy, Solid)
+        (item, item.energy, known) for item, known in zip(placed, values, strict=True) if isinstance(item.energy, Solid)
     ]
-    for name, own, first in body.members:
-        if own.mesh.element.parents:
+    for name, member, first in body.members:
+        if member.mesh.element.parents:
             continue
-        at, regions = q[first : first + own.n_vertices], dict[str, FloatArray]()
+        at, regions = q[first : first + member.n_vertices], dict[str, FloatArray]()
         for item, solid, known in solids:
             stiffness = known["stiffness"]
-            if item.first == first and item.body is own and stiffness is not None:
+            if item.first == first and item.body is member and stiffness is not None:
                 region = item.prefix.removeprefix(f"{name}_" if name else "").removesuffix("_")
                 regions[region] = _energies(solid, at, stiffness[0].detach().double().cpu().numpy())
         energies = sum(regions.values(), np.zeros(4))
@@ -63,10 +63,10 @@ def warn_of_cells(body: Body, placed: Sequence[PlacedEnergy], q: FloatArray, val
             continue
         if abs(change := _change(energies)) < NOTICED:
             continue
-        simplex = own.mesh.element.is_simplex
+        simplex = member.mesh.element.is_simplex
         kind, order = ("tetrahedra", " (in a configuration, mesh.order=2)") if simplex else ("hexahedra", "")
         by = f"at least {100.0 * change:.0f} % more" if change > 0.0 else f"about {-100.0 * change:.0f} % less"
-        thin = [region for region in regions if region and is_one_cell_thick(own.mesh, own.mesh.region(region))]
+        thin = [region for region in regions if region and is_one_cell_thick(member.mesh, member.mesh.region(region))]
         where = f", with its region {thin[0]!r} of one cell through the thickness," if thin else ""
         warn(
             f"the linear {kind} of {f'the body {name!r}' if name else 'the body'}{where} are too coarse for its "

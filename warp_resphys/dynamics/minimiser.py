@@ -103,16 +103,16 @@ class Minimiser:
     def _record_directions(self) -> None:
         """Records the start of a solve, the choice of environments to factorise, and new directions."""
         p, now, b = self._potential, self._now, self._potential.batch
-        own, vector = lbfgs_kernels(_scalar(self._right.dtype)), wp.types.vector(3, _scalar(self._right.dtype))
+        lbfgs, vector = lbfgs_kernels(_scalar(self._right.dtype)), wp.types.vector(3, _scalar(self._right.dtype))
         right = warp_view(self._right, vector)
         vertex_at = p.upload(self.hessian.vertex_at.astype(np.int32), int)
         inputs = [self._tolerances, warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         begin = p.record_blocks(kernels.begin, b, inputs, [now.progress, now.search, now.history])
         outputs = [now.progress, now.pairs.count, *self._masks]
         self._select = p.record(kernels.select_for_factorisation, (b,), [], outputs)
-        self._project = p.record_blocks(own.project, b, [vertex_at, now.progress, now.search], [now.pairs, right])
+        self._project = p.record_blocks(lbfgs.project, b, [vertex_at, now.progress, now.search], [now.pairs, right])
         outputs = [now.progress, now.search, now.pairs]
-        set_direction = p.record_blocks(own.set_direction, b, [vertex_at, right], outputs)
+        set_direction = p.record_blocks(lbfgs.set_direction, b, [vertex_at, right], outputs)
         shorten_start, shorten_step = self._record_bounds()
         self._starts, self._trials = [begin, *shorten_start], [set_direction, *shorten_step]
 

@@ -72,13 +72,13 @@ class PairCouplings:
         vertices[row, at] = keys % total
         out, done = list[Coupling](), 0
         for size, number in zip(*(x.tolist() for x in sizes.unique(return_counts=True)), strict=True):
-            own, m = order[sizes[order] == size], 3 * size
+            environments, m = order[sizes[order] == size], 3 * size
             if size:
                 matrices = values[done : done + number * m * m].view(number, m, m)
                 if self._reduction is None:
-                    out.append(Coupling(own, coordinates(vertices[own, :size]), matrices))
+                    out.append(Coupling(environments, coordinates(vertices[environments, :size]), matrices))
                 else:
-                    out += self._reduction.reduced(own, vertices[own, :size], matrices)
+                    out += self._reduction.reduced(environments, vertices[environments, :size], matrices)
                 done += number * m * m
         return out
 

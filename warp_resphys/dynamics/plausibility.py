@@ -41,10 +41,10 @@ def warn_of_implausible(
         gravity: acceleration (3,) [m/s^2].
         on_cpu: whether it is simulated on the CPU.
     """
-    for name, own, _ in body.members:
+    for name, member, _ in body.members:
         known = f"the body {name!r}" if name else "the body"
-        _warn_of_mesh(own.mesh, known)
-        _warn_of_inertia(own, known)
+        _warn_of_mesh(member.mesh, known)
+        _warn_of_inertia(member, known)
     for name, material in materials.items():
         _warn_of_material(material, f" of {name}" if name else "")
     size = float(np.linalg.norm(gravity))
@@ -101,8 +101,10 @@ def _warn_of_inertia(body: Body, name: str) -> None:
 def _lies_on_floor(body: Body) -> bool:
     """Whether an undeformed body is within the distance of contact of a half-space."""
     contacts = [energy for energy in body.energies if isinstance(energy, Contact)]
-    floors = [(own, floor) for own in contacts for floor in own.obstacles.values() if isinstance(floor, HalfSpace)]
-    return any(float(((body.vertices - f.position) @ f.turn[:, 2]).min()) < own.distance for own, f in floors)
+    floors = [
+        (contact, floor) for contact in contacts for floor in contact.obstacles.values() if isinstance(floor, HalfSpace)
+    ]
+    return any(float(((body.vertices - f.position) @ f.turn[:, 2]).min()) < contact.distance for contact, f in floors)
 
 
 def _inertia(arms: NDArray[np.float64], masses: NDArray[np.float64]) -> NDArray[np.float64]:

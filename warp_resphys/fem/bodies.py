@@ -231,7 +231,7 @@ class Body:
                 "positions, or such an array for each environment."
             )
         at = np.asarray(q[environment] if q.ndim == 3 else q, dtype=np.float64)
-        meshes = ((at[first:][: own.n_vertices], own.mesh) for _, own, first in self.members)
+        meshes = ((at[first:][: member.n_vertices], member.mesh) for _, member, first in self.members)
         parts = ((points, mesh.cells, mesh.element, mesh.regions) for points, mesh in meshes)
         return plot_parts(parts, at[self.fixed_vertices], screenshot, plotter, **options)
 

@@ -60,7 +60,7 @@ def tangential_projections(normals: FloatArray, touched: BoolArray) -> FloatArra
         touched: (R, S) whether a vertex lies in a plane.
     """
     combinations, which = np.unique(touched, axis=0, return_inverse=True)
-    by_combination = [np.eye(3) - np.linalg.pinv(normals[own]) @ normals[own] for own in combinations]
+    by_combination = [np.eye(3) - np.linalg.pinv(normals[planes]) @ normals[planes] for planes in combinations]
     return np.asarray(by_combination)[which.reshape(-1)]
 
 
@@ -100,13 +100,13 @@ class Coordinates:
     @classmethod
     def joined(cls, maps: "Sequence[Coordinates]") -> "Coordinates":
         """Returns the map of several bodies with their vertices concatenated."""
-        first = np.cumsum([0, *(own.n_vertices for own in maps)])
+        first = np.cumsum([0, *(part.n_vertices for part in maps)])
         dependent, sliding = (
-            np.concatenate([getattr(own, name) + start for own, start in zip(maps, first, strict=False)])
+            np.concatenate([getattr(part, name) + start for part, start in zip(maps, first, strict=False)])
             for name in ("dependent", "sliding")
         )
-        weights = scipy.sparse.csr_array(scipy.sparse.block_diag([own.weights for own in maps]))
-        projections, offsets = (np.concatenate([getattr(own, n) for own in maps]) for n in ("projections", "offsets"))
+        weights = scipy.sparse.csr_array(scipy.sparse.block_diag([part.weights for part in maps]))
+        projections, offsets = (np.concatenate([getattr(part, n) for part in maps]) for n in ("projections", "offsets"))
         return cls(int(first[-1]), dependent, weights, sliding, projections, offsets)
 
     def with_planes(self, planes: Sequence[SymmetryPlane], vertices: FloatArray, fixed: IntArray) -> "Coordinates":
@@ -163,15 +163,15 @@ class Coordinates:
         node = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
         operators = points.gradients[touched].swapaxes(1, 2).reshape(-1, per_cell, components)[node]
         first = rows.indices[rows.indptr[:-1:k]]  # a control vertex of each cell
-        own, composed = padded_operators(node // k, rows.indices, rows.data[:, None, None] * operators, first)
-        width = max(k, own.shape[1])
+        controls, composed = padded_operators(node // k, rows.indices, rows.data[:, None, None] * operators, first)
+        width = max(k, controls.shape[1])
         # Cells are padded with their first vertex and a zero operator.
         nodes = np.repeat(points.nodes[:, :1], width, axis=1)
         gradients = np.zeros((cells, per_cell, width, components))
         nodes[:, :k], gradients[:, :, :k] = points.nodes, points.gradients
         nodes[touched], gradients[touched] = first[:, None], 0.0
-        nodes[touched, : own.shape[1]] = own
-        gradients[touched, :, : own.shape[1]] = composed.swapaxes(1, 2)
+        nodes[touched, : controls.shape[1]] = controls
+        gradients[touched, :, : controls.shape[1]] = composed.swapaxes(1, 2)
         return replace(points, nodes=nodes, gradients=gradients)
 
     @cached_property
@@ -271,7 +271,7 @@ def control_vertices(
         InputError: all candidates lie in a plane, or they have no such vertices in the symmetry planes.
     """
     places = vertices[candidates]
-    inside = [own for plane in planes if (own := plane.contains(places)).any()]
+    inside = [flags for plane in planes if (flags := plane.contains(places)).any()]
     size = float(np.linalg.norm(np.ptp(places, axis=0)))
     chosen: list[int] = []
     for allowed in _corner_sets(inside, len(candidates)):

@@ -132,13 +132,13 @@ def _discretise_cells(mesh: Mesh, volume_integration: str, cells: NDArray[np.int
     """Returns the discretisation of a submesh, with the vertex numbers of the whole mesh."""
     used, renumbered = np.unique(mesh.cells[cells], return_inverse=True)
     part = Mesh(mesh.vertices[used], renumbered.reshape(-1, mesh.cells.shape[1]))
-    own = discretise(part, volume_integration, cracks=cracks)
+    discretised = discretise(part, volume_integration, cracks=cracks)
     spread = scipy.sparse.eye_array(len(mesh.vertices), format="csc")[:, used]
     return Discretisation(
-        tuple(replace(points, nodes=used[points.nodes]) for points in own.point_sets),
-        own.element_volumes,
-        scipy.sparse.csr_array(spread @ own.load_volume),
-        scipy.sparse.csr_array(spread @ own.lumped_volume),
+        tuple(replace(points, nodes=used[points.nodes]) for points in discretised.point_sets),
+        discretised.element_volumes,
+        scipy.sparse.csr_array(spread @ discretised.load_volume),
+        scipy.sparse.csr_array(spread @ discretised.lumped_volume),
     )
 
 
@@ -153,10 +153,10 @@ def _isoparametric(mesh: Mesh, full: bool) -> Discretisation:
     if full:
         shape_volume = volume_volume = volumes
     else:
-        projected, own = _projected(mesh, points, volumes, gradients)
+        projected, projected_volumes = _projected(mesh, points, volumes, gradients)
         gradients = np.concatenate([gradients, projected], axis=1)
-        shape_volume = np.concatenate([volumes, np.zeros_like(own)], axis=1)
-        volume_volume = np.concatenate([np.zeros_like(volumes), own], axis=1)
+        shape_volume = np.concatenate([volumes, np.zeros_like(projected_volumes)], axis=1)
+        volume_volume = np.concatenate([np.zeros_like(volumes), projected_volumes], axis=1)
     load = volumes @ values
     lumped = load if element.mass_rule is None else _hrz_lumping(mesh, element_volumes)
     n = len(mesh.vertices)
@@ -192,10 +192,10 @@ def _projected(mesh: Mesh, points: Array, volumes: Array, gradients: Array) -> t
     moments = np.einsum("cq,qm,cqki->cmki", volumes, modes, gradients)
     coefficients = np.linalg.solve(gram, moments.reshape(*moments.shape[:2], -1)).reshape(moments.shape)
     _, determinants = physical_gradients(mesh.vertices, mesh.cells, element.shape(at)[1])
-    own = determinants * weights
-    missing = volumes @ modes - own @ there
-    own += np.linalg.solve(there.T @ there, missing.T).T @ there.T
-    return np.einsum("pn,cnki->cpki", there, coefficients), own
+    corrected = determinants * weights
+    missing = volumes @ modes - corrected @ there
+    corrected += np.linalg.solve(there.T @ there, missing.T).T @ there.T
+    return np.einsum("pn,cnki->cpki", there, coefficients), corrected
 
 
 def _hrz_lumping(mesh: Mesh, element_volumes: Array) -> Array:
@@ -218,9 +218,9 @@ def _linear_tetrahedra(mesh: Mesh, full: bool) -> Discretisation:
     volumes = determinants * weights  # (M, 1)
     n, m = len(mesh.vertices), len(mesh.cells)
     quarter = _per_vertex(mesh.cells, n, np.repeat(volumes / 4.0, 4, axis=1))
-    own = _one_hot(volumes)
+    volume_of_cell = _one_hot(volumes)
     nothing = scipy.sparse.csr_array((m, m))
-    cells = SolidPoints(mesh.cells, gradients, own, own if full else nothing)
+    cells = SolidPoints(mesh.cells, gradients, volume_of_cell, volume_of_cell if full else nothing)
     if full:
         return Discretisation((cells,), volumes[:, 0], quarter, quarter)
     nodes, operator = mean_gradients(mesh.cells, gradients[:, 0], quarter)

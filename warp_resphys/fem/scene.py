@@ -115,7 +115,7 @@ class Scene(Body):
             self.vertex_slice(name)
         fields: dict[str, torch.Tensor | ArrayLike] = {}
         for key in _FIELDS:
-            given = {name: value for name, own in by_body.items() if (value := own.fields.get(key)) is not None}
+            given = {name: value for name, inputs in by_body.items() if (value := inputs.fields.get(key)) is not None}
             if not given:
                 continue
             axis = -1 if key == "attached_mass" else -2
@@ -133,7 +133,9 @@ class Scene(Body):
                 given[name] = sample.new_zeros(shape)
             whole = torch.cat([given[name] for name in self.bodies], axis)
             fields[key] = whole if tensors else whole.numpy()
-        named = {f"{name}_{key}": value for name, own in by_body.items() for key, value in own.actuation.items()}
+        named = {f"{name}_{key}": value for name, inputs in by_body.items() for key, value in inputs.actuation.items()}
         out = Inputs(**named)
-        out.plain |= {f"{name}_{key}" for name, own in by_body.items() for key in own.plain & own.actuation.keys()}
+        out.plain |= {
+            f"{name}_{key}" for name, inputs in by_body.items() for key in inputs.plain & inputs.actuation.keys()
+        }
         return out.replace(**fields)

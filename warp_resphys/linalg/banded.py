@@ -121,11 +121,11 @@ class _Cholesky(SeparateFactors):
             super()._overwrite_units(factor, rows, places)
             return
         for start, end in self._solver.blocks:  # The solution is zero in the blocks of other bodies.
-            own = ((places >= start) & (places < end)).nonzero().ravel()
-            if len(own):
-                columns = rows[own, start:end]
+            rows_here = ((places >= start) & (places < end)).nonzero().ravel()
+            if len(rows_here):
+                columns = rows[rows_here, start:end]
                 self._solver.lapack.solve(factor[start:end], columns)
-                rows[own, start:end] = columns
+                rows[rows_here, start:end] = columns
 
 
 def _blocks(i: Indices, j: Indices, n: int) -> list[tuple[int, int]]:

@@ -53,22 +53,22 @@ class VertexCouplings:
             vertices: (G, s) their vertices; -1 in places that an environment does not need.
             matrices: (G, 3 s, 3 s) symmetric matrices of the coordinates of these.
         """
-        for own, chosen, k in Coupling(environments, vertices, matrices).parts():
+        for some, chosen, k in Coupling(environments, vertices, matrices).parts():
             columns = torch.where(chosen[..., None] < 0, -1, self._columns[chosen])  # (G, s, w)
-            row = torch.arange(len(own), device=own.device)[:, None, None].expand_as(columns)
+            row = torch.arange(len(some), device=some.device)[:, None, None].expand_as(columns)
             used = columns >= 0
             keys, local = (row * self._count + columns)[used].unique(return_inverse=True)
             if not len(keys):
                 continue
-            counts, at = numbered(keys // self._count, len(own))
-            unknowns = torch.full((len(own), int(counts.max())), -1, device=own.device)
+            counts, at = numbered(keys // self._count, len(some))
+            unknowns = torch.full((len(some), int(counts.max())), -1, device=some.device)
             unknowns[keys // self._count, at] = keys % self._count
             weights = k.new_zeros(*chosen.shape, unknowns.shape[1])
-            vertex = torch.arange(chosen.shape[1], device=own.device)[:, None].expand_as(columns)[used]
+            vertex = torch.arange(chosen.shape[1], device=some.device)[:, None].expand_as(columns)[used]
             weights[row[used], vertex, at[local]] = self._weights[chosen][used].to(k)
             whole = k.unflatten(2, (-1, 3)).unflatten(1, (-1, 3))
             reduced = torch.einsum("gsi,gsxty,gtj->gixjy", weights, whole, weights)
-            yield Coupling(own, coordinates(unknowns), reduced.flatten(3, 4).flatten(1, 2))
+            yield Coupling(some, coordinates(unknowns), reduced.flatten(3, 4).flatten(1, 2))
 
 
 def coordinates(vertices: torch.Tensor) -> torch.Tensor:
@@ -117,11 +117,11 @@ class CouplingSolver:
         place = torch.empty_like(order)
         place[order] = torch.arange(len(order), device=order.device)
         for b, unknowns, k in (part for coupling in couplings for part in coupling.parts()):
-            own = unknowns.clamp_min(0)  # K is zero where there is none
-            solved = self._solved[b[:, None], self._places[b[:, None], own].clamp_min(0)]  # (G, m, n)
-            among = solved.gather(2, own[:, None].expand(-1, own.shape[1], -1)).to(k)
-            small = torch.eye(own.shape[1], device=x.device, dtype=k.dtype) + k @ among
-            along = torch.linalg.solve(small, k @ x[b[:, None], place[own]].to(k)).to(x)
+            used = unknowns.clamp_min(0)  # K is zero where there is none
+            solved = self._solved[b[:, None], self._places[b[:, None], used].clamp_min(0)]  # (G, m, n)
+            among = solved.gather(2, used[:, None].expand(-1, used.shape[1], -1)).to(k)
+            small = torch.eye(used.shape[1], device=x.device, dtype=k.dtype) + k @ among
+            along = torch.linalg.solve(small, k @ x[b[:, None], place[used]].to(k)).to(x)
             x[b] -= (solved.mT @ along)[:, order]
 
     def _solve_missing(self, factor: Factor, couplings: Sequence[Coupling]) -> None:

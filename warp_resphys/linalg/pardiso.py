@@ -47,8 +47,8 @@ class PardisoSolver(LinearSolver):
 
     @override
     def _factorise(self, values: torch.Tensor, idle: Mask, before: Factor | None) -> Factor:
-        def factorise(number: int, own: torch.Tensor) -> _System | None:
-            return self._system((len(values), number), own)
+        def factorise(number: int, entries: torch.Tensor) -> _System | None:
+            return self._system((len(values), number), entries)
 
         return _Systems(self, values, factorise, idle, before)
 
@@ -64,24 +64,24 @@ class PardisoSolver(LinearSolver):
             return self.factor(values, columns, idle, before)
         kept = before.factor if isinstance(before, CorrectedFactor) else before
 
-        def factorise(number: int, own: torch.Tensor) -> _System | None:
+        def factorise(number: int, entries: torch.Tensor) -> _System | None:
             environment = (len(values), number)
             if environment not in self._needs_double:
-                if system := self._system(environment, own.float()):
+                if system := self._system(environment, entries.float()):
                     return system
-                if own.dtype == torch.float32:
+                if entries.dtype == torch.float32:
                     return None
-            system = self._system(environment, own)
+            system = self._system(environment, entries)
             if system is not None:
                 self._needs_double.add(environment)
             return system
 
         return _Systems(self, values, factorise, idle, None if idle is None else kept)
 
-    def _system(self, environment: tuple[int, int], own: torch.Tensor) -> "_System | None":
+    def _system(self, environment: tuple[int, int], entries: torch.Tensor) -> "_System | None":
         """Returns the factorised matrix of an environment's values, or None if it has no factor."""
-        values = own.detach().clone().numpy()
-        key = (*environment, own.dtype)
+        values = entries.detach().clone().numpy()
+        key = (*environment, entries.dtype)
         if key not in self._rooms:
             self._rooms[key] = _Room(self._rows, values)
         system = _System(self._rooms[key], values)

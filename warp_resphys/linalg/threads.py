@@ -122,7 +122,7 @@ def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
 
     others = [_pool(len(shards) - 1).submit(work_on, shard) for shard in shards[:-1]]
     try:
-        own = work(shards[-1])
+        last = work(shards[-1])
     finally:
         wait(others)
-    return [*(other.result() for other in others), own]
+    return [*(other.result() for other in others), last]

@@ -171,7 +171,7 @@ def name_surfaces(mesh: Mesh) -> dict[str, IntArray]:
         "tip": np.all(heights[faces] < heights.min() + tolerance, axis=1),
     }
     chambers = {chamber.name: chamber.faces for chamber in find_chambers(mesh)}
-    inner = [own.ravel() for own in chambers.values()]
+    inner = [faces.ravel() for faces in chambers.values()]
     outside = ~(surfaces["base"] | surfaces["tip"] | np.isin(faces[:, 0], np.concatenate([*inner, faces[:0, 0]])))
     return {**{name: faces[chosen] for name, chosen in surfaces.items()}, "outside": faces[outside], **chambers}
 

@@ -151,7 +151,8 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity]:
     start_quietly()
     with shareable():
         rays: list[Any] = [
-            wp.array(own, dtype=wp.vec3, device="cpu") for own in (np.repeat(starts, _DIRECTIONS, axis=0), directions)
+            wp.array(vectors, dtype=wp.vec3, device="cpu")
+            for vectors in (np.repeat(starts, _DIRECTIONS, axis=0), directions)
         ]
         points: Any = wp.array(mesh.vertices, dtype=wp.vec3, device="cpu")
         surface = wp.Mesh(points, wp.array(outer.ravel(), dtype=int, device="cpu"))
@@ -159,10 +160,10 @@ def open_cavities(mesh: Mesh) -> list[OpenCavity]:
         wp.launch(blocked, len(directions), [surface.id, *rays], [hits], device="cpu")
     hidden = np.flatnonzero(1.0 - hits.numpy().reshape(-1, _DIRECTIONS).mean(axis=1) < _HIDDEN)
     parts, cavities = connected_parts(outer[hidden]), []
-    for own in (hidden[parts == part] for part in np.unique(parts)):
-        if sizes[own].sum() >= _LEAST_AREA * sizes.sum():
-            centre = np.average(centres[own], axis=0, weights=sizes[own])
-            cavities.append(OpenCavity(centre, 0.5 * float(sizes[own].sum())))
+    for members in (hidden[parts == part] for part in np.unique(parts)):
+        if sizes[members].sum() >= _LEAST_AREA * sizes.sum():
+            centre = np.average(centres[members], axis=0, weights=sizes[members])
+            cavities.append(OpenCavity(centre, 0.5 * float(sizes[members].sum())))
     return sorted(cavities, key=lambda cavity: -cavity.area)
 
 

@@ -71,7 +71,7 @@ class Shape:
 def _monomials(points: Array, exponents: IntArray) -> Array:
     """Returns x^a y^b z^c, (Q, K)."""
     powers = np.cumprod([np.ones_like(points), *[points] * int(exponents.max())], axis=0)  # (E, Q, d)
-    return np.asarray(np.prod([powers[own, :, axis] for axis, own in enumerate(exponents.T)], axis=0).T)
+    return np.asarray(np.prod([powers[exponent, :, axis] for axis, exponent in enumerate(exponents.T)], axis=0).T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,29 +46,17 @@ def rod(
         MeshError: fewer than two points, a radius that is not positive, a number that is not an integer, a grading out
             of range, or a radius of curvature smaller than the rod's radius.
     """
-    axis, order = np.asarray(centreline, dtype=np.float64), 1 if nodes == 8 else 2
-    if axis.ndim != 2 or axis.shape[1] != 3 or len(axis) < 2 or not np.isfinite(axis).all():
-        raise MeshError(f"the centreline of a rod has shape {axis.shape}: it needs two or more finite points (M, 3).")
-    pieces = np.linalg.norm(np.diff(axis, axis=0), axis=1)
-    if not (pieces > 0.0).all():
-        raise MeshError("the centreline of a rod has two points in a row at one place: leave one of them out.")
-    profile = np.asarray(radii, dtype=np.float64)
-    profile = np.array([[0.0, float(profile)]]) if profile.ndim == 0 else profile
-    listed = profile.ndim == 2 and profile.shape[1] in (2, 3) and bool(np.isfinite(profile).all())
-    if not (listed and (profile[:, 1:] > 0.0).all() and (np.diff(profile[:, 0]) > 0.0).all()):
-        raise MeshError(
-            "the radii of a rod must be one positive number, or rising arc lengths with one or two positive radii each."
-        )
-    profile = profile[:, [0, 1, -1]]
+    axis, profile = _checked_centreline(centreline), _checked_radii(radii)
     for name, value in (("layers", layers), ("core", core), ("rings", rings)):
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
             raise MeshError(f"{name} of a rod is {value!r}: it must be a whole number, one or more.")
     if nodes not in (8, 20, 27):
         raise MeshError(f"a rod of cells with {nodes} nodes: choose 8, 20 or 27.")
-    section, squares = _section(core * order, rings * order, order)
-    length = np.concatenate([[0.0], np.cumsum(pieces)])
     if not 0.0 <= grading <= 1.0:
         raise MeshError(f"the grading of a rod is {grading:g}: it must be from 0, for layers of one length, to 1.")
+    order = 1 if nodes == 8 else 2
+    section, squares = _section(core * order, rings * order, order)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(axis, axis=0), axis=1))])
     along = _levels(float(length[-1]), profile, layers, order, grading)
     places, frames = _transported(axis, length, along)
     radius = np.stack([np.interp(along, profile[:, 0], semi_axis) for semi_axis in profile[:, 1:].T], axis=1)
@@ -85,6 +73,28 @@ def rod(
     if not (np.linalg.det(np.einsum("cki,qkj->cqij", mesh.vertices[mesh.cells], slopes)) > 0.0).all():
         raise MeshError("a rod is bent more sharply than it is thick: straighten its centreline, or make it thinner.")
     return mesh
+
+
+def _checked_centreline(centreline: ArrayLike) -> FloatArray:
+    """Returns the points (M, 3) of a polyline [m], or raises MeshError."""
+    axis = np.asarray(centreline, dtype=np.float64)
+    if axis.ndim != 2 or axis.shape[1] != 3 or len(axis) < 2 or not np.isfinite(axis).all():
+        raise MeshError(f"the centreline of a rod has shape {axis.shape}: it needs two or more finite points (M, 3).")
+    if not np.diff(axis, axis=0).any(axis=1).all():
+        raise MeshError("the centreline of a rod has two points in a row at one place: leave one of them out.")
+    return axis
+
+
+def _checked_radii(radii: ArrayLike) -> FloatArray:
+    """Returns arc lengths and two semi-axes (R, 3) [m], or raises MeshError."""
+    profile = np.asarray(radii, dtype=np.float64)
+    profile = np.array([[0.0, float(profile)]]) if profile.ndim == 0 else profile
+    listed = profile.ndim == 2 and profile.shape[1] in (2, 3) and bool(np.isfinite(profile).all())
+    if not (listed and (profile[:, 1:] > 0.0).all() and (np.diff(profile[:, 0]) > 0.0).all()):
+        raise MeshError(
+            "the radii of a rod must be one positive number, or rising arc lengths with one or two positive radii each."
+        )
+    return profile[:, [0, 1, -1]]
 
 
 def _levels(length: float, radii: FloatArray, layers: int, order: int, grading: float) -> FloatArray:

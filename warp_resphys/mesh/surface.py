@@ -68,7 +68,7 @@ def closest_of(
     while len(left):
         again = []
         for rows in np.array_split(left, len(left) * count // _PAIRS + 1):
-            apart, candidates = (own.reshape(len(rows), count) for own in tree.query(points[rows], count))
+            apart, candidates = (found.reshape(len(rows), count) for found in tree.query(points[rows], count))
             index, places, distance = _closest_candidate(
                 corners[candidates], normals[candidates], points[rows], None if towards is None else towards[rows], tie
             )
@@ -146,7 +146,7 @@ def _located(
     for point in points:  # cells whose boxes are nearest
         away = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
         near.append(np.flatnonzero(away <= np.partition(away, last)[last]))
-    cells, ends = np.concatenate(near), np.cumsum([len(own) for own in near])
+    cells, ends = np.concatenate(near), np.cumsum([len(cells_near) for cells_near in near])
     targets = np.repeat(points, np.diff(ends, prepend=0), axis=0)
     place = _reference_coordinates(element, nodes[cells], targets)
     within = np.clip(place, -1.0, 1.0)
@@ -155,7 +155,7 @@ def _located(
         within = barycentric[:, 1:] / barycentric.sum(axis=1, keepdims=True)
     values, _ = element.shape(within)
     distances = np.linalg.norm(np.einsum("ck,cki->ci", values, nodes[cells]) - targets, axis=1)
-    best = [own[np.argmin(distances[own])] for own in np.split(np.arange(ends[-1]), ends[:-1])]
+    best = [candidates[np.argmin(distances[candidates])] for candidates in np.split(np.arange(ends[-1]), ends[:-1])]
     cells, distances = cells[best], distances[best]
     weights, slopes = element.shape(place[best])
     gradients = slopes @ np.linalg.pinv(np.einsum("pki,pkj->pij", nodes[cells], slopes))

@@ -192,8 +192,8 @@ def _loops(model: Any) -> list[list[int]]:
     """Returns the patches of each closed surface of a model, the outer surface first."""
     patches = [tag for _, tag in model.getEntities(2)]
     curves = [[abs(tag) for _, tag in model.getBoundary([(2, patch)], oriented=False)] for patch in patches]
-    tags = [tag for own in curves for tag in own]
-    rows = np.repeat(np.arange(len(patches)), [len(own) for own in curves])
+    tags = [tag for tags_of_patch in curves for tag in tags_of_patch]
+    rows = np.repeat(np.arange(len(patches)), [len(tags_of_patch) for tags_of_patch in curves])
     incidence = scipy.sparse.coo_matrix((np.ones(len(rows)), (rows, tags)), (len(patches), max(tags, default=0) + 1))
     count, labels = scipy.sparse.csgraph.connected_components(incidence @ incidence.T, directed=False)
     loops = [[patch for patch, label in zip(patches, labels, strict=True) if label == k] for k in range(count)]

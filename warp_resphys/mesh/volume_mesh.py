@@ -241,10 +241,12 @@ def join(meshes: Mapping[str, Mesh]) -> Mesh:
     regions: dict[str, IntArray] = {}
     for name, mesh in meshes.items():
         cells.append(mesh.cells + first)
-        own = {name: np.arange(len(mesh.cells))} | {f"{name}_{region}": cells for region, cells in mesh.regions.items()}
-        if twice := regions.keys() & own.keys():
+        named = {name: np.arange(len(mesh.cells))} | {
+            f"{name}_{region}": cells for region, cells in mesh.regions.items()
+        }
+        if twice := regions.keys() & named.keys():
             raise MeshError(f"two regions have the name {min(twice)!r}: rename a mesh or its region.")
-        regions |= {region: count + cells for region, cells in own.items()}
+        regions |= {region: count + cells for region, cells in named.items()}
         first, count = first + len(mesh.vertices), count + len(mesh.cells)
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes.values()]), np.concatenate(cells), regions)
 

@@ -125,8 +125,7 @@ class Description:
         """
         if self.learned is not None and isinstance(self.learned.network, NextState):
             raise InputError(f"{self.model} has no simulator, only a network for its mesh: load another model.")
-        given = {key: value.plain() if isinstance(value, Settings) else value for key, value in body.items()}
-        settings = parse(SimulatorSettings, {**self.settings.plain(), **given})
+        settings = self.settings.changed(**body)
         material = MaterialSettings.model_validate({**self.material.plain(), MASS_DAMPING: None})
         return Description(self.name, self.model, settings, material, mesh, parameters)
 

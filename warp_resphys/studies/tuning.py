@@ -63,7 +63,7 @@ def tune(settings: TunedRun, folder: Path) -> None:
         StageInterrupted: the user pressed Ctrl-C; finished trials are kept.
     """
     search = settings.tune
-    run = parse(RunSettings, {key: value for key, value in settings.plain().items() if key != "tune"})
+    run = RunSettings.of(settings)
     prepare(run)
     space, training = _checked(run, search)
     _, acquired = acquire(run, folder, wait=True)
@@ -74,7 +74,7 @@ def tune(settings: TunedRun, folder: Path) -> None:
     *before, trained = (stage for name, stage in stages.items() if name in wanted)
     run_stages(before, folder, wait=True)
     experiment = Experiment(trained.settings, folder)
-    conditions = [training.plain(), str(space), *(stage.settings.plain() for stage in (*before, trained))]
+    conditions = [training.plain(), str(space), *(stage.settings.content() for stage in (*before, trained))]
     name = f"{search.model} {hashlib.sha256(json.dumps(conditions, sort_keys=True).encode()).hexdigest()[:12]}"
 
     def error_mm(trial: Trial) -> float:

@@ -11,7 +11,6 @@ import signal
 import sys
 import threading
 import warnings
-from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module, resources
@@ -81,18 +80,18 @@ class _Job:
 
     def run(self, command: str, arguments: Sequence[str]) -> None:
         """Composes the configuration and runs the command with it."""
-        if any(argument.startswith("--experimental-rerun") for argument in arguments):
+        parser = get_args_parser()
+        parsed = parser.parse_intermixed_args([*_own_options(), *arguments])
+        if parsed.experimental_rerun is not None:
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
-        rest = [*_own_options(), *arguments]
-        if command in TYPED:
-            rest, self.shown = _without_shown(rest)
-        if any(argument[:1] != "-" for argument in rest):
+        if command in TYPED and parsed.cfg == "job":
+            self.shown, parsed.cfg = parsed.package or "", None
+        if parsed.overrides:
             schema = run_schema() if command in TYPED else _function(self.function)[1].model_json_schema()
-            rest, self.late = readable(rest, schema)
+            parsed.overrides, self.late = readable(parsed.overrides, schema, parsed.config_dir, parsed.multirun)
+        parsed.overrides += _SILENT if self.shown is not None else ()
         OmegaConf.register_new_resolver("run_label", self._label, replace=True)
         setbase("1.3")
-        parser = get_args_parser()
-        parsed = parser.parse_args([*rest, *(_SILENT if self.shown is not None else ())])
         with _ends_as_after_ctrl_c(), names_are_texts():
             _run_hydra(parsed, parser, self._call, f"pkg://{CONFIG_PACKAGE}", configuration(command))
 
@@ -187,15 +186,6 @@ def _own_options() -> list[str]:
         if packaged.joinpath(path.parent.name, path.name).is_file():
             print(f"warning: {name} is ignored: the package has an option of that name", file=sys.stderr)
     return ["--config-dir", str(folder)]
-
-
-def _without_shown(arguments: Sequence[str]) -> tuple[list[str], str | None]:
-    """Removes ``--cfg job``; returns the key whose settings are to be shown as well: empty for all, None without it."""
-    parser = ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--cfg")
-    parser.add_argument("--package", default="")
-    asked, rest = parser.parse_known_args(arguments)
-    return (rest, asked.package) if asked.cfg == "job" else ([*arguments], None)
 
 
 def _show(config: DictConfig, key: str) -> None:

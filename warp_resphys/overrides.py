@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from functools import reduce
 from importlib import resources
-from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -23,7 +22,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from .commands import CONFIG_PACKAGE, VALUED, quote, quote_name
+from .commands import CONFIG_PACKAGE, quote, quote_name
 from .io.errors import InputError
 from .io.setting_errors import Schema, is_text
 
@@ -72,23 +71,25 @@ class LateOverride:
             config.merge_with(reduce(lambda inner, name: {name: inner}, reversed(self.path), override.value()))
 
 
-def readable(arguments: Sequence[str], schema: Schema = MappingProxyType({})) -> tuple[list[str], list[LateOverride]]:
-    """Returns the arguments as Hydra reads them, options first, and those that change the composed configuration.
+def readable(
+    arguments: Sequence[str], schema: Schema = MappingProxyType({}), config_dir: str | None = None, sweeps: bool = False
+) -> tuple[list[str], list[LateOverride]]:
+    """Returns overrides as Hydra reads them, and those that change the composed configuration.
 
     Overrides may set keys that no YAML file mentions, since the settings classes check the keys.
 
     Args:
-        arguments: words of the command line.
+        arguments: overrides of a command line.
         schema: JSON Schema of the settings of the command.
+        config_dir: folder with options of the user.
+        sweeps: whether commas separate the values of a sweep.
     """
-    options = [
-        at for at, argument in enumerate(arguments) if argument[:1] == "-" or (at and arguments[at - 1] in VALUED)
-    ]
-    reader = _Reader(schema, _groups(arguments), bool({"--multirun", "-m"} & {*arguments}))
-    rest = [argument for at, argument in enumerate(arguments) if at not in options]
-    overrides = [override for argument in rest for override in reader.overrides(argument)]
-    read = [override for override in overrides if isinstance(override, str)]
-    return [*map(arguments.__getitem__, options), *read], [one for one in overrides if isinstance(one, LateOverride)]
+    folders = [resources.files(CONFIG_PACKAGE), *([] if config_dir is None else [Path(config_dir)])]
+    groups = {entry.name for folder in folders if folder.is_dir() for entry in folder.iterdir() if entry.is_dir()}
+    reader = _Reader(schema, groups, sweeps)
+    overrides = [override for argument in arguments for override in reader.overrides(argument)]
+    late = [override for override in overrides if isinstance(override, LateOverride)]
+    return [override for override in overrides if isinstance(override, str)], late
 
 
 def composed(name: str, arguments: Sequence[str] = ()) -> Any:
@@ -99,13 +100,6 @@ def composed(name: str, arguments: Sequence[str] = ()) -> Any:
     for override in late:
         override.apply(config)
     return OmegaConf.to_container(config, resolve=True)
-
-
-def _groups(arguments: Sequence[str]) -> set[str]:
-    """Names of the configuration groups, in the package and in the user's folders."""
-    added = [Path(value) for option, value in pairwise(arguments) if option in ("--config-dir", "-cd")]
-    places = [resources.files(CONFIG_PACKAGE), *(folder for folder in added if folder.is_dir())]
-    return {entry.name for place in places for entry in place.iterdir() if entry.is_dir()}
 
 
 @dataclass(frozen=True)

@@ -123,9 +123,9 @@ class EnergySet:
 
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> tuple[list[Values], Mass]:
         """Returns the values of every energy that follow from the parameters, by name, and the mass of the body."""
-        given = [_without(item.prefix, parameters) for item in self.placed]
-        values: list[Values] = [bound.prepare(own) for bound, own in zip(self._bound, given, strict=True)]
-        masses = [mass for bound, own in zip(self._bound, given, strict=True) if (mass := bound.mass(own)) is not None]
+        split = [_without(item.prefix, parameters) for item in self.placed]
+        values: list[Values] = [bound.prepare(mine) for bound, mine in zip(self._bound, split, strict=True)]
+        masses = [mass for bound, mine in zip(self._bound, split, strict=True) if (mass := bound.mass(mine))]
         return values, masses[0] if len(masses) == 1 else Mass.sum(masses)
 
     def _values(self, step: SimulatorStep, share: float = 1.0) -> list[dict[str, torch.Tensor | None]]:
@@ -135,15 +135,15 @@ class EnergySet:
             step: the step.
             share: factor of the inputs.
         """
-        values, given, batch = [dict(own) for own in step.constants.values], step.inputs.actuation, step.state.batch
-        for own, item in zip(values, self.placed, strict=True):
+        values, actuation = [dict(prepared) for prepared in step.constants.values], step.inputs.actuation
+        for energy_values, item in zip(values, self.placed, strict=True):
             for quantity in item.energy.inputs:
                 name = f"{item.prefix}{quantity.name}"
                 zero = step.constants.gravity.new_zeros
-                if name in given:
-                    own[quantity.name] = given[name] if share == 1.0 else share * given[name]
+                if name in actuation:
+                    energy_values[quantity.name] = actuation[name] if share == 1.0 else share * actuation[name]
                 else:
-                    own[quantity.name] = zero(batch, self.counts[name])
+                    energy_values[quantity.name] = zero(step.state.batch, self.counts[name])
         return values
 
     def _step(self, step: SimulatorStep, k: int) -> EnergyStep:
@@ -278,8 +278,8 @@ def joined_names(materials: Material | Materials) -> dict[str, Material]:
         return {"": materials}
     return {
         f"{name}_{region}" if region else name: value
-        for name, own in materials.items()
-        for region, value in joined_names(own).items()
+        for name, part in materials.items()
+        for region, value in joined_names(part).items()
     }
 
 
@@ -302,9 +302,11 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
         energies += sliding
         for part in body.controls:
             energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
-        items: list[tuple[Energy, Any, str]] = [(energy, energy.points(body.mesh), own) for energy, own in energies]
-        given = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
-        items += [(energy, points, prefix) for energy, points in given]
+        items: list[tuple[Energy, Any, str]] = [
+            (energy, energy.points(body.mesh), region_prefix) for energy, region_prefix in energies
+        ]
+        declared = zip(cast(Sequence[Energy], body.energies), body.energy_points, strict=True)
+        items += [(energy, points, prefix) for energy, points in declared]
         placed += [PlacedEnergy.of(whole, body, first, *item) for item in items]
     if (contact := getattr(whole, "contact", None)) is not None:
         placed.append(PlacedEnergy.of(whole, whole, 0, contact, contact.points(whole.mesh)))
@@ -322,5 +324,5 @@ def _material_of(material: Material | Materials, body: Body, name: str) -> Mater
         if body.soft_cells is not None and not len(body.soft_cells):
             return {}
         raise InputError(f"The body {name!r} has no material. Give one: there are {', '.join(material) or 'none'}.")
-    own: Material | Materials = material[name]
-    return own
+    chosen: Material | Materials = material[name]
+    return chosen

@@ -287,5 +287,5 @@ class PlacedEnergy:
             points: points of the energy, with the body's own vertex numbers.
             prefix: prefix of the energy's names.
         """
-        shifted = tuple(own.shifted(first) for own in points)
+        shifted = tuple(item.shifted(first) for item in points)
         return cls(energy, tuple(map(whole.coordinates.compose, shifted)), prefix, shifted, body, first)

@@ -143,7 +143,7 @@ class ConvexMaterial(Material):
         moduli = [constants[name] for name in list(self.own_quantities())[:ISOTROPIC]]
         moduli += [torch.ones_like(moduli[0])] * 2
         moduli += [constants[name] for name in self._ogden.values()]
-        for azimuth, elevation, *own in self.group("fibres", constants):
+        for azimuth, elevation, *coefficients in self.group("fibres", constants):
             level = elevation.cos()
-            moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *own]
+            moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *coefficients]
         return tuple(moduli)

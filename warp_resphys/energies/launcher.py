@@ -92,6 +92,10 @@ class Launcher:
         with shareable():
             return RecordedLaunch(wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, **options))
 
+    def run(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
+        """Launches a kernel once."""
+        self.launch(self.record(kernel, dim, inputs, outputs))
+
     def record_blocks(self, kernel: Any, blocks: int, inputs: list[Any], outputs: list[Any]) -> Any:
         """Returns a recorded launch with cooperating blocks of threads (one thread per block on a CPU)."""
         options: dict[str, Any] = {"block_dim": BLOCK, "device": str(self.device), "record_cmd": True}
@@ -129,7 +133,7 @@ class Launcher:
         if not any(isinstance(command, HostLaunches) for command in commands):
             return self.capture_calls(lambda: issue(*commands), commands)
         groups = itertools.groupby(commands, lambda command: isinstance(command, HostLaunches))
-        parts = [own if by_host else [self.capture(*own)] for by_host, own in ((k, list(g)) for k, g in groups)]
+        parts = [group if by_host else [self.capture(*group)] for by_host, group in ((k, list(g)) for k, g in groups)]
         return LaunchSequence(*itertools.chain(*parts))
 
     def capture_calls(self, calls: Callable[[], None], commands: Iterable[Any]) -> "CapturedGraph":

@@ -74,11 +74,11 @@ class Material(ABC):
 
     def __post_init__(self) -> None:
         """Raises InputError for a constant outside its physical range."""
-        for group, own in self.groups.items():
+        for group, quantities in self.groups.items():
             items = getattr(self, group)
-            if not all(isinstance(item, Sequence) and len(item) == len(own) for item in items):
-                names = ", ".join(q.name.partition("_")[2] for q in own)
-                units = " and ".join(q.unit or "-" for q in own)
+            if not all(isinstance(item, Sequence) and len(item) == len(quantities) for item in items):
+                names = ", ".join(q.name.partition("_")[2] for q in quantities)
+                units = " and ".join(q.unit or "-" for q in quantities)
                 raise InputError(f"{group} is {items!r}: give a ({names}) for each {_ITEMS[group]}, {units}.")
         constants = self.constants
         for name, quantity in self.quantities.items():
@@ -96,9 +96,9 @@ class Material(ABC):
         """Constants of groups with their values: ``prony_ratio_1``, ``prony_time_1``, ..."""
         return {
             f"{q.name}_{k}": (replace(q, name=f"{q.name}_{k}"), value)
-            for group, own in self.groups.items()
+            for group, quantities in self.groups.items()
             for k, item in enumerate(getattr(self, group), 1)
-            for q, value in zip(own, item, strict=True)
+            for q, value in zip(quantities, item, strict=True)
         }
 
     @property
@@ -109,8 +109,8 @@ class Material(ABC):
     @property
     def constants(self) -> dict[str, Parameter]:
         """Values of the constants by name."""
-        own = {name: getattr(self, name) for name in self.own_quantities()}
-        return {**own, **{name: value for name, (_, value) in self.numbered.items()}}
+        known = {name: getattr(self, name) for name in self.own_quantities()}
+        return {**known, **{name: value for name, (_, value) in self.numbered.items()}}
 
     @classmethod
     def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
@@ -124,22 +124,22 @@ class Material(ABC):
     @classmethod
     def _arguments(cls, constants: Mapping[str, Any]) -> dict[str, Any]:
         """Returns the arguments of the class: constants, and the items of groups."""
-        own, values, groups = cls.own_quantities(), dict(constants), {}
+        known_quantities, values, groups = cls.own_quantities(), dict(constants), {}
         for group, quantities in cls.groups.items():
             names = {q.name for q in quantities}
-            given = {name for name in constants if re.sub(r"_[1-9]\d*$", "", name) in names}
-            count = len({re.findall(r"\d+$", name)[-1] for name in given if name not in names})
+            present = {name for name in constants if re.sub(r"_[1-9]\d*$", "", name) in names}
+            count = len({re.findall(r"\d+$", name)[-1] for name in present if name not in names})
             items = [[f"{q.name}_{k}" for q in quantities] for k in range(1, 1 + count)]
-            if given != {*chain.from_iterable(items)}:
+            if present != {*chain.from_iterable(items)}:
                 raise InputError(
-                    f"{group} has {', '.join(sorted(given))}: give each {_ITEMS[group]}, numbered from 1, its "
+                    f"{group} has {', '.join(sorted(present))}: give each {_ITEMS[group]}, numbered from 1, its "
                     f"{' and its '.join(f'{q.name}_' for q in quantities)}."
                 )
             groups[group] = [tuple(values.pop(name) for name in item) for item in items]
         for name in values:
-            if name not in own:
+            if name not in known_quantities:
                 numbered = [f"{q.name}_1" for q in chain.from_iterable(cls.groups.values())]
-                known, model = ", ".join((*own, *numbered, "...")), cls.model or cls.__name__
+                known, model = ", ".join((*known_quantities, *numbered, "...")), cls.model or cls.__name__
                 raise InputError(f"{model} has no constant {name!r}: it has {known}")
         return {**values, **groups}
 
@@ -253,10 +253,10 @@ class DensityMaterial(Material):
     @override
     def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns ones for both volumes, the Lame constants, and the constants of the functions."""
-        own = [constants[f.name] for f in fields(self) if f.metadata and not f.kw_only]
-        volume = torch.ones_like(own[0])
+        constants_of_law = [constants[f.name] for f in fields(self) if f.metadata and not f.kw_only]
+        volume = torch.ones_like(constants_of_law[0])
         under_integrated = volume if self.volume_energy else torch.zeros_like(volume)
-        return volume, under_integrated, *self.lame(constants), *own
+        return volume, under_integrated, *self.lame(constants), *constants_of_law
 
 
 @dataclass(frozen=True)

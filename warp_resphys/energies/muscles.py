@@ -74,7 +74,7 @@ class Muscles(Energy):
 
     @override
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Muscles":
-        turned = [replace(own, direction=np.asarray(own.direction) @ rotation.T) for own in self.muscles]
+        turned = [replace(muscle, direction=np.asarray(muscle.direction) @ rotation.T) for muscle in self.muscles]
         return replace(self, muscles=turned)
 
     def __post_init__(self) -> None:

@@ -51,6 +51,7 @@ class IncrementalPotential(Launcher):
     Attributes:
         energies: terms of the energies.
         stiffness: (B,) sum of the solids' moduli times volumes, the scale of the energy's rounding error [J].
+        value_names: number of the energy and name of every value of the terms.
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
@@ -102,6 +103,7 @@ class IncrementalPotential(Launcher):
         self._feasible = [start for start in starts if start is not None]
         fields = self.zeros(n_vertices, 3), self.zeros(n_vertices), self.zeros(n_vertices, 3)
         self.terms = StepTerms(*fields, [term.values for term in self.energies])
+        self.value_names = tuple((k, name) for k, term in enumerate(self.energies) for name in term.values)
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
@@ -190,11 +192,6 @@ class IncrementalPotential(Launcher):
         totals = [total for term in self.energies if (total := term.total_stiffness()) is not None]
         if totals:
             self.stiffness.copy_(totals[0] if len(totals) == 1 else torch.stack(totals).sum(0))
-
-    @property
-    def value_names(self) -> tuple[tuple[int, str], ...]:
-        """Number of the energy and name of every value of the terms."""
-        return tuple((number, name) for number, term in enumerate(self.energies) for name in term.values)
 
     @property
     def inertia(self) -> torch.Tensor:

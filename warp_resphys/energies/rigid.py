@@ -154,7 +154,7 @@ class RigidityTerm(SolidTerm):
     def improve_start(self, positions: Any) -> None:
         (s,), batch = self.sets, self.launcher
         inputs = [s.points, self._centre, self._arms]
-        batch.launch(batch.record(kernels.straighten, (batch.batch, 1), inputs, [positions]))
+        batch.run(kernels.straighten, (batch.batch, 1), inputs, [positions])
 
 
 class BoundRigidity(BoundEnergy):

@@ -108,7 +108,7 @@ class Solid(Energy):
 
     def kernel(self, device: torch.device) -> Any:
         """Returns a kernel of the module that evaluates the material on a device."""
-        law, several = self.material.law, any(own.points_per_cell > 1 for own in self.discretisation.point_sets)
+        law, several = self.material.law, any(points.points_per_cell > 1 for points in self.discretisation.point_sets)
         if device.type == "cpu" and several and law.has_lanes:
             return lanes.cell_step(law)
         return kernels.solid_kernels(law).local_step
@@ -193,7 +193,7 @@ class BoundSolid(BoundEnergy):
         ratio = time = None
         if material.prony:
             branches = zip(*material.group("prony", parameters), strict=True)
-            ratio, time = (torch.cat(torch.broadcast_tensors(*own), 1) for own in branches)
+            ratio, time = (torch.cat(torch.broadcast_tensors(*branch), 1) for branch in branches)
             if not (ratio.requires_grad or bool((ratio > 0).any())):
                 ratio = time = None
         damped = damping.requires_grad or bool((damping > 0).any())

@@ -107,7 +107,7 @@ class Tendons(Energy):
             raise InputError("an entry angle of tendons acts by friction: give their friction, or leave it out.")
         BRISTLE.check(self.bristle_length)
         if len(self.fixed_guides) not in (0, self.count):
-            raise InputError(f"fixed guides are given for {len(self.fixed_guides)} of {self.count} tendons: give all.")
+            raise InputError(f"fixed guides are way for {len(self.fixed_guides)} of {self.count} tendons: give all.")
         for number, (route, fixed) in enumerate(zip(self.guides, self.fixed_guides, strict=False), 1):
             if not set(fixed) <= set(range(len(route))):
                 most = len(route) - 1
@@ -121,20 +121,20 @@ class Tendons(Energy):
                 "in rad."
             )
         if len(set(self.names)) != self.count:
-            raise InputError(f"tendons are called {', '.join(self.names)}: give each a name of its own.")
+            raise InputError(f"tendons are called {', '.join(self.names)}: give each a name of its ways.")
         if not len(self.directions):
             return
         if len(self.directions) != self.count:
             raise InputError(f"{len(self.directions)} tendons have directions of offsets, but there are {self.count}.")
-        counts = [len(own) for own in self.directions]
+        counts = [len(ways) for ways in self.directions]
         if set(counts) not in ({1}, {2}):
             raise InputError(f"the tendons have {counts} directions of offsets: give each one, or each two.")
-        for number, (route, own) in enumerate(zip(self.guides, self.directions, strict=True), 1):
-            for given in own:
+        for number, (route, ways) in enumerate(zip(self.guides, self.directions, strict=True), 1):
+            for way in ways:
                 try:
-                    direction = np.asarray(given, dtype=np.float64)
+                    direction = np.asarray(way, dtype=np.float64)
                 except (TypeError, ValueError):
-                    raise InputError(f"tendon {number} has a direction that is not an array: {given!r}.") from None
+                    raise InputError(f"tendon {number} has a direction that is not an array: {way!r}.") from None
                 if direction.shape not in ((3,), route.shape):
                     raise InputError(
                         f"tendon {number} has a direction of offsets of shape {direction.shape}: give three numbers, "
@@ -151,8 +151,8 @@ class Tendons(Energy):
         """
         all_offsets = np.asarray(offsets, dtype=np.float64)
         routes = [
-            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(own, directions, strict=True))
-            for route, own, directions in zip(self.guides, all_offsets, self.directions, strict=True)
+            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(amounts, directions, strict=True))
+            for route, amounts, directions in zip(self.guides, all_offsets, self.directions, strict=True)
         ]
         return replace(self, routes=routes, directions=())
 
@@ -212,8 +212,10 @@ class Tendons(Energy):
         """
         nodes, operators, tendon, rest, anchors = [], [], [], [], []
         for number, route in enumerate(self.guides):
-            held = np.isin(np.arange(len(route)), self.fixed_guides[number] if len(self.fixed_guides) else ())
-            places = locate(mesh, np.where(held[:, None], route[~held][:1], route))  # those in the world have no place
+            in_world = np.isin(np.arange(len(route)), self.fixed_guides[number] if len(self.fixed_guides) else ())
+            places = locate(
+                mesh, np.where(in_world[:, None], route[~in_world][:1], route)
+            )  # those in the world have no place
             worst = int(np.argmax(places.outside))
             if places.outside[worst] > self.reach:
                 raise InputError(
@@ -228,7 +230,7 @@ class Tendons(Energy):
                 step = kernels.OFFSET_UNIT * np.broadcast_to(self.directions[number][k], route.shape)
                 weights[..., 1 + k] = np.einsum("gki,gi->gk", places.gradients, step)
                 shape[..., 1 + k] = step
-            weights[held] = 0.0
+            weights[in_world] = 0.0
             for first in range(len(route) - 1):
                 own_nodes, own_operators = _difference(
                     mesh, places.cells[first : first + 2], weights[first : first + 2]
@@ -237,13 +239,15 @@ class Tendons(Energy):
                 operators.append(own_operators)
             tendon += [number] * (len(route) - 1)
             rest.append(np.diff(shape, axis=0))
-            anchors.append(np.diff(np.where(held[:, None, None], shape, 0.0), axis=0))
+            anchors.append(np.diff(np.where(in_world[:, None, None], shape, 0.0), axis=0))
         most = max(map(len, nodes))
         # Lists are padded with their first vertex and a zero operator.
-        padded = np.array([np.pad(own, (0, most - len(own)), constant_values=own[0]) for own in nodes])
+        padded = np.array(
+            [np.pad(vertices, (0, most - len(vertices)), constant_values=vertices[0]) for vertices in nodes]
+        )
         operator = np.zeros((len(nodes), 1, most, 3))
-        for row, own in enumerate(operators):
-            operator[row, 0, : len(own)] = own
+        for row, vertices in enumerate(operators):
+            operator[row, 0, : len(vertices)] = vertices
         lines = (np.concatenate(rest), np.concatenate(anchors), self.offset_count)
         return (TendonPoints(padded, operator, np.array(tendon), np.ones(len(tendon)), *lines),)
 

@@ -67,8 +67,8 @@ class Viscosity:
         offset = dilation = None
         if self.damped:
             strains = [(w, strain(x)) for x, w in stage.strain_weights]
-            offset = reduce(torch.add, [_scale(w * both[:, 0], own) for w, own in strains])
-            traces = [w * own.diagonal(dim1=-2, dim2=-1).sum(-1) for w, own in strains]
+            offset = reduce(torch.add, [_scale(w * both[:, 0], strained) for w, strained in strains])
+            traces = [w * strained.diagonal(dim1=-2, dim2=-1).sum(-1) for w, strained in strains]
             dilation = both[:, 1:] * reduce(torch.add, traces)
         if self.ratio is None or self.time is None:
             return both, offset, dilation
@@ -122,16 +122,19 @@ class StrainTerm(Term):
         On a CPU, the last results serve again, and must not be changed in place: with branches of Prony, a step needs
         the strain at its end, where the next one begins, and BDF2 looks back by two steps.
         """
-        own = self.launcher
-        at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.n_points, 3, 3)
+        launcher = self.launcher
+        at, out = launcher.zeros(self.sets[0].n_vertices, 3), launcher.zeros(self.n_points, 3, 3)
         view = warp_view(at, wp.vec3d)
         commands = [
-            own.record(
-                kernels.strain, (own.batch, s.n_points), [s.points, view], [warp_view(out[:, s.in_energy], wp.mat33d)]
+            launcher.record(
+                kernels.strain,
+                (launcher.batch, s.n_points),
+                [s.points, view],
+                [warp_view(out[:, s.in_energy], wp.mat33d)],
             )
             for s in self.sets
         ]
-        recorded = own.capture(*commands)
+        recorded = launcher.capture(*commands)
 
         known = list[tuple[torch.Tensor, torch.Tensor]]()
 
@@ -143,7 +146,7 @@ class StrainTerm(Term):
                 if torch.equal(place, at):
                     known.append(known.pop(number))
                     return strains.detach()
-            own.launch(recorded)
+            launcher.launch(recorded)
             if keeps:
                 known[:] = [*known[1 - _KEPT :], (at.clone(), out.clone())]
                 return known[-1][1].detach()
@@ -154,22 +157,22 @@ class StrainTerm(Term):
     @cached_property
     def strain_adjoint(self) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
         """Returns the vector-Jacobian product (B, N, 3) of `strain` at positions with (B, P, 3, 3)."""
-        own = self.launcher
-        at, out = own.zeros(self.sets[0].n_vertices, 3), own.zeros(self.sets[0].n_vertices, 3)
-        along, stress = own.zeros(self.n_points, 3, 3), own.zeros(self.n_points, 3, 3)
+        launcher = self.launcher
+        at, out = launcher.zeros(self.sets[0].n_vertices, 3), launcher.zeros(self.sets[0].n_vertices, 3)
+        along, stress = launcher.zeros(self.n_points, 3, 3), launcher.zeros(self.n_points, 3, 3)
         place, commands = warp_view(at, wp.vec3d), []
         for s in self.sets:
             direction, view = (warp_view(values[:, s.in_energy], wp.mat33d) for values in (along, stress))
             inputs = [s.points, place, direction]
-            commands.append(own.record(kernels.strain_adjoint, (own.batch, s.n_points), inputs, [view]))
-            commands.append(own.gather(s, view, out))
-        recorded = own.capture(*commands)
+            commands.append(launcher.record(kernels.strain_adjoint, (launcher.batch, s.n_points), inputs, [view]))
+            commands.append(launcher.gather(s, view, out))
+        recorded = launcher.capture(*commands)
 
         def product(positions: torch.Tensor, adjoint: torch.Tensor) -> torch.Tensor:
             at.copy_(positions)
             along.copy_(adjoint)
             out.zero_()
-            own.launch(recorded)
+            launcher.launch(recorded)
             return out.clone()
 
         return product

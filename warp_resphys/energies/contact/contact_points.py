@@ -54,13 +54,13 @@ def vertex_factors(mesh: Mesh, factors: Mapping[str, float]) -> NDArray[np.float
     Raises:
         InputError: the mesh has no such region, or a cell is in two of them.
     """
-    own, named = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells), dtype=bool)
+    by_cell, named = np.ones(len(mesh.cells)), np.zeros(len(mesh.cells), dtype=bool)
     for name, factor in factors.items():
         with naming("contact.friction_factors: "):
             cells = mesh.region(name)
         if named[cells].any():
             raise InputError(f"contact.friction_factors: {name!r} shares cells with another region: leave one out.")
-        own[cells], named[cells] = factor, True
+        by_cell[cells], named[cells] = factor, True
     corners, size = mesh.cells.ravel(), len(mesh.vertices)
     counts = np.bincount(corners, minlength=size).clip(1)
-    return np.asarray(np.bincount(corners, np.repeat(own, mesh.cells.shape[1]), size) / counts)
+    return np.asarray(np.bincount(corners, np.repeat(by_cell, mesh.cells.shape[1]), size) / counts)

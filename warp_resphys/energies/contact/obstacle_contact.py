@@ -140,8 +140,8 @@ class Contact(Energy):
     @override
     def constants(self) -> Mapping[str, Parameter]:
         zeros = {quantity.name: 0.0 for quantity in (GROWTH, *SHIFT, *TURN)}
-        own = {STIFFNESS.name: self._by_obstacle("stiffness"), FRICTION.name: self._by_obstacle("friction")}
-        return {**own, **zeros}
+        known = {STIFFNESS.name: self._by_obstacle("stiffness"), FRICTION.name: self._by_obstacle("friction")}
+        return {**known, **zeros}
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
@@ -194,9 +194,9 @@ class BoundContact(BoundEnergy):
         rigid = list[tuple[torch.Tensor, torch.Tensor]]()
         for name in site.body.controls:
             cells = site.body.mesh.cells[site.body.mesh.region(name)]
-            own = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
-            if len(surface := torch.isin(self._vertices, own).nonzero().ravel()):  # others are out of reach
-                rigid.append((surface, own[~torch.isin(own, self._vertices)]))
+            part = torch.as_tensor(np.unique(cells) + site.first, device=like.device)
+            if len(surface := torch.isin(self._vertices, part).nonzero().ravel()):  # others are out of reach
+                rigid.append((surface, part[~torch.isin(part, self._vertices)]))
         self._clearance = Clearance(contact.obstacles, contact.distance, self._shapes, self._vertices, free, rigid)
         self._clearance.check_start(like, self.pose(contact.constants, {}))
 
@@ -324,12 +324,12 @@ class BoundContact(BoundEnergy):
         if not self._contact.moves:
             return now, now
         memory = step.state.memory
-        given = [memory.get(name) for name in (m.name for m in self.memory)]
-        if given[0] is None or given[1] is None:
+        poses = [memory.get(name) for name in (m.name for m in self.memory)]
+        if poses[0] is None or poses[1] is None:
             rest = now if math.isfinite(step.stage.step) else self._pose(step.values, {}, step.state.batch)
             return rest, rest
-        before = Pose(given[0], given[1], now.growth)
-        return before, before if given[2] is None or given[3] is None else Pose(given[2], given[3], now.growth)
+        before = Pose(poses[0], poses[1], now.growth)
+        return before, before if poses[2] is None or poses[3] is None else Pose(poses[2], poses[3], now.growth)
 
     @override
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:

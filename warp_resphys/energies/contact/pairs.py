@@ -63,8 +63,8 @@ class Surface:
         degree, owners = np.bincount(triangles.ravel(), minlength=len(x)), np.full(len(x), -1)
         for number, region in reversed(list(enumerate(mesh.regions.values()))):
             owners[mesh.cells[region]] = number
-        own = (np.unique(triangles), triangles, edges, degree, pieces.astype(np.int64), x, areas)
-        return cls(*own, tuple(mesh.regions), owners)
+        arrays = (np.unique(triangles), triangles, edges, degree, pieces.astype(np.int64), x, areas)
+        return cls(*arrays, tuple(mesh.regions), owners)
 
     def within(self, first: int, count: int) -> "Surface":
         """Returns the surface with its body's vertices from `first` on among `count`."""
@@ -151,11 +151,11 @@ class PairList:
         self.vertices = tensor(surface.vertices)
         self._triangles, self._edges = tensor(surface.triangles), tensor(surface.edges)
         self._pieces = tensor(surface.pieces)
-        own = self._pieces[self.vertices]
+        pieces = self._pieces[self.vertices]
         # Weights of the mean over every piece, and in the last row over all.
         self._means = torch.zeros(int(surface.pieces.max()) + 2, n, device=device, dtype=torch.float64)
-        self._means[own, self.vertices] = 1.0 / torch.bincount(own, minlength=len(self._means))[own].double()
-        self._means[-1, self.vertices] = 1.0 / len(own)
+        self._means[pieces, self.vertices] = 1.0 / torch.bincount(pieces, minlength=len(self._means))[pieces].double()
+        self._means[-1, self.vertices] = 1.0 / len(pieces)
         self._degree = tensor(surface.degree, torch.float64)
         # Both surfaces in contact have vertices, for half of its area, and edges, for an eighth.
         self._vertex_area = tensor(0.5 * surface.vertex_areas(), torch.float64)
@@ -195,7 +195,7 @@ class PairList:
 
     def find(self, origin: torch.Tensor, ways: torch.Tensor) -> None:
         """Makes the list for positions (B, N, 3) and ways (B, N, 3) from there, around the middle of these [m]."""
-        own, surface = self._launcher, self.surface
+        launcher, surface = self._launcher, self.surface
         outer, inner = (_SPARE * size + self._least_radius for size in self._ways(ways))
         self._origin, self._outer, self._inner = origin + 0.5 * ways, outer, inner
         motion = struct_of(
@@ -209,12 +209,12 @@ class PairList:
             (self._hierarchy(motion, edges), edges, edges, size),
         )
         while True:
-            count = torch.zeros(1, device=own.device, dtype=torch.int32)
-            keys = torch.zeros(self._capacity, device=own.device, dtype=torch.int64)
+            count = torch.zeros(1, device=launcher.device, dtype=torch.int32)
+            keys = torch.zeros(self._capacity, device=launcher.device, dtype=torch.int64)
             pair_keys = struct_of(broad_phase.PairKeys, count=count, keys=keys)
             for kind, (tree, first, second, offset) in enumerate(searches):
                 inputs = [kind, tree.id, motion, first, second, wp.int64(offset), wp.int64(total)]
-                own.launch(own.record(broad_phase.close_pairs, (own.batch, first.shape[0]), inputs, [pair_keys]))
+                launcher.run(broad_phase.close_pairs, (launcher.batch, first.shape[0]), inputs, [pair_keys])
             if (needed := int(count)) <= self._capacity:
                 break
             self._capacity = 2 * needed  # The list is made again.
@@ -225,14 +225,14 @@ class PairList:
 
         Bodies keep together, so that a hierarchy serves for many positions.
         """
-        own, device = self._launcher, str(self._launcher.device)
-        size, used = own.batch * nodes.shape[0], self._hierarchies.get(nodes.ptr)
+        launcher, device = self._launcher, str(self._launcher.device)
+        size, used = launcher.batch * nodes.shape[0], self._hierarchies.get(nodes.ptr)
         if used is None:
             with shareable():
                 arrays = [wp.empty(size, dtype=kind, device=device) for kind in (wp.vec3, wp.vec3, int)]
             used = self._hierarchies[nodes.ptr] = _Hierarchy(arrays)
-        own.launch(own.record(broad_phase.boxes, (own.batch, nodes.shape[0]), [motion, nodes], used.arrays))
-        with shareable(), wp.ScopedStream(launch_stream(own.device)):
+        launcher.run(broad_phase.boxes, (launcher.batch, nodes.shape[0]), [motion, nodes], used.arrays)
+        with shareable(), wp.ScopedStream(launch_stream(launcher.device)):
             return used.fitted()
 
     def _set(self, keys: torch.Tensor, size: int, total: int) -> None:
@@ -268,11 +268,11 @@ class PairList:
 
     def distances(self, positions: torch.Tensor) -> torch.Tensor:
         """Returns the distances (C,) of the pairs at positions (B, N, 3) [m]."""
-        own, kept = self._launcher, positions.contiguous()
-        out = torch.zeros(self.count, device=own.device, dtype=torch.float64)
+        launcher, kept = self._launcher, positions.contiguous()
+        out = torch.zeros(self.count, device=launcher.device, dtype=torch.float64)
         if self.count:
             inputs = [self.pairs, warp_view(kept, wp.vec3d)]
-            own.launch(own.record(nearest_points.distances, (self.count,), inputs, [warp_view(out, wp.float64)]))
+            launcher.run(nearest_points.distances, (self.count,), inputs, [warp_view(out, wp.float64)])
         return out
 
     def check_apart(self, positions: torch.Tensor, when: str, advice: str) -> None:
@@ -309,10 +309,10 @@ class PairList:
         depth, deepest = 0.0, -1
         pieces = self._pieces[[vertex, other]].tolist()
         for one, two in (pieces, pieces[::-1]) if pieces[0] != pieces[1] else ():
-            own = self.vertices[self._pieces[self.vertices] == one]
-            far = -self._distances(positions, two, own)
+            vertices = self.vertices[self._pieces[self.vertices] == one]
+            far = -self._distances(positions, two, vertices)
             if far.max() > depth:
-                depth, deepest = float(far.max()), int(own[int(far.argmax())])
+                depth, deepest = float(far.max()), int(vertices[int(far.argmax())])
         if deepest >= 0:
             words += f"; deepest is {self.surface.words(deepest)}, by {1e3 * depth:.3g} mm"
         return words
@@ -341,11 +341,13 @@ class PairList:
 
     def crossings(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the number (B,) of edges that pass through a triangle, and the first of them (B,)."""
-        own = self._launcher
-        motion = struct_of(broad_phase.Sweep, origin=positions.contiguous(), outer=own.zeros(positions.shape[1]))
+        launcher = self._launcher
+        motion = struct_of(broad_phase.Sweep, origin=positions.contiguous(), outer=launcher.zeros(positions.shape[1]))
         hierarchy = self._hierarchy(motion, self._triangle_array)
-        count, edge = (torch.full((own.batch,), k, device=own.device, dtype=torch.int32) for k in (0, 2**31 - 1))
+        count, edge = (
+            torch.full((launcher.batch,), k, device=launcher.device, dtype=torch.int32) for k in (0, 2**31 - 1)
+        )
         inputs = [hierarchy.id, motion, self._edge_array, self._triangle_array]
         outputs = [warp_view(count, wp.int32), warp_view(edge, wp.int32)]
-        own.launch(own.record(broad_phase.crossings, (own.batch, len(self.surface.edges)), inputs, outputs))
+        launcher.run(broad_phase.crossings, (launcher.batch, len(self.surface.edges)), inputs, outputs)
         return count, edge

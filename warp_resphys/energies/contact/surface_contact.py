@@ -123,9 +123,9 @@ class SurfaceContact(Energy):
         vertices = surface.vertices
         regions = np.zeros((len(self.pairs), 2, len(mesh.vertices)), dtype=np.bool_)
         for row, (name, pair) in zip(regions, self.pairs.items(), strict=True):
-            for own, region in zip(row, (pair.first, pair.second), strict=True):
+            for members, region in zip(row, (pair.first, pair.second), strict=True):
                 with naming(f"the pair {name!r} of a contact between surfaces: "):
-                    own[mesh.cells[mesh.region(region)]] = True
+                    members[mesh.cells[mesh.region(region)]] = True
         return (SurfacePoints(vertices[:, None], np.ones((len(vertices), 1, 1, 1)), surface, regions),)
 
     @override

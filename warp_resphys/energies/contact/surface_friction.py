@@ -34,7 +34,7 @@ class NearPairs(NamedTuple):
         part = x.new_zeros(len(chosen), _FEATURES)
         features = struct_of(nearest_points.Features, coefficient=part, w=w, t=t, s=s)
         inputs = [warp_view(indices, wp.int32), pairs.pairs, wp.float64(pairs.reach), warp_view(x, wp.vec3d)]
-        launcher.launch(launcher.record(nearest_points.pair_features, (len(chosen), _FEATURES), inputs, [features]))
+        launcher.run(nearest_points.pair_features, (len(chosen), _FEATURES), inputs, [features])
         environment, nodes = pairs.environment[chosen], pairs.nodes[chosen]
         ends = x[environment[:, None], nodes]
         # Weights that do not change here, but whose derivatives are those of the nearest points.

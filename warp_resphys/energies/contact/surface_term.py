@@ -92,9 +92,9 @@ class SurfaceTerm(Term):
         if self._whole is None:
             return field
         out = torch.zeros_like(field) if out is None else out
-        (s,), own = self.sets, self.launcher
+        (s,), launcher = self.sets, self.launcher
         inputs = [self._list.vertex_array, s.points, warp_view(field.contiguous(), wp.vec3d)]
-        own.launch(own.record(kernels.interpolate, (own.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)]))
+        launcher.run(kernels.interpolate, (launcher.batch, self.n_points), inputs, [warp_view(out, wp.vec3d)])
         return out
 
     @override
@@ -106,15 +106,15 @@ class SurfaceTerm(Term):
 
     @override
     def check_start(self, start: torch.Tensor, follows: bool) -> None:
-        given, ours = self.values["surface_start"], self._list
+        before, pairs = self.values["surface_start"], self._list
         if not follows:
             when = "at the start of a step, in environment {}"
-            ours.check_apart(given, when, "give a state in which the bodies are apart")
+            pairs.check_apart(before, when, "give a state in which the bodies are apart")
         share = self.launcher.zeros() + 1.0
-        self.free_way(given, start, share)
+        self.free_way(before, start, share)
         if bool((share < 1.0).any()):
             b = int(share.argmin())
-            way = (start - given)[b].norm(dim=-1)
+            way = (start - before)[b].norm(dim=-1)
             raise InputError(
                 f"an obstacle moves a body through the gap to another one in a step, in environment {b} by up to "
                 f"{1e3 * float(way.max()):.3g} mm, at vertex {int(way.argmax())}: let it move less in a step, or go "
@@ -123,13 +123,13 @@ class SurfaceTerm(Term):
 
     @override
     def free_way(self, origin: torch.Tensor, end: torch.Tensor, share: torch.Tensor) -> None:
-        ours = self._list
+        pairs = self._list
         if torch.equal(origin, end):
             return
         origin, end = self._expand(origin), self._expand(end)
-        if not (ours.covers(origin) and ours.covers(end)):
-            ours.find(origin, end - origin)
-        if ours.count:
+        if not (pairs.covers(origin) and pairs.covers(end)):
+            pairs.find(origin, end - origin)
+        if pairs.count:
             self.launcher.launch(self._bound(origin, end, warp_view(share, wp.float64)))
 
     def _commands(self, positions: Any, active: Any) -> list[Any]:
@@ -143,22 +143,24 @@ class SurfaceTerm(Term):
         return self._recorded[active.ptr][1]
 
     def _record(self, positions: Any, active: Any) -> list[Any]:
-        own, ours = self.launcher, self._list
-        if self._sized != ours.version:
-            self._size(ours.count)
+        launcher, pairs = self.launcher, self._list
+        if self._sized != pairs.version:
+            self._size(pairs.count)
         stiffness = self.view(STIFFNESS.name)
-        inputs = [active, ours.pairs, stiffness, wp.float64(self._reach), positions]
+        inputs = [active, pairs.pairs, stiffness, wp.float64(self._reach), positions]
         pair_out = [warp_view(self._pair_force, nearest_points.Corners), warp_view(self._pair_energy, wp.float64)]
         sums = [warp_view(self._force, wp.vec3d), warp_view(self._energy, wp.float64)]
-        incidence = [warp_view(x, wp.int32) for x in (ours.start, ours.incident)]
-        size, near = (own.batch, self.n_points), warp_view(self._near, wp.int32)
-        commands = [own.record(kernels.pair_forces, (ours.count,), inputs, [*pair_out, near])] if ours.count else []
-        commands.append(own.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums))
+        incidence = [warp_view(x, wp.int32) for x in (pairs.start, pairs.incident)]
+        size, near = (launcher.batch, self.n_points), warp_view(self._near, wp.int32)
+        commands = (
+            [launcher.record(kernels.pair_forces, (pairs.count,), inputs, [*pair_out, near])] if pairs.count else []
+        )
+        commands.append(launcher.record(kernels.gather, size, [*incidence, *pair_out, self.n_points, 0], sums))
         if (grips := self._grips) is not None:
             inputs = [active, grips.struct, *self._friction(), positions]
-            commands.append(own.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs))
+            commands.append(launcher.record(kernels.grip_forces, (grips.count,), inputs, grips.outputs))
             inputs = [*grips.incidence, *grips.outputs, self.n_points, 1]
-            commands.append(own.record(kernels.gather, size, inputs, sums))
+            commands.append(launcher.record(kernels.gather, size, inputs, sums))
         return commands
 
     def _friction(self) -> list[Any]:
@@ -182,7 +184,7 @@ class SurfaceTerm(Term):
 
     @override
     def pair_tangents(self, positions: Any, clamp: bool, active: torch.Tensor) -> PairTangents | None:
-        own, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
+        launcher, chosen, parts = self.launcher, self._chosen(active), list[PairTangents]()
         if self._whole is not None:
             positions = warp_view(self._expand(wp.to_torch(positions), self._whole), wp.vec3d)
         if len(chosen):
@@ -191,12 +193,12 @@ class SurfaceTerm(Term):
             inputs = [warp_view(indices, wp.int32), self._list.pairs, stiffness, wp.float64(self._reach), positions]
             out = [warp_view(blocks, wp.float64)]
             kernel = kernels.pair_springs if clamp else kernels.pair_tangents
-            own.launch(own.record(kernel, (len(chosen),), inputs, out))
+            launcher.run(kernel, (len(chosen),), inputs, out)
             parts.append(PairTangents(self._list.environment[chosen], self._list.nodes[chosen], blocks))
         if (grips := self._grips) is not None:
             blocks = self._force.new_zeros(grips.count, 12, 12)
             inputs = [grips.struct, *self._friction(), positions]
-            own.launch(own.record(kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)]))
+            launcher.run(kernels.grip_tangents, (grips.count,), inputs, [warp_view(blocks, wp.float64)])
             used = active.bool()[grips.environment]
             parts.append(PairTangents(grips.environment[used], grips.nodes[used], blocks[used]))
         if not parts:
@@ -214,16 +216,16 @@ class SurfaceTerm(Term):
 
     def _bounding(self, origin: Any, positions: Any, share: Any) -> list[Any]:
         """Returns the launch that bounds a way, after a search for pairs along it, and limits its length."""
-        own, ours, self._bounded = self.launcher, self._list, True
+        launcher, pairs, self._bounded = self.launcher, self._list, True
         start, end, part = self._expand(wp.to_torch(origin)), self._expand(wp.to_torch(positions)), wp.to_torch(share)
-        ways = ((end - start) * own.active[:, None, None]).nan_to_num(0.0)
-        start = torch.where(own.active.bool()[:, None, None], start, end)
-        part.copy_(torch.minimum(part, ours.longest_way / ours.lengths(ways).amax(1).clamp_min(_TINY)))
+        ways = ((end - start) * launcher.active[:, None, None]).nan_to_num(0.0)
+        start = torch.where(launcher.active.bool()[:, None, None], start, end)
+        part.copy_(torch.minimum(part, pairs.longest_way / pairs.lengths(ways).amax(1).clamp_min(_TINY)))
         way = part[:, None, None] * ways
-        if not (ours.covers(start) and ours.covers(start + way)):
-            ours.find(start, way)
+        if not (pairs.covers(start) and pairs.covers(start + way)):
+            pairs.find(start, way)
         self._ends = start, end  # keeps their memory
-        return [self._bound(start, end, share)] if ours.count else []
+        return [self._bound(start, end, share)] if pairs.count else []
 
     def _bound(self, start: torch.Tensor, end: torch.Tensor, share: Any) -> Any:
         """Returns the launch that bounds the way between positions (B, N, 3)."""
@@ -258,7 +260,7 @@ class SurfaceTerm(Term):
         nodes, out = self._list.nodes[chosen], torch.zeros_like(chosen)
         first = torch.arange(4, device=nodes.device) <= self._list.kind[chosen, None]
         for number, regions in reversed(list(enumerate(self._members, 1))):
-            a, b = (own[nodes] for own in regions)
+            a, b = (region[nodes] for region in regions)
             matches = torch.where(first, a, b).all(1) | torch.where(first, b, a).all(1)
             out = torch.where(matches, number, out)
         return out
@@ -288,22 +290,22 @@ class SurfaceTerm(Term):
         if len(chosen := self._near_at(x.detach())):
             differentiable = torch.is_grad_enabled()
             with torch.enable_grad():
-                given = x if x.requires_grad else x.detach().requires_grad_()
-                near = self._pairs(chosen, given)
+                leaf = x if x.requires_grad else x.detach().requires_grad_()
+                near = self._pairs(chosen, leaf)
                 s = (near.d / self._reach).clamp_max(1.0)
                 barrier = (near.part * -(s - 1.0).square() * s.log()).sum(1) * self._reach
                 energy = (barrier * near.factor * stiffness[near.environment, 0]).sum()
-                (slope,) = torch.autograd.grad(energy, given, create_graph=differentiable)
+                (slope,) = torch.autograd.grad(energy, leaf, create_graph=differentiable)
             normal = -slope
             entries = near.environment[:, None] * x.shape[1] + near.nodes
             distance = torch.where(near.weights[:, 0] == 0.0, self._reach, near.d[:, :1])
             gap = gap.ravel().scatter_reduce(0, entries.ravel(), distance.ravel(), "amin").view_as(gap)
-        own = self._list.vertices
-        return gap[:, own], normal[:, own], friction[:, own], slide[:, own]
+        vertices = self._list.vertices
+        return gap[:, vertices], normal[:, vertices], friction[:, vertices], slide[:, vertices]
 
     @override
     def adjoint(self, positions: torch.Tensor, direction: torch.Tensor) -> Adjoint:
-        own = self.launcher
+        launcher = self.launcher
         names = ("surface_start", "surface_reference", STIFFNESS.name, FRICTION.name)
 
         def differentiate() -> dict[str, torch.Tensor]:
@@ -311,17 +313,17 @@ class SurfaceTerm(Term):
             chosen = self._near_at(x)
             environment, nodes = self._list.environment[chosen], self._list.nodes[chosen]
             work = (self._pair_force[chosen] * ways[environment[:, None], nodes]).sum((1, 2))
-            by_stiffness = own.zeros(1).index_add_(0, environment, -work[:, None]) / self.values[STIFFNESS.name]
-            start, reference, stiffness, friction = given = [
+            by_stiffness = launcher.zeros(1).index_add_(0, environment, -work[:, None]) / self.values[STIFFNESS.name]
+            start, reference, stiffness, friction = leaves = [
                 self.values[name].detach().requires_grad_() for name in names
             ]
-            slopes = tuple(torch.zeros_like(value) for value in given)
+            slopes = tuple(torch.zeros_like(value) for value in leaves)
             with torch.enable_grad():
                 if (slides := self.sliding(start, stiffness)) is not None:
                     force = slides.force(x, reference, friction, self.values["surface_slip"])
                     along = ways[slides.environment[:, None], slides.nodes]
                     work = (slides.weights[..., None] * along * force[:, None]).sum()
-                    slopes = torch.autograd.grad(work, given)
+                    slopes = torch.autograd.grad(work, leaves)
             out = dict(zip(names, slopes, strict=True))
             return out | {STIFFNESS.name: out[STIFFNESS.name] + by_stiffness}
 

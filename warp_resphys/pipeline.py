@@ -26,13 +26,11 @@ from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.digests import digest_of, files_read
 from .experiment.duration import announcement
-from .experiment.evaluate import evaluate
 from .experiment.experiment import LEARNED, SIMFREE
-from .experiment.folds import Fold, run_folds, workers_for
+from .experiment.folds import Fold, intervals_of_folds, run_folds, workers_for
 from .experiment.laboratory import run_laboratory
-from .experiment.learning_stages import identify, identify_law, reconstruct, train
+from .experiment.learning_stages import evaluate, identify, identify_law, reconstruct, train
 from .experiment.mesh_check import check_mesh
-from .experiment.prediction_intervals import intervals_of_folds
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
 from .experiment.shapes import try_shapes
@@ -359,7 +357,7 @@ def _run_folds(
     return {
         "errors_mm": summarise_folds(_of_all([of_fold["errors_mm"] for of_fold in metrics.values()])),
         "folds": metrics,
-        **intervals_of_folds(folder / files.DATASET, {name: fold.folder for name, fold in folds.items()}),
+        **intervals_of_folds(folder, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),

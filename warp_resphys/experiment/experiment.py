@@ -15,6 +15,7 @@ from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
 from ..io.safe_files import read_array, read_hdf5, read_json
+from ..learning.comparison import Model
 from ..learning.correction import Learned
 from ..learning.identification.identification import Identification
 from ..learning.networks import NextState, ResidualForce, StateMap
@@ -30,6 +31,7 @@ from .simulate import target_settings
 
 LAW: Final = "law"
 SIMFREE: Final = "simfree"
+INTERVAL_MODELS: Final = ("sysid", LAW, SIMFREE, "resphys")  # with prediction intervals, beside the baselines
 LEARNED: Final = (SIMFREE, "resphys_uncorrected", "resphys")
 # By model: the simulator that it uses or corrects, and the identification that provides its parameters.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
@@ -177,6 +179,11 @@ class Experiment:
         """The simulator that a model uses or corrects."""
         kind = self.sources(model)[0]
         return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
+
+    def model(self, name: str) -> Model:
+        """Returns a model that is compared, with what this run has learned for it."""
+        learned = self.learned(name)
+        return Model(self.model_simulator(name), self.identified(name), learned, name in INTERVAL_MODELS)
 
     def learned(self, model: str) -> Learned | None:
         """Trained network of a model; None for models without a network.

@@ -4,16 +4,24 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
+from ..data.trials import Trials
+from ..io.arrays import FloatArray
 from ..io.errors import InputError, ResphysError
 from ..io.fan_out import ALONE, WorkerError, Workers, fan_out
 from ..io.machine import available_cores
 from ..io.progress import Progress
 from ..io.resuming import Stage, StageInterrupted, run_stages, unfinished
+from ..io.safe_files import read_array, read_hdf5
+from ..learning.baselines import BASELINES
+from ..learning.intervals import LEVEL, intervals_of_each_other
 from ..settings.run_keys import ParallelSettings
 from .build import simulation_device
+from .experiment import INTERVAL_MODELS
+from .files import DATASET, ROLLOUTS
 
 Stages = Callable[[Workers], list[Stage]]
 
@@ -96,3 +104,24 @@ def _run(fold: Fold) -> None:
         run_stages(fold.stages(ALONE), fold.folder)
     except ResphysError as error:
         raise WorkerError(f"fold {fold.name}: {error}") from error
+
+
+def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> dict[str, Any]:
+    """Prediction intervals of a cross-validation; each fold is calibrated on the test trials of the other folds.
+
+    Args:
+        folder: of the dataset.
+        folders: folders of the folds, by the trial that a fold leaves out.
+    """
+    data, names, models = Trials.read(folder / DATASET), list(folders), dict[str, Any]()
+    for model in (*BASELINES, *INTERVAL_MODELS) if data.bound is not None and len(names) > 2 else ():
+        series: dict[str, list[FloatArray]] = {"observed": [], "spread": []}
+        for own in folders.values():
+            with read_hdf5(own / ROLLOUTS, "rollouts") as file:
+                for key, rows in series.items():
+                    rows += [read_array(file, f"{model}_{key}")[0]] if f"{model}_{key}" in file else []
+        if len(series["observed"]) == len(names):
+            spreads = series["spread"] if len(series["spread"]) == len(names) else None
+            if (covered := intervals_of_each_other(data, names, series["observed"], spreads)) is not None:
+                models[model] = covered
+    return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}

@@ -12,6 +12,7 @@ from ..io.parts import Checkpoint, Parts
 from ..io.resuming import StageContext, package_versions
 from ..io.safe_files import atomic_hdf5, create, resume_checkpoint, write_checkpoint, write_json
 from ..learning import reconstruction
+from ..learning.comparison import Comparison
 from ..learning.fitting import Fitting, Snapshot, fit
 from ..learning.identification import identification, law_search
 from ..learning.placement import Accuracy
@@ -19,9 +20,11 @@ from ..settings.stage_keys import StageSettings
 from .build import choose_device
 from .experiment import LAW, MODELS, SIMFREE, Experiment
 from .files import (
+    ERRORS,
     IDENTIFICATION,
     LAW_FILE,
     RECONSTRUCTION,
+    ROLLOUTS,
     read_if_there,
     reconstruction_file,
     training_file,
@@ -167,3 +170,32 @@ def fitting_of(experiment: Experiment, model: str) -> Fitting:
         experiment.sources(model)[0] == LAW,
         choose_device(settings.device),
     )
+
+
+def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
+    """Writes rollouts.h5, the observed points of every model's roll-outs of the test trials, and errors.json."""
+    settings: StageSettings = context.settings
+    experiment, parts = Experiment(settings, context.run_dir, "count"), Parts.of(context, workers, settings.batch)
+    found = experiment.reconstructed("resphys") if experiment.dataset.bound is None and not settings.with_law else None
+    compared = Comparison(
+        {name: experiment.model(name) for name in experiment.models},
+        experiment.motions,
+        train=settings.split.train,
+        groups=settings.groups,
+        calibration=settings.calibration,
+        horizons=settings.horizons,
+        reconstructed=None if found is None else found.of(settings.groups["1"], "q")[0],
+        parts=parts,
+    )
+    errors = compared.errors()
+    attributes = {"names": compared.names, "time_step": settings.time_step, "film_trial": compared.filmed}
+    with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
+        for model, values in compared.simulated.items():
+            create(file, f"{model}_observed", values, "m", time_axis=1)
+        for model in compared.models:
+            create(file, f"{model}_film", compared.film(model), "m")
+        create(file, "film_steps", compared.film_steps)
+        for model, spread in compared.spreads.items():
+            create(file, f"{model}_spread", spread, "m^2", time_axis=1)
+    write_json(context.run_dir / ERRORS, errors)
+    parts.remove()

@@ -23,6 +23,7 @@ from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.resuming import StageContext, package_versions, resources_used
 from ..io.safe_files import read_array, read_hdf5, read_json
+from ..learning.intervals import half_widths_of
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.selection import select_vertices
@@ -55,7 +56,6 @@ from .files import (
     read_if_there,
     training_file,
 )
-from .prediction_intervals import half_widths_of
 
 
 def make_report(context: StageContext) -> None:

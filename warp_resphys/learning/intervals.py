@@ -19,6 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
+from ..data.driving import since_change
+from ..data.rigid_bodies import as_markers
+from ..data.trials import Trials
 from ..io.arrays import BoolArray, FloatArray
 
 LEVEL: Final = 0.9
@@ -248,3 +251,73 @@ def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:
             reached = int(np.searchsorted(np.cumsum(weights[order]), level - 1e-9))
             quantiles[m] = values[order[min(reached, len(values) - 1)]]
     return quantiles
+
+
+def intervals_of_each_other(
+    dataset: Trials, names: Sequence[str], simulated: Sequence[FloatArray], spreads: Sequence[FloatArray] | None
+) -> dict[str, Any] | None:
+    """Coverage of intervals of which each trial's are calibrated on the others; None if some cannot be calibrated.
+
+    Args:
+        dataset: with the trials.
+        names: names of R trials.
+        simulated: (T, M, 3) of each trial, by models that have not learned from it [m].
+        spreads: (T, M) variances due to the parameters [m^2]; None if they are not known.
+    """
+    trials = predicted_trials(dataset, names, simulated, dataset.observed[dataset.rows(names)], spreads)
+    covered, rest = dict[str, tuple[FloatArray, FloatArray]](), rest_places(dataset)
+    for out, trial in trials.items():
+        intervals = Intervals.calibrated({name: other for name, other in trials.items() if name != out}, rest)
+        if intervals is None:
+            return None
+        covered[out] = intervals.covered(trial, rest)
+    return coverage(covered)
+
+
+def half_widths_of(
+    dataset: Trials,
+    names: Sequence[str],
+    errors: Mapping[str, Any],
+    simulated: Mapping[str, FloatArray],
+    spreads: Mapping[str, FloatArray],
+) -> dict[str, FloatArray]:
+    """Half-widths (R, T, M) of the intervals of markers and rigid bodies [m], by model that has intervals.
+
+    Args:
+        dataset: with the trials.
+        names: names of R trials.
+        errors: content of errors.json.
+        simulated: (R, T, M, 3) [m] by model.
+        spreads: (R, T, M) variances due to the parameters [m^2], by model.
+    """
+    known = {m: Intervals.from_plain(own) for m, own in errors.get("intervals", {}).get("models", {}).items()}
+    since = since_change(dataset, names)
+    return {
+        model: own.half_widths(
+            as_markers(simulated[model], dataset.labels), rest_places(dataset), since, spreads.get(model)
+        )
+        for model, own in known.items()
+        if own is not None and model in simulated
+    }
+
+
+def rest_places(dataset: Trials) -> FloatArray:
+    """(M, 3) markers on the undeformed body [m]; a rigid body is one."""
+    assert dataset.bound is not None
+    return as_markers(dataset.bound, dataset.labels)
+
+
+def predicted_trials(
+    dataset: Trials,
+    names: Sequence[str],
+    simulated: Sequence[FloatArray] | FloatArray,
+    observed: FloatArray,
+    spreads: Sequence[FloatArray] | FloatArray | None = None,
+) -> dict[str, Predicted]:
+    """Trials as they were predicted and observed; rigid bodies count as one marker."""
+    known = [None] * len(names) if spreads is None else spreads
+    rows = zip(names, simulated, observed, since_change(dataset, names), known, strict=True)
+    return {
+        name: Predicted(as_markers(x, dataset.labels), as_markers(y, dataset.labels), since, spread)
+        for name, x, y, since, spread in rows
+    }

@@ -1,0 +1,209 @@
+"""Several models on the same tested trials: roll-outs, errors, prediction intervals, and what explains errors."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain
+from typing import Any, Final
+
+import numpy as np
+
+from ..dynamics.simulator import Simulator
+from ..io.arrays import FloatArray, IntArray
+from ..io.parts import Parts, TrialPart
+from .correction import Learned
+from .error_tables import ComparedModels, amplitudes, counted
+from .evaluation import rollout_parts
+from .identification.identification import Identification
+from .identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
+from .intervals import LEVEL, Intervals, coverage, predicted_trials, rest_places
+from .observed_motions import ObservedMotions
+from .without_physics import without_physics
+
+_FILM_FRAMES: Final = 256  # maximum
+Linear = Mapping[str, Mapping[str, Sensitivity]]  # derivatives by model and trial
+
+
+@dataclass(frozen=True)
+class Model:
+    """A simulator with identified parameters, and the network that corrects or replaces it, if any."""
+
+    simulator: Simulator
+    identified: Identification = field(default_factory=Identification)
+    learned: Learned | None = None
+    has_intervals: bool = True
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models on tested trials, beside predictions without physics.
+
+    Attributes:
+        models: by name.
+        motions: observed trials.
+        train: names of the trials that were learned from.
+        groups: names of the tested trials by input scale; ``1``, the original inputs, is first.
+        calibration: names of the trials that prediction intervals come from; none without intervals.
+        horizons: durations of whose errors there is a table [s].
+        reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m]; None without any.
+        parts: workers and files of the roll-outs.
+    """
+
+    models: Mapping[str, Model]
+    motions: ObservedMotions
+    train: Sequence[str]
+    groups: Mapping[str, Sequence[str]]
+    calibration: Sequence[str] = ()
+    horizons: Sequence[float] = ()
+    reconstructed: FloatArray | None = None
+    parts: Parts = field(default_factory=lambda: Parts("evaluate"))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all tested trials."""
+        return [name for group in self.groups.values() for name in group]
+
+    @cached_property
+    def filmed(self) -> str:
+        """Name of the tested trial with the largest motion, whose vertices are kept."""
+        sizes = amplitudes(self.motions.dataset, self.groups["1"])
+        return max(sizes, key=sizes.__getitem__)
+
+    @cached_property
+    def film_steps(self) -> IntArray:
+        """Steps of the inputs at which vertices are kept."""
+        dataset = self.motions.dataset
+        steps = int(dataset.seconds([self.filmed]) / dataset.time_step + 1e-6)
+        return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
+
+    @cached_property
+    def _rolled_out(self) -> tuple[dict[str, list[TrialPart]], dict[str, list[TrialPart]]]:
+        """Parts of the tested trials, and of those of the calibration, by model, after they were rolled out."""
+
+        def cut(model: str, names: Sequence[str], label: str) -> list[TrialPart]:
+            own = self.models[model]
+            made = own.simulator, self.motions, names, own.learned, own.identified
+            return rollout_parts(*made, self.parts.batch, self.filmed, f"{label}{model}")
+
+        tested = {model: cut(model, self.names, "") for model in self.models}
+        with_intervals = [model for model, own in self.models.items() if own.has_intervals]
+        calibrating = {model: cut(model, self.calibration, "calibration_") for model in with_intervals}
+        self.parts.run([*chain(*tested.values(), *calibrating.values())])
+        return tested, calibrating
+
+    def _in_order(self, model: str, name: str) -> Any:
+        """An array of the roll-outs of a model, (R, ...) in the order of the tested trials."""
+        parts = self._rolled_out[0][model]
+        order = [own for part in parts for own in part.names]
+        rows = [order.index(own) for own in self.names]
+        if name == "observed":
+            return self.parts.joined(parts, name, self.motions.dataset.observed.shape[1])[rows]
+        return np.concatenate([self.parts.read(part, name) for part in parts])[rows]
+
+    @cached_property
+    def _without_physics(self) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
+        return without_physics(self.motions, self.names, self.train)
+
+    @cached_property
+    def simulated(self) -> dict[str, FloatArray]:
+        """(R, T, M, 3) predicted points of the tested trials by model [m], first those without physics."""
+        return self._without_physics[0] | {model: self._in_order(model, "observed") for model in self.models}
+
+    def film(self, model: str) -> FloatArray:
+        """(F, N, 3) vertices of the filmed trial at `film_steps` [m]."""
+        parts = self._rolled_out[0][model]
+        bodies = next(self.parts.read(part, "film") for part in parts if self.filmed in part.names)
+        substeps = round(self.motions.dataset.time_step / self.models[model].simulator.time_step)
+        return np.asarray(bodies[np.minimum(substeps * self.film_steps, len(bodies) - 1)])
+
+    @cached_property
+    def _linear(self) -> Linear:
+        return self._linearised(self.groups["1"])
+
+    def _linearised(self, names: Sequence[str], uncertain: bool = False) -> Linear:
+        """Derivatives of trials by the parameters of each model's simulator; empty without markers.
+
+        Args:
+            names: names of the trials.
+            uncertain: whether models are left out whose parameters have no uncertainty.
+        """
+        made: dict[int, Mapping[str, Sensitivity]] = {}
+        found: dict[str, Mapping[str, Sensitivity]] = {}
+        for name, model in self.models.items() if self.motions.dataset.bound is not None else ():
+            replaced = model.learned is not None and model.learned.replaces_simulator
+            if replaced or not model.has_intervals or (uncertain and model.identified.uncertainty is None):
+                continue
+            key = id(model.simulator)
+            if key not in made:
+                made[key] = sensitivities(model.simulator, self.motions, names, model.identified, self.parts.batch)
+            found[name] = made[key]
+        return found
+
+    def _spreads(self, names: Sequence[str], linear: Linear, left_out: bool = False) -> dict[str, FloatArray]:
+        dataset, models = self.motions.dataset, self.models
+        spreads = {m: parameter_spread(dataset, names, models[m].identified, x, left_out) for m, x in linear.items()}
+        return {model: spread for model, spread in spreads.items() if spread is not None}
+
+    @cached_property
+    def spreads(self) -> dict[str, FloatArray]:
+        """Variances (R, T, M) of markers and rigid bodies due to the parameters [m^2], by model."""
+        return self._spreads(self.groups["1"], self._linear)
+
+    def errors(self) -> dict[str, Any]:
+        """Returns all that errors.json has: tables, baselines, displacements, free fits and intervals."""
+        test, (_, plain, missing) = self.groups["1"], self._without_physics
+        networks = {name: own.learned for name, own in self.models.items() if own.learned is not None}
+        left = {name: self._in_order(name, "left") for name, own in networks.items() if own.range_ is not None}
+        compared = ComparedModels(
+            self.motions, self.train, self.groups, self.simulated, left, self.reconstructed, self.horizons
+        )
+        content = compared.errors() | {"baselines": plain} | ({"missing_baselines": missing} if missing else {})
+        sideways = dict(zip(self.names, self._in_order([*self.models][-1], "sideways").tolist(), strict=True))
+        if known := {name: sideways[name] for name in test if math.isfinite(sideways[name])}:
+            content["sideways_mm"] = known
+        return content | self._free_fits() | (self._intervals() if self.calibration else {})
+
+    def _free_fits(self) -> dict[str, Any]:
+        """Entry ``free_fits``, by model; empty if nothing could be fitted."""
+        names, fits = self.groups["1"], {}
+        observed = dict(zip(names, counted(self.motions, self.train, names), strict=True))
+        for model, own in self._linear.items():
+            predicted = dict(zip(names, self.simulated[model][: len(names)], strict=True))
+            fits[model] = free_fits(self.motions.dataset, observed, predicted, own)
+        return {"free_fits": fits} if any(fits.values()) else {}
+
+    def _intervals(self) -> dict[str, Any]:
+        """Prediction intervals by model and their coverage of the tested trials, see `intervals`.
+
+        Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`). The
+        intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
+        """
+        motions, dataset, test = self.motions, self.motions.dataset, self.groups["1"]
+        names = [*chain(*dataset.batches(self.calibration))]
+        observed, target = dataset.observed[dataset.rows(names)], counted(motions, self.train, test)
+        rest = rest_places(dataset)
+        learned = [row for row, name in enumerate(names) if name in self.train]
+        observed[learned, motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
+        linear = self._linearised(names, uncertain=True)
+        changes = {m: left_out_changes(dataset, names, self.models[m].identified, own) for m, own in linear.items()}
+        simulated, *_ = without_physics(motions, names, self.train, left_out=True)
+        for model, own in self._rolled_out[1].items():
+            change = changes.get(model)
+            simulated[model] = self.parts.joined(own, "observed", dataset.observed.shape[1])
+            simulated[model] += 0.0 if change is None else change
+        spreads, models = self._spreads(names, linear, left_out=True), dict[str, Any]()
+        for model in (model for model in simulated if model in self.simulated):
+            trials = predicted_trials(dataset, names, simulated[model], observed, spreads.get(model))
+            if (intervals := Intervals.calibrated(trials, rest)) is None:
+                continue
+            new = self.simulated[model][: len(test)]
+            tested = predicted_trials(dataset, test, new, target, self.spreads.get(model))
+            covered = coverage({name: intervals.covered(trial, rest) for name, trial in tested.items()})
+            models[model] = {**intervals.plain(), **covered}
+            alone = Intervals.calibrated({name: replace(trial, spread=None) for name, trial in trials.items()}, rest)
+            if model in self.spreads and alone is not None:
+                models[model]["without_spread"] = alone.plain()
+        without = any(change is not None for change in changes.values())
+        split = "left_out" if without else "training" if learned else "validation"
+        return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}

@@ -103,8 +103,8 @@ class Minimiser:
     def _record_directions(self) -> None:
         """Records the start of a solve, the choice of environments to factorise, and new directions."""
         p, now, b = self._potential, self._now, self._potential.batch
-        lbfgs, vector = lbfgs_kernels(_scalar(self._right.dtype)), wp.types.vector(3, _scalar(self._right.dtype))
-        right = warp_view(self._right, vector)
+        lbfgs = lbfgs_kernels(_scalar(self._right.dtype))
+        right = warp_view(self._right, wp.vec3d if self._right.dtype == torch.float64 else wp.vec3f)
         vertex_at = p.upload(self.hessian.vertex_at.astype(np.int32), int)
         inputs = [self._tolerances, warp_view(p.terms.force, wp.vec3d), warp_view(p.stiffness, wp.float64)]
         begin = p.record_blocks(kernels.begin, b, inputs, [now.progress, now.search, now.history])

@@ -67,7 +67,7 @@ class Simulator:
         counts: number of values of an input or a parameter per environment, by name.
         parts: names of the parts, such as tendons, for which a parameter may have values, by the parameter's name.
         constants: default values of the parameters.
-        energies: all energies.
+        energies: all energies of the body as one (`dynamics.energy_set`).
     """
 
     body: Body

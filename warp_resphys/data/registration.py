@@ -126,29 +126,13 @@ def register_markers(
             or too many of them are too far off.
     """
     a, b = np.asarray(measured, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
-    if a.shape != (len(names), 3) or b.shape != a.shape:
-        raise InputError(
-            f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones {b.shape}: both must "
-            "be (markers, 3)."
-        )
-    if unknown := [name for name in use or () if name not in names]:
-        raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
-    wanted = np.array([use is None or name in use for name in names], dtype=bool)
-    seen = np.isfinite(a).all(axis=1)
-    used = np.flatnonzero(wanted & seen)
-    least = 1 if rotation is not None else 3 if vertical is None else 2
-    if len(used) < least:
-        needed = ["one marker", "two markers", "three markers"][least - 1]
-        raise DataFileError(
-            f"{source}: registration needs {needed} at rest, but {len(used)} are left to it; not seen: "
-            f"{listed(_pick(names, wanted & ~seen))}."
-        )
+    used = _used(a, b, names, use, source, 1 if rotation is not None else 3 if vertical is None else 2)
     fewest, turned, known = max(4, len(used) // 2 + 1), None, ""
     if rotation is not None:
         fewest, turned = len(used) // 2 + 1, np.asarray(rotation, dtype=np.float64)
         known = " with the axes that are given"
     elif _distance_from_line(b[used]) <= largest_residual:
-        turned = _upright(a[used], b[used], vertical, largest_residual, listed(_pick(names, wanted & seen)))
+        turned = _upright(a[used], b[used], vertical, largest_residual, listed([names[row] for row in used]))
         fewest, known = len(used), " with the vertical that is given"
     best = _consensus(a, b, used, fewest, turned, largest_residual)
     if best is None:
@@ -159,9 +143,32 @@ def register_markers(
         )
     rows, motion = best
     moved, inliers = motion.apply(a), np.isin(np.arange(len(names)), rows)
-    outliers = tuple(_pick(names, wanted & seen & ~inliers))
+    outliers = tuple(names[row] for row in used if row not in rows)
     residual = np.linalg.norm(moved - b, axis=1)
     return Registration(tuple(names), motion, moved, residual, inliers, outliers, root_mean_square((moved - b)[rows]))
+
+
+def _used(
+    a: FloatArray, b: FloatArray, names: Sequence[str], use: Sequence[str] | None, source: str | Path, least: int
+) -> IntArray:
+    """Indices of the measured markers a to register to nominal ones b, at least so many."""
+    if a.shape != (len(names), 3) or b.shape != a.shape:
+        raise InputError(
+            f"{len(names)} markers are named, with measured positions {a.shape} and nominal ones {b.shape}: both must "
+            "be (markers, 3)."
+        )
+    if unknown := [name for name in use or () if name not in names]:
+        raise InputError(f"Registration should use {listed(unknown)}, but the markers are {listed(names)}.")
+    seen = np.asarray(np.isfinite(a).all(axis=1))
+    wanted = [row for row, name in enumerate(names) if use is None or name in use]
+    used = [row for row in wanted if seen[row]]
+    if len(used) < least:
+        needed = ["one marker", "two markers", "three markers"][least - 1]
+        raise DataFileError(
+            f"{source}: registration needs {needed} at rest, but {len(used)} are left to it; not seen: "
+            f"{listed([names[row] for row in wanted if not seen[row]])}."
+        )
+    return np.array(used, dtype=np.int64)
 
 
 def _upright(
@@ -225,10 +232,6 @@ def _distance_from_line(points: FloatArray) -> float:
     """Root mean square distance [m] of points (N, 3) from their best-fitting line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(np.sqrt(np.sum(spread[1:] ** 2) / len(points)))
-
-
-def _pick(names: Sequence[str], chosen: BoolArray) -> list[str]:
-    return [name for name, here in zip(names, chosen, strict=True) if here]
 
 
 def unit_vector(axis: str | Sequence[float]) -> FloatArray:

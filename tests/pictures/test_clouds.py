@@ -162,9 +162,9 @@ def test_a_turned_scan_with_outliers(beam):
     assert (turned * turn.inv()).magnitude() < 0.05
     at_clamp = [result.parameters[name] for name in PLACES[:3]]
     assert at_clamp == pytest.approx(turn.apply(CENTRE) + shift - CENTRE, abs=2e-3)
-    assert own.difference(own.photos[0], own.shape(result.parameters), result.parameters).cloud_mm < 1.0
+    assert own.difference(own.photos[0], own.shape(result.parameters), result.parameters)["cloud_mm"] < 1.0
     undeformed = replace(own, deforms=False)
-    assert undeformed.difference(own.photos[0], REST, result.parameters).cloud_mm > 4.0
+    assert undeformed.difference(own.photos[0], REST, result.parameters)["cloud_mm"] > 4.0
 
 
 def test_background_and_isolated_points_are_left_out():

@@ -16,7 +16,7 @@ from warp_resphys.learning.identification.identification import search_parameter
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
 from warp_resphys.pictures.picture_misfit import PictureMisfit, values_of
-from warp_resphys.pictures.seen import Photo, SeenPose
+from warp_resphys.pictures.seen import Photo, SeenPose, distance_of
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)
 LENS = Lens(torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
@@ -83,12 +83,13 @@ def test_parameters_come_back(seen, kind):
     own = replace(seen, photos=(photo,))
     q = own.shape(result.parameters)
     difference = own.difference(photo, q, result.parameters)
-    assert difference.distance < 0.25
+    assert distance_of(difference) < 0.25
     undeformed = replace(own, deforms=False)
-    assert undeformed.difference(photo, undeformed.shape({}), {}).distance > 10.0 * difference.distance
+    off = undeformed.difference(photo, undeformed.shape({}), {})
+    assert distance_of(off) > 10.0 * distance_of(difference)
     if kind == "outline":
-        assert difference.overlap > 0.97
-        assert difference.outline_px == pytest.approx(difference.outline_mm * 0.7 / 0.31, rel=0.1)
+        assert difference["overlap"] > 0.97
+        assert difference["outline_px"] == pytest.approx(difference["outline_mm"] * 0.7 / 0.31, rel=0.1)
 
 
 def test_a_body_beside_the_picture_is_named():

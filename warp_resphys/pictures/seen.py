@@ -76,29 +76,9 @@ class Photo:
         return self.time + max(self.row_time * max(rows), 0.0)
 
 
-@dataclass(frozen=True)
-class Difference:
-    """Distances between a simulated and a measured picture.
-
-    Attributes:
-        outline_mm: mean distance of the outlines, both ways, at the body's mean depth.
-        outline_px: the same in pixels.
-        overlap: common area over that of both together, outside of the clamps.
-        cloud_mm: mean distance of the points of a cloud from the surface, of farther ones its reach; None without.
-        points_mm: mean distance of the tracked points that were seen, at their depths; None without.
-    """
-
-    outline_mm: float | None = None
-    outline_px: float | None = None
-    overlap: float | None = None
-    cloud_mm: float | None = None
-    points_mm: float | None = None
-
-    @property
-    def distance(self) -> float:
-        """Distance of the outlines; where there are none, of the cloud, and without that, of tracked points [mm]."""
-        known = [value for value in (self.outline_mm, self.cloud_mm, self.points_mm) if value is not None]
-        return known[0] if known else math.nan
+def distance_of(difference: Mapping[str, float]) -> float:
+    """Returns the distance of the outlines; where there are none, of the cloud, else of tracked points [mm]."""
+    return next((difference[kind] for kind in ("outline_mm", "cloud_mm", "points_mm") if kind in difference), math.nan)
 
 
 @dataclass(frozen=True)
@@ -308,16 +288,21 @@ class SeenPose:
             )
         return rim, simulated, measured
 
-    def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> Difference:
+    def difference(self, photo: Photo, q: torch.Tensor, values: Mapping[str, float]) -> dict[str, float]:
         """Returns how far a simulated picture is from a measured one.
 
         Args:
             photo: the picture.
             q: (N, 3) vertices [m].
             values: of the camera's corrections by name; none where they are left out.
+
+        Returns:
+            What the picture shows of: ``outline_mm``, the mean distance of the outlines, both ways, at the body's mean
+            depth; ``outline_px``, the same in pixels; ``overlap``, the common area over that of both together, outside
+            of the clamps; ``cloud_mm``, the mean distance of the points of a cloud from the surface, of farther ones
+            its reach; and ``points_mm``, the mean distance of the tracked points that were seen, at their depths.
         """
-        q, corrections = q.double().cpu(), PlacedCamera.corrections(values)
-        result = Difference()
+        q, corrections, result = q.double().cpu(), PlacedCamera.corrections(values), dict[str, float]()
         if photo.outline is not None:
             depth = photo.camera.seen_from(q, corrections)[:, 2]
             rim, of_simulated, of_measured = self.outlines(photo, q, corrections)
@@ -331,15 +316,15 @@ class SeenPose:
                 shapely.difference(area, hidden) for area in (self.surface.region(drawn), photo.outline.region)
             )
             overlap = shapely.intersection(body, mask).area / shapely.union(body, mask).area
-            result = replace(result, outline_mm=millimetres, outline_px=pixels, overlap=overlap)
+            result |= {"outline_mm": millimetres, "outline_px": pixels, "overlap": float(overlap)}
         if photo.cloud is not None:
             distances = np.abs(photo.cloud.distances(photo.camera, corrections, self.surface.triangles, q).distances)
-            result = replace(result, cloud_mm=_MILLI * float(np.minimum(distances, photo.cloud.reach).mean()))
+            result["cloud_mm"] = _MILLI * float(np.minimum(distances, photo.cloud.reach).mean())
         if photo.tracked is not None and self.points is not None:
             places = self.points(q[None])[0]
             away = photo.camera.pixels(places, corrections).numpy() - photo.tracked
             deep = photo.camera.seen_from(places, corrections)[:, 2].numpy()
             distance = np.linalg.norm(away, axis=1) * deep * photo.camera.millimetres(corrections)
             if np.isfinite(distance).any():
-                result = replace(result, points_mm=float(np.nanmean(distance)))
+                result["points_mm"] = float(np.nanmean(distance))
         return result

@@ -25,7 +25,7 @@ from ...learning.identification.identification import first_points, search_param
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
-from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape
+from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
 from ...report.identification_section import parameter_rows
 from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
 from ...settings.pictures import PictureData
@@ -220,7 +220,7 @@ class _Plan:
                 photos = [photo for photo in tried.photos if photo.camera.lens is not None and photo.lens == lens]
                 photos = photos[:: math.ceil(len(photos) / _TRIED)]
                 bodies = [tried.vertices(photo, shape, known) for photo in photos]
-                distances = (tried.difference(*pair, known).distance for pair in zip(photos, bodies, strict=True))
+                distances = (distance_of(tried.difference(*pair, known)) for pair in zip(photos, bodies, strict=True))
                 seen.append((sum(distances), camera))
             except InputError as error:
                 failure = error
@@ -302,7 +302,7 @@ def compare_pictures(context: StageContext) -> None:
                     seen_by = values_of(pose, values, photo.lens)
                     row = {"pose": name, "picture": number, "model": model, "tested": name in settings.data.test}
                     q = pose.vertices(photo, near[1], seen_by)
-                    rows.append({**row, **asdict(pose.difference(photo, q, seen_by)), "values": seen_by})
+                    rows.append({**row, **pose.difference(photo, q, seen_by), "values": seen_by})
                     corrections = PlacedCamera.corrections(seen_by)
                     if photo.outline is not None:
                         rim, weights, _ = pose.outlines(photo, q, corrections)
@@ -329,7 +329,7 @@ def summary_of(rows: Sequence[Mapping[str, Any]], data: PictureData) -> list[Pic
         of_pose, means = [row for row in rows if row["pose"] == name], dict[str, dict[str, float | None]]()
         for key in ("outline_mm", "outline_px", "overlap", "cloud_mm", "points_mm"):
             for model in MODELS:
-                known = [row[key] for row in of_pose if row["model"] == model and row[key] is not None]
+                known = [row[key] for row in of_pose if row["model"] == model and key in row]
                 means.setdefault(key, {})[model] = float(np.mean(known)) if known else None
         count = len({row["picture"] for row in of_pose})
         results.append(PictureResult(name, data.poses[name].material or "", name in data.test, count, **means))

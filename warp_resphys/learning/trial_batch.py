@@ -90,14 +90,6 @@ class TrialBatch:
         observed = torch.where(inside[..., None, None], self.observed, torch.nan)
         return replace(self, times=self.times[:, :last], observed=observed[:, :last])
 
-    def joined(self, other: "TrialBatch") -> "TrialBatch":
-        """Returns these trials followed by others, with the same number of frames and the same kinds of inputs."""
-        times, observed, held = (
-            torch.cat([getattr(t, n) for t in (self, other)]) for n in ("times", "observed", "held")
-        )
-        inputs, resting = self.inputs.joined(other.inputs), self.resting.joined(other.resting)
-        return TrialBatch(self.names + other.names, times, observed, held, inputs, resting, self.session)
-
     def to(self, like: torch.Tensor) -> "TrialBatch":
         """Returns the trials on the device and in the precision of a tensor."""
         fields = (self.times.to(like), self.observed.to(like), self.held.to(like))

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from itertools import islice
+from itertools import islice, repeat
 from typing import Any
 
 import numpy as np
@@ -190,7 +190,7 @@ def played(
     Args:
         frames: number of frames.
         simulator: of the bodies.
-        substeps: steps from frame to frame.
+        substeps: steps from frame to frame; none of static poses.
         data: motions of trials without their own.
         trials: trials of the part.
         begin: state of the first frame.
@@ -214,7 +214,10 @@ def played(
         now = inputs_at(frame, share).replace(**{name: own[number + 1] for name, own in moving.items()})
         return simulator.step(state, now, constants)
 
-    yield from islice(states(step, begin, range((frames - 1) * substeps)), 0, None, substeps)
+    if substeps:
+        yield from islice(states(step, begin, range((frames - 1) * substeps)), 0, None, substeps)
+    else:
+        yield from repeat(begin, frames)
 
 
 def _free_motion(settings: StageSettings, names: Sequence[str], report: Report) -> Arrays:

@@ -133,7 +133,8 @@ class TestMotion:
         shown = {"sysid": 1.2 * MEASURED, "resphys": 1.1 * MEASURED}
         widths = {"resphys": np.linspace(1e-3, 3e-3, 20)[:, None]}
         figure = paths_of(shown, bands=widths)
-        (band,) = figure.axes[2].collections
+        (axes,) = figure.axes  # Nothing moves along x and y.
+        (band,) = axes.collections
         corners = band.get_paths()[0].vertices
         for time, middle, width in zip(TIMES, 1.1 * MEASURED[:, 0, 2], widths["resphys"][:, 0], strict=True):
             reached = corners[np.isclose(corners[:, 0], time), 1]

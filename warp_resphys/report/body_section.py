@@ -26,6 +26,7 @@ _CALIBRATED: Final = {  # Source of prediction intervals.
     "folds": "the errors of the other folds",
 }
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.
+_STILL: Final = 0.01  # Largest motion along an axis that is not drawn, over that along the others.
 _LOWEST: Final = 2.2  # Least height of all panels [in].
 _MOST_DOTS: Final = 75  # Dots along a time axis.
 _BAND: Final = 0.16  # Opacity of prediction intervals.
@@ -198,13 +199,16 @@ def marker_paths(
         measured_and_simulated = [trials.target, *(trials.positions[model] for model in models)]
         target, *paths = (1e3 * (q[row] - start)[:, kept] for q in measured_and_simulated)  # [mm]
     times, ratios = trials.times[row], [1.0] * len(kept) + [1.3] * (driven is not None)
+    drawn = (np.where(np.abs(q) < figures.LARGEST_SHOWN, q, 0.0) for q in (target, *paths))
+    reach = np.max([np.ptp(q, axis=0).max(axis=0) for q in drawn], axis=0)  # (3,) [mm]
+    shown = [axis for axis in trials.axes if reach[axis] > _STILL * reach.max()] or [*trials.axes]
     figure = figures.new_figure(0.9 + max(1.25 * sum(ratios), _LOWEST))
-    panels = figure.subplots(len(ratios), len(trials.axes), sharex=True, squeeze=False, height_ratios=ratios)
+    panels = figure.subplots(len(ratios), len(shown), sharex=True, squeeze=False, height_ratios=ratios)
     least = _LEAST_SPAN * float(np.ptp(np.nan_to_num(target), axis=0).max())
     every = -(-len(times) // _MOST_DOTS)
     dots: dict[str, Any] = {"color": TONES["ink"].light, "markersize": 3.2, "zorder": 1.5, "label": "Observed"}
     for marker, of_marker in enumerate(panels[: len(kept)]):
-        for axes, axis in zip(of_marker, trials.axes, strict=True):
+        for axes, axis in zip(of_marker, shown, strict=True):
             seen = target[:, marker, axis]
             axes.plot(times[::every], seen[::every], ".", **dots)
             for model, path in zip(models, paths, strict=True):
@@ -216,7 +220,7 @@ def marker_paths(
             figures.keep_in_view(axes, seen, 0.6, least)
             figures.few_ticks(axes.yaxis, 4)
         of_marker[0].set_ylabel(f"{trials.labels[kept[marker]]} [mm]")
-    for axes, axis in zip(panels[0], trials.axes, strict=True):
+    for axes, axis in zip(panels[0], shown, strict=True):
         axes.set_title("xyz"[axis])
     if driven is not None:
         for axes in panels[-1]:

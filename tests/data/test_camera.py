@@ -1,4 +1,4 @@
-"""Cameras: the pinhole's equation, corrections, derivatives, points from depths, and Young's modulus from pixels."""
+"""Cameras: the pinhole's equation, corrections, derivatives, points from depths, Young's modulus from pixels; views."""
 
 import math
 
@@ -8,10 +8,20 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
-from warp_resphys.data.camera import CORRECTIONS, CameraMarkers, Lens, PlacedCamera
+from warp_resphys.data.camera import (
+    CORRECTIONS,
+    CameraMarkers,
+    Lens,
+    PlacedCamera,
+    axes_from_below,
+    motion_axes,
+    path_axes,
+)
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.stepping.rotations import rotations
 
+X, Y, Z = np.eye(3)
+DOWN = np.array([0.0, 0.0, -9.8])
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 TIP = wr.select_vertices(MESH, x=0.1)
 PLACES = np.array([[0.1, 0.01, 0.022], [0.06, 0.01, 0.022], [0.1, 0.022, 0.01]])
@@ -208,3 +218,31 @@ def test_located_points_are_those_that_are_seen():
         for number, by in enumerate(1e-6 * torch.eye(len(CORRECTIONS), dtype=torch.float64)):
             ends = [camera.located(own, corrections + sign * by) for sign in (1.0, -1.0)]
             assert torch.allclose(slopes[number], (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("plane", [(X, Y), (X, -Y), (Y, X), (X, Z), (-Y, Z), (X, Y + Z)])
+@pytest.mark.parametrize("gravity", [-9.81 * Z, np.zeros(3)])
+def test_letters_can_be_read_and_what_is_up_is_above(plane, gravity):
+    axes = path_axes(np.stack(plane), gravity)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    right, up = (axes[:2] @ direction for direction in plane)
+    assert right[0] > 0.9  # Neither mirrored nor turned:
+    assert up[1] > 0.5
+    assert right[0] * up[1] - right[1] * up[0] > 0.5
+    assert axes[1] @ Z > 0.3
+
+
+def test_the_free_end_is_on_the_right_and_gravity_down():
+    rest = wr.box_hexahedra(divisions=(4, 1, 1)).vertices
+    bent = rest + np.linspace(0.0, 0.1, 10)[:, None, None] * rest[:, :1] * [0.0, 0.0, -1.0]
+    axes = motion_axes(DOWN, bent)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert axes[0, 0] > 0.9
+    assert axes[1, 2] > 0.9
+    assert motion_axes(DOWN, bent * [-1.0, 1.0, 1.0])[0, 0] < -0.9
+    assert motion_axes(DOWN, bent[..., [2, 1, 0]] * [1.0, 1.0, -1.0])[1, 2] > 0.9
+    assert np.isfinite(motion_axes(np.zeros(3), bent)).all()
+    below = axes_from_below(axes, DOWN)
+    np.testing.assert_allclose(below[[0, 2]], [axes[0], [0.0, 0.0, -1.0]], atol=1e-12)
+    assert np.linalg.det(below) == pytest.approx(1.0)
+    np.testing.assert_array_equal(axes_from_below(axes, np.zeros(3)), below)

@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.driving import phases, time_since_change
+from warp_resphys.io.errors import InputError
 from warp_resphys.learning.metrics import (
+    PUBLISHED_MM,
     errors_per_marker,
     marker_errors,
+    mean_distance,
+    median_filter,
     paired_gain,
+    published_errors,
     summarise,
     summarise_folds,
     summarise_trajectories,
@@ -90,3 +95,42 @@ def test_a_driven_trial_rises_holds_and_is_released():
     assert found(-np.ones(12)) == "ris ris ris" + 9 * " hol"
     assert found(np.ones(12), before=1.0) == " ".join(12 * "-")
     assert found(0.2 * np.ones(12), before=1.0) == " ".join(12 * ["rel"])
+
+
+def test_published_numbers_are_those_of_the_same_experiment():
+    assert published_errors("sopra_extrapolation") is PUBLISHED_MM["sopra_extrapolation"]
+    assert published_errors("sopra_overpressure") is PUBLISHED_MM["sopra"]
+    assert published_errors("beam_real_repeated") is PUBLISHED_MM["beam_real"]
+    assert published_errors("segment_real") == {}
+
+
+def test_mean_distances_count_what_was_seen():
+    measured = np.zeros((1, 4, 2, 3))
+    measured[0, 1, 0] = np.nan
+    measured[0, 2] = np.nan
+    markers = np.zeros((1, 4, 2, 3))
+    markers[0, :, 0, 0], markers[0, :, 1, 2] = 0.001, 0.003
+    markers[0, 2:, 0] = np.nan
+    np.testing.assert_allclose(mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf])
+
+
+class TestMedianFilter:
+    def test_it_is_one_of_a_second(self):
+        values = np.random.default_rng(1).normal(size=(2, 300))
+        smooth = median_filter(values, 0.01)
+        for at in (0, 20, 50, 150, 299):  # half a second to both sides: 50 steps
+            np.testing.assert_allclose(smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1))
+        step = (np.arange(300) >= 150).astype(float)
+        np.testing.assert_array_equal(median_filter(step, 0.01), step)
+        spike = np.zeros(300)
+        spike[100:150] = 5.0  # shorter than half of the window
+        assert median_filter(spike, 0.01).max() == 0.0
+        assert median_filter(spike, 0.02).max() == 5.0  # at this step it lasts a second
+
+    def test_it_leaves_out_what_is_not_known(self):
+        values = np.array([1.0, np.nan, 3.0, np.inf, np.nan, np.nan, np.nan])
+        filtered = median_filter(values, 1.0, 2.0)
+        np.testing.assert_array_equal(filtered, [1.0, 2.0, np.inf, np.inf, np.inf, np.nan, np.nan])
+        for step, window in ((0.0, 1.0), (0.01, -1.0), (np.nan, 1.0)):
+            with pytest.raises(InputError, match="both must be positive"):
+                median_filter(values, step, window)

@@ -9,19 +9,10 @@ from rich.console import Console
 
 from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from warp_resphys.data.camera import axes_from_below, motion_axes
 from warp_resphys.data.recordings.marker_quality import quality_table
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.safe_files import write_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.metrics import (
-    PUBLISHED_MM,
-    PUBLISHED_WINDOWS_MM,
-    mean_distance,
-    median_filter,
-    published_errors,
-)
-from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, at_times
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
@@ -97,21 +88,6 @@ class TestErrors:
         assert beside.keys() == {"published", "sysid", "simfree", "resphys"}
         beside = published_beside(published, ["simulation", "sysid_elastic", "sysid"])
         assert beside["sysid_elastic"] == ("1.32", "± 1.38")
-
-    def test_published_numbers_are_those_of_the_same_experiment(self):
-        assert published_errors("sopra_extrapolation") is PUBLISHED_MM["sopra_extrapolation"]
-        assert published_errors("sopra_overpressure") is PUBLISHED_MM["sopra"]
-        assert published_errors("beam_real_repeated") is PUBLISHED_MM["beam_real"]
-        assert published_errors("segment_real") == {}
-
-    def test_they_count_what_was_seen(self):
-        measured = np.zeros((1, 4, 2, 3))
-        measured[0, 1, 0] = np.nan
-        measured[0, 2] = np.nan
-        markers = np.zeros((1, 4, 2, 3))
-        markers[0, :, 0, 0], markers[0, :, 1, 2] = 0.001, 0.003
-        markers[0, 2:, 0] = np.nan
-        np.testing.assert_allclose(mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf])
 
 
 def test_control_is_told_by_controller_and_speed():
@@ -247,43 +223,6 @@ class TestWhatIsShown:
     def test_the_uncorrected_model_and_the_best_one(self):
         assert shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
         assert shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
-
-    def test_the_free_end_is_on_the_right_and_gravity_down(self):
-        rest = box_hexahedra(divisions=(4, 1, 1)).vertices
-        bent = rest + np.linspace(0.0, 0.1, 10)[:, None, None] * rest[:, :1] * [0.0, 0.0, -1.0]
-        axes = motion_axes(DOWN, bent)
-        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-        assert axes[0, 0] > 0.9
-        assert axes[1, 2] > 0.9
-        assert motion_axes(DOWN, bent * [-1.0, 1.0, 1.0])[0, 0] < -0.9
-        assert motion_axes(DOWN, bent[..., [2, 1, 0]] * [1.0, 1.0, -1.0])[1, 2] > 0.9
-        assert np.isfinite(motion_axes(np.zeros(3), bent)).all()
-        below = axes_from_below(axes, DOWN)
-        np.testing.assert_allclose(below[[0, 2]], [axes[0], [0.0, 0.0, -1.0]], atol=1e-12)
-        assert np.linalg.det(below) == pytest.approx(1.0)
-        np.testing.assert_array_equal(axes_from_below(axes, np.zeros(3)), below)
-
-
-class TestMedianFilter:
-    def test_it_is_one_of_a_second(self):
-        values = np.random.default_rng(1).normal(size=(2, 300))
-        smooth = median_filter(values, 0.01)
-        for at in (0, 20, 50, 150, 299):  # half a second to both sides: 50 steps
-            np.testing.assert_allclose(smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1))
-        step = (np.arange(300) >= 150).astype(float)
-        np.testing.assert_array_equal(median_filter(step, 0.01), step)
-        spike = np.zeros(300)
-        spike[100:150] = 5.0  # shorter than half of the window
-        assert median_filter(spike, 0.01).max() == 0.0
-        assert median_filter(spike, 0.02).max() == 5.0  # at this step it lasts a second
-
-    def test_it_leaves_out_what_is_not_known(self):
-        values = np.array([1.0, np.nan, 3.0, np.inf, np.nan, np.nan, np.nan])
-        filtered = median_filter(values, 1.0, 2.0)
-        np.testing.assert_array_equal(filtered, [1.0, 2.0, np.inf, np.inf, np.inf, np.nan, np.nan])
-        for step, window in ((0.0, 1.0), (0.01, -1.0), (np.nan, 1.0)):
-            with pytest.raises(InputError, match="both must be positive"):
-                median_filter(values, step, window)
 
 
 def test_trials_out_of_range_are_counted_where_they_belong():

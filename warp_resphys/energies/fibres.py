@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
@@ -108,17 +107,12 @@ class Fibres(Energy):
         return (PartPoints(nodes, np.concatenate(operators)[..., None], part, np.concatenate(areas).ravel()),)
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "FibreTerm":
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
         shapes = {"fibre_stiffness": (self.count,)}
-        return FibreTerm(launcher, sets, THREAD, shapes, self.count, constants=[self.toe])
-
-
-class FibreTerm(ReadingTerm):
-    """Kernels of the fibres around every chamber."""
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        return self.weight * self.values["fibre_stiffness"][:, self.part_of]
+        constants = [self.toe]
+        return ReadingTerm(
+            launcher, sets, THREAD, shapes, self.count, constants=constants, stiffness=lambda v: v["fibre_stiffness"]
+        )
 
 
 def _long_axis(chamber: Chamber, mesh: Mesh, near: Sequence[float] | None) -> NDArray[np.float64]:

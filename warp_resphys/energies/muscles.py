@@ -10,7 +10,7 @@ chamber whose walls are not modelled. Without inputs the fibres are a reinforcem
 (Spencer, Continuum Theory of the Mechanics of Fibre-Reinforced Composites, 1984), but not in compression.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -148,15 +148,10 @@ class Muscles(Energy):
         return lines
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "MuscleTerm":
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
         shapes = dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
-        return MuscleTerm(launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe])
 
+        def stiffness(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
+            return values["muscle_stress"].clamp_min(0.0) + values["muscle_stiffness"]
 
-class MuscleTerm(ReadingTerm):
-    """Kernels of muscles."""
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        pull = self.values["muscle_stress"].clamp_min(0.0) + self.values["muscle_stiffness"]
-        return self.weight * pull[:, self.part_of]
+        return ReadingTerm(launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness)

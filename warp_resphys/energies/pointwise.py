@@ -16,7 +16,7 @@ deformation gradient), and the values at the point: parameters and inputs, in th
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -47,6 +47,8 @@ class ReadingTerm(PartTerm):
         count: number of parts.
         arrays: names of arrays, of any shape, that every point reads completely.
         constants: numbers that are the last values at every point.
+        stiffness: returns an upper bound (B, count) of the eigenvalues of a point of weight one from the values; zero
+            if omitted: the constant matrix of projective dynamics does not contain the energy.
     """
 
     def __init__(
@@ -58,10 +60,11 @@ class ReadingTerm(PartTerm):
         count: int,
         arrays: Sequence[str] = (),
         constants: Sequence[float] = (),
+        stiffness: Callable[[Mapping[str, torch.Tensor]], torch.Tensor] | None = None,
     ) -> None:
         super().__init__(launcher, sets, shapes, count)
         self._kernels, self._law, self._shapes = point_kernels(law), law, dict(shapes)
-        self._arrays = frozenset(arrays)
+        self._arrays, self._stiffness = frozenset(arrays), stiffness
         self._constants = launcher.zeros(len(constants)) + torch.tensor(
             constants, device=launcher.device, dtype=torch.float64
         )
@@ -92,8 +95,9 @@ class ReadingTerm(PartTerm):
 
     @override
     def curvature(self) -> torch.Tensor:
-        """Returns zero: the constant matrix of projective dynamics does not contain these energies."""
-        return torch.zeros_like(self.weight)[None]
+        if self._stiffness is None:
+            return torch.zeros_like(self.weight)[None]
+        return self.weight * self._stiffness(self.values)[:, self.part_of]
 
     @override
     def _slopes(self) -> list[Slope]:

@@ -55,9 +55,10 @@ class PointInertia(_OnOwnPoints):
     own_points: PartPoints  # a part each
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "PointInertiaTerm":
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
         count = self.own_points.n_points
-        return PointInertiaTerm(launcher, sets, INERTIA, {"target": (count, 3), "inertia": (count,)}, count)
+        shapes = {"target": (count, 3), "inertia": (count,)}
+        return ReadingTerm(launcher, sets, INERTIA, shapes, count, stiffness=lambda v: v["inertia"])
 
     @override
     def bind(self, site: EnergySite) -> "BoundInertia":
@@ -107,14 +108,6 @@ class BoundRigidInertia(BoundInertia):
         inertia = step.value("density") / step.stage.step**2
         target = weighted_sum(self._factor, step.stage.target[:, self._controls, None].unbind(1))
         return {"inertia": inertia.expand(step.state.batch, len(self._factor)), "target": target}
-
-
-class PointInertiaTerm(ReadingTerm):
-    """Kernels of the inertia of points."""
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        return self.values["inertia"]
 
 
 @dataclass(frozen=True)

@@ -100,9 +100,12 @@ class Strings(Energy):
         return (PartPoints(nodes, operator, np.arange(self.count), np.ones(self.count)),)
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "StringTerm":
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
         shapes = {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
-        return StringTerm(launcher, sets, STRING, shapes, self.count, constants=[self.toe])
+        constants = [self.toe]
+        return ReadingTerm(
+            launcher, sets, STRING, shapes, self.count, constants=constants, stiffness=lambda v: v["string_stiffness"]
+        )
 
     @override
     def bind(self, site: EnergySite) -> "BoundStrings":
@@ -210,11 +213,3 @@ class BoundStrings(BoundEnergy):
         compliance = step.value("string_compliance")
         share = pull / (1.0 + compliance * mass) / distance.clamp_min(torch.finfo(line.dtype).tiny)
         return free + share[..., None] * line
-
-
-class StringTerm(ReadingTerm):
-    """Kernels of the springs that replace strings and weights in a stage."""
-
-    @override
-    def curvature(self) -> torch.Tensor:
-        return self.values["string_stiffness"]

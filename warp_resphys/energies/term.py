@@ -10,7 +10,6 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from ..fem.integration_points import Points
 from ..kernels.points import MatrixPoints, VectorPoints
@@ -295,8 +294,3 @@ class PartTerm(Term):
     def one_hot(self) -> torch.Tensor:
         """Part of each point as a matrix (P, count)."""
         return torch.eye(self.count, device=self.launcher.device, dtype=torch.float64)[self.part_of]
-
-    @override
-    def _by_values(self, out: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Sums the derivatives (B, P) over the points of each part, in a fixed order."""
-        return {name: slope @ self.one_hot for name, slope in out.items()}

@@ -18,8 +18,7 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, parameter
 from .base import Energy
 from .launcher import Launcher
-from .pointwise import ReadingTerm
-from .term import PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointSet
 
 _CAP = 0.7  # cosine between face normal and chamber axis above which a face is an end cap, without fibres
 _ALIGNED = 0.8  # smallest cosine between a chamber's principal direction and the given axis
@@ -107,10 +106,10 @@ class Fibres(Energy):
         return (PartPoints(nodes, np.concatenate(operators)[..., None], part, np.concatenate(areas).ravel()),)
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         shapes = {"fibre_stiffness": (self.count,)}
         constants = [self.toe]
-        return ReadingTerm(
+        return LawTerm(
             launcher, sets, THREAD, shapes, self.count, constants=constants, stiffness=lambda v: v["fibre_stiffness"]
         )
 

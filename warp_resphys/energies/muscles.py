@@ -26,8 +26,7 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Parameter, Quantity, parameter
 from .base import Energy
 from .launcher import Launcher
-from .pointwise import ReadingTerm
-from .term import PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointSet
 
 STRESS = Quantity(
     *("muscle_stress", "Pa"), per="muscle", typical=1e4, words="stress", shown_unit="kPa", shown_factor=1e-3
@@ -148,10 +147,10 @@ class Muscles(Energy):
         return lines
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         shapes = dict.fromkeys(("muscle_stress", "muscle_contraction", "muscle_stiffness"), (self.count,))
 
         def stiffness(values: Mapping[str, torch.Tensor]) -> torch.Tensor:
             return values["muscle_stress"].clamp_min(0.0) + values["muscle_stiffness"]
 
-        return ReadingTerm(launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness)
+        return LawTerm(launcher, sets, MUSCLE, shapes, self.count, constants=[self.toe], stiffness=stiffness)

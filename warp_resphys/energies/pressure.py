@@ -21,8 +21,7 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.quantity import Quantity
 from .base import Energy
 from .launcher import Launcher
-from .pointwise import ReadingTerm
-from .term import PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointSet
 
 PRESSURE = Quantity(
     *("pressure", "Pa"), per="chamber", typical=1e4, words="pressure", shown_unit="kPa", shown_factor=1e-3
@@ -85,5 +84,5 @@ class Pressure(Energy):
         return parts.new_zeros(len(parts), self.count).index_add(1, torch.as_tensor(points.part).to(f.device), parts)
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
-        return ReadingTerm(launcher, sets, PRESSURE_LAW, {"pressure": (self.count,)}, self.count)
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
+        return LawTerm(launcher, sets, PRESSURE_LAW, {"pressure": (self.count,)}, self.count)

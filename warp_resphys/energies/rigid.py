@@ -32,9 +32,9 @@ from ..stepping.state import Mass
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep
 from .launcher import Launcher
 from .materials import Corotated
-from .pointwise import ReadingTerm, one_part_each
+from .pointwise import one_part_each
 from .solid import VISCOUS, SolidTerm
-from .term import PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointSet
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class PointInertia(_OnOwnPoints):
     own_points: PartPoints  # a part each
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         count = self.own_points.n_points
         shapes = {"target": (count, 3), "inertia": (count,)}
-        return ReadingTerm(launcher, sets, INERTIA, shapes, count, stiffness=lambda v: v["inertia"])
+        return LawTerm(launcher, sets, INERTIA, shapes, count, stiffness=lambda v: v["inertia"])
 
     @override
     def bind(self, site: EnergySite) -> "BoundInertia":

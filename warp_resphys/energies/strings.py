@@ -32,8 +32,7 @@ from ..stepping.quantity import Parameter, Quantity, parameter
 from ..stepping.state import ImplicitStage, State
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher
-from .pointwise import ReadingTerm
-from .term import PartPoints, PointSet
+from .term import LawTerm, PartPoints, PointSet
 
 PAYLOAD = Quantity(
     "payload", "kg", 0.0, closed=True, per="string", typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
@@ -100,10 +99,10 @@ class Strings(Energy):
         return (PartPoints(nodes, operator, np.arange(self.count), np.ones(self.count)),)
 
     @override
-    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> ReadingTerm:
+    def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
         shapes = {"string_target": (self.count, 3), "string_stiffness": (self.count,), "string_length": (self.count,)}
         constants = [self.toe]
-        return ReadingTerm(
+        return LawTerm(
             launcher, sets, STRING, shapes, self.count, constants=constants, stiffness=lambda v: v["string_stiffness"]
         )
 

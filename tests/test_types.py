@@ -34,5 +34,5 @@ def test_a_type_checker_knows_the_public_names(tmp_path):
     revealed = re.findall(r'Revealed type is "(.+)"', out)
     assert revealed[0].endswith("-> warp_resphys.dynamics.simulator.Simulator")
     assert revealed[1].startswith("torch.")
-    assert "-> warp_resphys.learning.identification.identification.Identification" in revealed[2].replace('"', "")
+    assert "-> warp_resphys.learning.identification.search.Identification" in revealed[2].replace('"', "")
     assert len(re.findall(r"error: .*\[(?:arg-type|attr-defined)\]", out)) == 2, out

@@ -15,7 +15,7 @@ from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.resuming import StageContext, StageInterrupted, run_stages
 from warp_resphys.io.safe_files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.identification import identification
+from warp_resphys.learning.identification import search
 from warp_resphys.learning.networks import NextState, ResidualForce, restore
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
@@ -83,10 +83,10 @@ class TestCompleteRun:
         results = read_json(finished / "identification.json")
         assert list(results["sysid"]["parameters"]) == ["youngs_modulus", "stiffness_damping"]
         assert list(results["sysid_elastic"]["parameters"]) == ["youngs_modulus", "poissons_ratio"]
-        for search in (results["sysid"], results["sysid_elastic"]):
-            losses = [record["loss"] for record in search["history"][0]]
-            assert search["loss"] in losses[1:]
-            assert search["loss"] < losses[0]
+        for found in (results["sysid"], results["sysid_elastic"]):
+            losses = [record["loss"] for record in found["history"][0]]
+            assert found["loss"] in losses[1:]
+            assert found["loss"] < losses[0]
             assert len(losses) <= 4 * 4  # The release was estimated again, up to three times.
         assert np.shape(results["sysid"]["uncertainty"]["correlation"]) == (2, 2)
 
@@ -189,9 +189,9 @@ def test_an_interrupted_identification_goes_on_with_the_next_search(finished, tm
         descents.append((misfit.simulator.integrator, number))
         if len(descents) == at:
             raise KeyboardInterrupt
-        return identification._Attempt(misfit.to_unit(start), number + 1.0, [{"loss": 1.0, **start}], 0.0)
+        return search._Attempt(misfit.to_unit(start), number + 1.0, [{"loss": 1.0, **start}], 0.0)
 
-    monkeypatch.setattr(identification, "_descend", descend)
+    monkeypatch.setattr(search, "_descend", descend)
     with pytest.raises(StageInterrupted, match="interrupted in stage 'identify'"):
         run_stages([stage], tmp_path)
     assert not (tmp_path / "identification.json").exists()

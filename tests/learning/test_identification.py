@@ -10,8 +10,8 @@ from support.swinging_beam import MARKERS, MESH, TIP, blank, double
 from warp_resphys import Body, Simulator
 from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.identification.identification import first_points, search_parameters
 from warp_resphys.learning.identification.misfit import Misfit
+from warp_resphys.learning.identification.search import first_points, search_parameters
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start

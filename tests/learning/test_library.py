@@ -1,5 +1,7 @@
 """Identification, reconstruction, training and evaluation as functions, on beams."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,11 +9,15 @@ import torch
 import warp_resphys as wr
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.fan_out import Workers
-from warp_resphys.io.parts import Parts
+from warp_resphys.io.parts import Checkpoint, Parts
+from warp_resphys.io.resuming import StageContext
 from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.fitting import Fitting, fit_force
 from warp_resphys.learning.identification.identification import identify
+from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.observed_motions import ObservedMotions
+from warp_resphys.learning.parameters import Bounds, Prior
+from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.reconstruction import reconstruct
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings
 
@@ -57,6 +63,46 @@ def test_youngs_modulus_is_recovered(robot):
     assert not result.at_bounds
     assert float(evaluate(beam(180e3), motion, parameters=result.parameters).max()) < 1e-6
     assert float(evaluate(beam(180e3), motion).mean()) > 1e-4
+
+
+def test_trials_have_their_values_sessions_their_marker_places_and_finished_searches_are_kept(tmp_path, monkeypatch):
+    """Tensions that differ from their logs, and a marker that sits 1 mm elsewhere in one of two sessions."""
+    cable = wr.Tendons([[[0.0, 0.01, 0.0], [0.05, 0.01, 0.0], [0.1, 0.01, 0.0]]])
+    body = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[cable])
+    true, wrong = (wr.Simulator(body, wr.Corotated(e, 0.45, stiffness_damping=3e-3)) for e in (264e3, 200e3))
+    factors = {"motion 0": 1.1, "motion 1": 0.92, "motion 2": 1.06}
+    logged = torch.sin(0.6 * torch.arange(20).double()).square()[:, None, None].expand(20, 3, 1)
+    pulled = logged * torch.tensor([*factors.values()]).double()[:, None]
+    q = true.rollout(true.static_equilibrium(batch=3), 20, wr.Inputs(tendon_tension=pulled)).q
+    seen = torch.stack([MARKERS(positions) for positions in q])
+    seen[:, 1, 0] += torch.tensor([0.0, 1e-3, 0.0])
+    motions = ObservedMotions.of(wrong, seen, inputs=wr.Inputs(tendon_tension=logged), observation=MARKERS)
+    motions = replace(motions, dataset=replace(motions.dataset, sessions=("monday", "friday", "monday")))
+    ranges = {
+        "youngs_modulus": Bounds(1e5, 1e6),
+        "tendon_tension_factor": Bounds(0.5, 2.0, False, Prior(1.0, 0.3), "trial"),
+    }
+
+    def identified():
+        kept = Checkpoint(StageContext("identify", tmp_path, "fingerprint", None))
+        options = {"names": ["motion 0", "motion 1"], "held_out": ["motion 2"], "accuracy": Accuracy(markers=1e-3)}
+        return identify(wrong, motions, ranges, kept=kept, **options)
+
+    found = identified()
+    assert found.parameters["tendon_tension_factor"] == 1.0
+    assert found.own_deviation.keys() == found.own.keys()
+    ratios = [found.own[f"tendon_tension_factor@{name}"] / factor for name, factor in factors.items()]
+    scale = found.parameters["youngs_modulus"] / 264e3  # of all forces, which places hide
+    assert scale == pytest.approx(1.0, rel=0.1)
+    assert ratios == pytest.approx([scale] * 3, rel=0.02)
+    places = {session: placed["offsets"]["0"] for session, placed in found.placement["sessions"].items()}
+    assert np.subtract(places["friday"], places["monday"]) == pytest.approx([0.0, 1e-3, 0.0], abs=2e-4)
+    assert np.shape(found.placement["new_session"]) == (15, 15)
+    monkeypatch.setattr(Misfit, "linearise", None)  # No search is needed again, but that of the first frames.
+    with pytest.raises(TypeError):
+        identified()
+    monkeypatch.undo()
+    assert identified().own == found.own
 
 
 def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):

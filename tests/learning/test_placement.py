@@ -13,9 +13,9 @@ from warp_resphys import Body, Corotated, Rigid, Simulator
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_vertices
 from warp_resphys.data.rigid_bodies import angles, arms
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification.identification import search_parameters
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.nuisances import NuisanceFit
+from warp_resphys.learning.identification.search import search_parameters
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start

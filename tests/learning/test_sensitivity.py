@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from warp_resphys.data.rigid_bodies import arms
-from warp_resphys.learning.identification.identification import Identification
+from warp_resphys.learning.identification.search import Identification
 from warp_resphys.learning.identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread
 from warp_resphys.settings.motions import CORNERS
 

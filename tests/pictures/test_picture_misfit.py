@@ -12,7 +12,7 @@ import warp_resphys as wr
 from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification.identification import search_parameters
+from warp_resphys.learning.identification.search import search_parameters
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures.outlines import ClosedSurface, Outline
 from warp_resphys.pictures.picture_misfit import PictureMisfit, values_of

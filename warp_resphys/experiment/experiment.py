@@ -17,7 +17,7 @@ from ..fem.bodies import Body
 from ..io.safe_files import read_array, read_hdf5, read_json
 from ..learning.comparison import Model
 from ..learning.correction import Learned
-from ..learning.identification.identification import Identification
+from ..learning.identification.search import Identification
 from ..learning.networks import NextState, ResidualForce, StateMap
 from ..learning.observed_motions import ObservedMotions
 from ..learning.parameters import split_name

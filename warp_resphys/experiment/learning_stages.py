@@ -41,11 +41,12 @@ def identify(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     wanted, names = settings.identify, settings.split.train
-    experiment, kept, found = Experiment(settings, context.run_dir), Checkpoint(context), {}
+    experiment, kept, found = Experiment(settings, context.run_dir), dict[str, Checkpoint](), {}
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     for model, parameters in {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}.items():
         if not parameters:
             continue
+        kept[model] = Checkpoint(context, model)
         result = identification.identify(
             *(experiment.simulator(MODELS[model][0]), experiment.motions, parameters, wanted.first_guess),
             names=names,
@@ -57,12 +58,12 @@ def identify(context: StageContext) -> None:
             max_evaluations=wanted.max_evaluations,
             tolerance=wanted.tolerance,
             seed=settings.seed,
-            once=kept.within(model),
-            title=context.name,
+            kept=kept[model],
         )
         found[model] = result.plain()
     write_json(context.run_dir / IDENTIFICATION, found)
-    kept.path.unlink(missing_ok=True)
+    for checkpoint in kept.values():
+        checkpoint.remove()
 
 
 def _accuracy(settings: StageSettings, dataset: Trials) -> Accuracy | None:
@@ -97,8 +98,7 @@ def identify_law(context: StageContext) -> None:
         settings=settings.law,
         seconds=settings.trial_seconds,
         known=known,
-        once=kept.once,
-        title=context.name,
+        kept=kept,
     )
     content = law.plain()
     if known is None:
@@ -107,7 +107,7 @@ def identify_law(context: StageContext) -> None:
         accepted = known.get("accepted_there", known.get("accepted", True))
         content = {**known, **content, "accepted_there": accepted, "file": file}
     write_json(context.run_dir / LAW_FILE, content)
-    kept.path.unlink(missing_ok=True)
+    kept.remove()
 
 
 def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:

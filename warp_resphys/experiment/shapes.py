@@ -56,7 +56,7 @@ def try_shapes(context: StageContext) -> None:
                 raise ConvergenceError(f"shapes.{name}, its target: {error}", error.positions, error.report) from error
             progress.advance(1, body=name)
     write_json(context.run_dir / SHAPES, results)
-    kept.path.unlink(missing_ok=True)
+    kept.remove()
 
 
 def check_shape(shape: ShapeSettings) -> None:

@@ -160,10 +160,19 @@ def _compute(parts: Parts, part: TrialPart) -> Arrays | None:
 
 
 class Checkpoint:
-    """Finished parts of the work of a stage, as JSON data in a file that is ignored if the settings changed."""
+    """Finished parts of the work of a stage, as JSON data in a file that is ignored if the settings changed.
 
-    def __init__(self, context: StageContext) -> None:
-        self.path, self._fingerprint = context.run_dir / f"{context.name}_parts.safetensors", context.fingerprint
+    Args:
+        context: of the stage.
+        name: of the work, if a stage has several.
+
+    Attributes:
+        title: name of the stage.
+    """
+
+    def __init__(self, context: StageContext, name: str = "") -> None:
+        self.title, self._fingerprint = context.name, context.fingerprint
+        self.path = context.run_dir / f"{context.name}{name and '_'}{name}_parts.safetensors"
         checkpoint = resume_checkpoint(self.path, "parts", context.fingerprint)
         self._parts: dict[str, Any] = {} if checkpoint is None else checkpoint[1]["parts"]
 
@@ -174,9 +183,9 @@ class Checkpoint:
             write_checkpoint(self.path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self._parts})
         return self._parts[key]
 
-    def within(self, name: str) -> Callable[[str, Callable[[], Any]], Any]:
-        """Returns `once` with a name before the keys."""
-        return lambda key, work: self.once(f"{name} {key}", work)
+    def remove(self) -> None:
+        """Deletes the file."""
+        self.path.unlink(missing_ok=True)
 
 
 def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:

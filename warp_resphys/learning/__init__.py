@@ -2,10 +2,10 @@
 
 from .evaluation import evaluate as evaluate
 from .fitting import fit_force as fit_force
-from .identification.identification import Identification as Identification
 from .identification.identification import identify as identify
-from .identification.identification import search_parameters as search_parameters
 from .identification.law_search import identify_law as identify_law
+from .identification.search import Identification as Identification
+from .identification.search import search_parameters as search_parameters
 from .observed_motions import ObservedMotions as ObservedMotions
 from .parameters import Bounds as Bounds
 from .parameters import Prior as Prior

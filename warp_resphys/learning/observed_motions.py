@@ -130,6 +130,11 @@ class ObservedMotions:
         return cls(trials, observation.to(like), **more)
 
     @property
+    def sees_states(self) -> bool:
+        """Whether the positions of all vertices are observed."""
+        return isinstance(self.observe, WholeState)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """Names of the observed points, which are numbers where they have none."""
         return self.dataset.labels or tuple(map(str, range(self.dataset.observed.shape[2])))

@@ -21,7 +21,7 @@ from ...io.errors import InputError
 from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
-from ...learning.identification.identification import first_points, search_parameters, shown
+from ...learning.identification.search import first_points, search_parameters, shown
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE

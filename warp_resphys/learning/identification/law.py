@@ -20,6 +20,7 @@ from ...energies.catalogue import law_content, unit_of
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import Material
 from ...io.arrays import FloatArray
+from ...mesh.volume_mesh import Mesh
 from ..parameters import Bounds, Prior
 from .weak_form import Candidate, NormalEquations, WeakForm
 
@@ -34,6 +35,7 @@ _SAME: Final = 1.6  # ratio of neighbouring relaxation times that are one branch
 _FINER: Final = math.radians(15.0)  # of the finer directions about the best coarse one
 _LEAST: Final = 1e-3  # fraction of the shear modulus below which a coefficient is zero
 _STIFFEST: Final = 500.0  # bulk over shear modulus, as of a Poisson's ratio of 0.4995
+_OFF_THE_POLE: Final = 0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
 _TURN: Final = 0.8  # largest correction of a fibre's angle [rad]
 
 
@@ -91,6 +93,11 @@ class LawClass:
     groups: tuple[str, ...]
     constants: dict[str, float]
     residual: float
+
+    @property
+    def refined_groups(self) -> set[str]:
+        """Groups of terms when the law is refined, which adds viscosities."""
+        return {*self.groups, "viscosity"}
 
 
 class _Columns:
@@ -331,3 +338,9 @@ def family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[
     zero = {f"fibre_{name}_1": 0.0 for name in ("slack", "stiffening", "compression")}
     angles = dict(zip(("fibre_azimuth_1", "fibre_elevation_1"), direction, strict=True))
     return {"fibre_tension_1": tension, "fibre_toe_1": 0.02, **angles, **zero}
+
+
+def longest_side(mesh: Mesh) -> tuple[float, float]:
+    """Azimuth and elevation of the longest side of the box around a body [rad]."""
+    side = int(np.ptp(mesh.vertices, axis=0).argmax())
+    return ((0.0, 0.0), (0.5 * np.pi, 0.0), (0.0, 0.5 * np.pi - _OFF_THE_POLE))[side]

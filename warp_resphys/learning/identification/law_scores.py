@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ...data.markers import WHOLE_STATE, WholeState
+from ...data.markers import WHOLE_STATE
 from ...dynamics.simulator import Simulator
 from ...fem.integration_points import principal_stretches
 from ...io.arrays import FloatArray
@@ -59,20 +59,18 @@ class Score:
 def scores_of(
     replays: Sequence[tuple[Replay, Start]],
     values: Mapping[str, torch.Tensor],
-    sets: int,
     begin: float = 0.0,
     seconds: float | None = None,
 ) -> list[Score]:
-    """Returns the errors of a simulator on trials, for some sets of parameters.
+    """Returns the errors of a simulator on trials, for E sets of parameters.
 
     Args:
         replays: of the trials, with their starts.
-        values: (E,) values of the parameters by name.
-        sets: E.
+        values: (E,) values of the parameters by name; without any E is one.
         begin: time from which frames count [s].
         seconds: time until which frames count [s]; None for all.
     """
-    frames: list[list[FloatArray]] = [[] for _ in range(sets)]
+    frames: list[list[FloatArray]] = [[] for _ in next(iter(values.values()), range(1))]
     for replay, start in replays:
         trials = replay.trials if seconds is None else replay.trials.first(seconds)
         counted = Replay(replay.simulator, replay.observe, trials)
@@ -80,8 +78,8 @@ def scores_of(
         seen = trials.seen.sum(2)
         means = errors / (seen.clamp_min(1) * trials.amplitude.square()[:, None])
         for row, inside in enumerate((trials.times >= begin) & (seen > 0)):
-            for number in range(sets) if bool(inside.any()) else ():
-                frames[number].append(means[number, row, inside].double().cpu().numpy())
+            for of_set, of_all in zip(means, frames, strict=True) if bool(inside.any()) else ():
+                of_all.append(of_set[row, inside].double().cpu().numpy())
     return [Score(tuple(rows)) for rows in frames]
 
 
@@ -102,7 +100,7 @@ def stretches_in(
         identified: parameters with which the starts of the trials are estimated.
     """
     mesh = simulator.body.mesh
-    if isinstance(motions.observe, WholeState):
+    if motions.sees_states:
         bodies = [motions.dataset.observed[motions.dataset.rows(names)]]
     else:
         values = {name: simulator.tensor([value]) for name, value in parameters.items()}

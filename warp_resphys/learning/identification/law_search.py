@@ -16,17 +16,16 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ...data.markers import WholeState
 from ...data.rigid_bodies import independent
-from ...data.trials import RELEASED, evenly
+from ...data.trials import evenly
 from ...dynamics.simulator import Simulator
 from ...energies.catalogue import make_material
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
+from ...io.parts import Checkpoint
 from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import Bounds, Limits, Prior
-from .identification import Identification, IsLast, Once, first_points, refined_searches, search_parameters, shown
 from .law import (
     VISCOSITIES,
     IdentifiedLaw,
@@ -38,10 +37,12 @@ from .law import (
     fit_classes,
     is_refined,
     is_shape,
+    longest_side,
     strong_names,
 )
 from .law_scores import Score, scores_of, stretches_in
 from .misfit import Misfit
+from .search import Identification, first_points, refined_searches
 from .weak_form import KnownMotion, WeakForm
 
 _OF_MASS: Final = ("density", MASS_DAMPING)
@@ -51,7 +52,6 @@ _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: s
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
 _MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
-_OFF_THE_POLE: Final = 0.2  # rad, of fibres along z at first: exactly there, their azimuth has no effect
 _STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
 _BESIDE: Final = "beside"  # key of the search of parameters beside a known law
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
@@ -68,8 +68,7 @@ def identify_law(
     settings: LawSettings | None = None,
     seconds: float | None = None,
     known: Mapping[str, Any] | None = None,
-    once: Once = lambda key, work: work(),
-    title: str = "",
+    kept: Checkpoint | None = None,
 ) -> IdentifiedLaw:
     """Identifies the law of a material from observed motions, and tests it on others.
 
@@ -86,8 +85,7 @@ def identify_law(
         settings: terms, relaxation times and evaluations; the defaults of the class if None.
         seconds: duration of the trials that may be learned from [s]; None for the part that `motions` learns from.
         known: ``model`` and ``constants`` of a law beside which the parameters are identified; None to identify a law.
-        once: see `identify`.
-        title: of the progress to show; empty for none.
+        kept: see `identify`.
 
     Raises:
         ConvergenceError: the simulation fails at every start.
@@ -97,7 +95,7 @@ def identify_law(
     if motions.train_fraction < 1.0:
         learned = motions.train_fraction * float(motions.dataset.times.max())
         seconds = min(learned, seconds or math.inf)
-    options = (settings or LawSettings(), seconds, once, title)
+    options = (settings or LawSettings(), seconds, kept)
     search = _LawSearch(simulator, motions, ranges, identified or Identified(), names, tuple(validation), *options)
     return search.run() if known is None else search.beside(known)
 
@@ -125,8 +123,7 @@ class _LawSearch:
     validation: tuple[str, ...]
     settings: LawSettings
     seconds: float | None
-    once: Once
-    title: str
+    kept: Checkpoint | None
 
     @cached_property
     def checked(self) -> tuple[str, ...]:
@@ -141,31 +138,26 @@ class _LawSearch:
         return own if self.settings.trials is None else tuple(evenly(own, self.settings.trials))
 
     @property
-    def states(self) -> bool:
-        """Whether the positions of all vertices are known."""
-        return isinstance(self.motions.observe, WholeState)
-
-    @property
     def early(self) -> float | None:
         """Duration from which a law is identified before it is tested on the same trials [s]; None with others."""
         longest = self.seconds or float(self.motions.dataset.times.max())
         return _EARLY * longest if self.checked == self.train and longest > 0.0 else None
 
     @cached_property
-    def mass(self) -> dict[str, float]:
-        """Density and damping by mass."""
-        return {name: self._known[name] for name in _OF_MASS}
-
-    @cached_property
-    def _known(self) -> dict[str, float]:
+    def known(self) -> dict[str, float]:
         """Constants of the material as it was identified."""
         known = {name: float(torch.as_tensor(x)) for name, x in self.base.materials[""].constants.items()}
         return known | {name: x for name, x in self.identified.parameters.items() if name in known}
 
+    @property
+    def mass(self) -> dict[str, float]:
+        """Density and damping by mass."""
+        return {name: self.known[name] for name in _OF_MASS}
+
     @cached_property
     def guess(self) -> dict[str, float]:
         """A neo-Hookean law like the identified material."""
-        return first_guess(self.base.materials[""], self._known)
+        return first_guess(self.base.materials[""], self.known)
 
     @property
     def shear(self) -> float:
@@ -185,9 +177,8 @@ class _LawSearch:
 
     def run(self) -> IdentifiedLaw:
         """Identifies a law."""
-        if self.states:
-            fitted = self.once("classes", lambda: [asdict(own) for own in self._from_states()])
-            classes = [LawClass(**{**own, "groups": tuple(own["groups"])}) for own in fitted]
+        if self.motions.sees_states:
+            classes = self._from_states() if self.kept is None else self._kept_classes(self.kept)
             scores = [score.error for score in self.scores([law.constants for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
@@ -199,18 +190,20 @@ class _LawSearch:
             again = self._refine(best.law, whole=True)
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
         constants = {name: best.others.get(name, x) for name, x in self.mass.items()} | best.law.constants
-        deviation, tried = _deviation(best.found), zip(classes, scores, strict=True)
+        deviation, trials, law = best.found.deviation, self.names(whole=True), self.simulator(constants)
         return IdentifiedLaw(
-            simulator=self.simulator(constants),
+            simulator=law,
             groups=best.law.groups,
             constants=constants,
             parameters=best.others,
             deviation={n: deviation[old] for n, old in best.names.items() if old in deviation},
             at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
             loss=best.found.loss,
-            classes=[{**asdict(own), "validation": score} for own, score in tried],
-            stretches=self._stretches(best),
-            trials=self.names(whole=True),
+            classes=[{**asdict(own), "validation": x} for own, x in zip(classes, scores, strict=True)],
+            stretches=stretches_in(
+                self.motions, trials, self.simulator(best.law.constants), best.others, self.identified
+            ),
+            trials=trials,
             **self._tested(best.score),
         )
 
@@ -227,17 +220,17 @@ class _LawSearch:
             simulator=simulator,
             constants=constants,
             parameters=found.parameters,
-            deviation=law.get("deviation", {}) | _deviation(found),
+            deviation={**law.get("deviation", {}), **found.deviation},
             at_bounds=[*law.get("at_bounds", ()), *found.at_bounds],
             model=law["model"],
-            **self._tested(self._scores(simulator, values, 1)[0]) | {"accepted": True},
+            **self._tested(self._scores(simulator, values)[0]) | {"accepted": True},
         )
 
     def _tested(self, score: Score) -> dict[str, Any]:
         """Whether a law helps, and its errors and those without it on the trials that laws are tested on."""
         shared = {name: self.base.tensor([value]) for name, value in self.identified.parameters.items()}
         counting = replace(self.base, solver=replace(self.base.settings, on_failure="count"))
-        below, split = self._scores(counting, shared, 1)[0], "validation" if self.validation else "training"
+        below, split = self._scores(counting, shared)[0], "validation" if self.validation else "training"
         errors = {"trials": list(self.checked), "split": split, "law": score.error, "below": below.error}
         return {"accepted": score.beats(below), "validation": errors}
 
@@ -255,17 +248,12 @@ class _LawSearch:
         values = {name: simulator.tensor([law.get(name, union[name]) for law in laws]) for name in union}
         for name, value in {**self.others, **(others or {})}.items():
             values[name] = simulator.tensor([value]).expand(len(laws))
-        return self._scores(simulator, values, len(laws))
+        return self._scores(simulator, values)
 
-    def _scores(self, simulator: Simulator, values: Mapping[str, torch.Tensor], sets: int) -> list[Score]:
+    def _scores(self, simulator: Simulator, values: Mapping[str, torch.Tensor]) -> list[Score]:
         """Returns the errors of a simulator with some sets of parameters on the trials that laws are tested on."""
         replays = self.motions.replays(simulator, self.checked, self.identified)
-        return scores_of(replays, values, sets, self.early or 0.0, self.seconds)
-
-    def _stretches(self, law: _Refined) -> list[float]:
-        """Returns the least and the largest principal stretch in the training trials."""
-        simulator = self.simulator(law.law.constants)
-        return stretches_in(self.motions, self.names(whole=True), simulator, law.others, self.identified)
+        return scores_of(replays, values, self.early or 0.0, self.seconds)
 
     def _from_states(self) -> list[LawClass]:
         """Returns the classes of the weak form."""
@@ -282,6 +270,11 @@ class _LawSearch:
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
 
+    def _kept_classes(self, kept: Checkpoint) -> list[LawClass]:
+        """Returns the classes of the weak form, which an earlier run may have fitted."""
+        fitted = kept.once("classes", lambda: [asdict(law) for law in self._from_states()])
+        return [LawClass(**{**law, "groups": tuple(law["groups"])}) for law in fitted]
+
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         replay = self.motions.replay(simulator, names)
         _, inputs, _ = replay.prepare({name: simulator.tensor([value]) for name, value in self.others.items()})
@@ -290,9 +283,9 @@ class _LawSearch:
 
     def _enlarged(self, best: _Refined, classes: Sequence[LawClass]) -> _Refined:
         """Returns the best refined law of larger classes that balance the forces clearly better."""
-        residual = min(own.residual for own in classes if _refined_groups(own) == _refined_groups(best.law))
+        residual = min(own.residual for own in classes if own.refined_groups == best.law.refined_groups)
         for law in classes:
-            if _refined_groups(law) > _refined_groups(best.law) and law.residual < _BALANCED * residual:
+            if law.refined_groups > best.law.refined_groups and law.residual < _BALANCED * residual:
                 larger = self._refine(law)
                 if larger.score.error * _CLOSE < best.score.error:
                     best, residual = larger, law.residual
@@ -313,7 +306,7 @@ class _LawSearch:
         groups = {
             "elastic": dict.fromkeys(wanted.terms, 0.0),
             "branches": branches_of([0.1 * self.shear] * len(times), times, len(known) + 1),
-            "fibres": family(0.3 * self.shear, self._longest_side()) if wanted.families else {},
+            "fibres": family(0.3 * self.shear, longest_side(self.base.body.mesh)) if wanted.families else {},
         }
         groups = {name: added for name, added in groups.items() if added}
         guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.shear)
@@ -334,11 +327,6 @@ class _LawSearch:
             if not best.score.beats(tried[-1].score):
                 best = tried[-1]
         return [one for one in tried if one.law.constants != best.law.constants] + [best]
-
-    def _longest_side(self) -> tuple[float, float]:
-        """Azimuth and elevation of the longest side of the box around the body [rad]."""
-        side = int(np.ptp(self.base.body.mesh.vertices, axis=0).argmax())
-        return ((0.0, 0.0), (0.5 * np.pi, 0.0), (0.0, 0.5 * np.pi - _OFF_THE_POLE))[side]
 
     def _refine(self, law: LawClass, whole: bool = False) -> _Refined:
         """Returns a law that is refined through the simulator, with the other identified parameters.
@@ -385,22 +373,17 @@ class _LawSearch:
             limits: durations of these that are used [s]; the smallest counts.
         """
         seconds = min((limit for limit in limits if limit is not None), default=None)
-        dataset, wanted = self.motions.dataset, self.settings
+        wanted, shares = self.settings, independent(self.motions.dataset.labels)
 
         def prepared(before: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
             simulator, guess = begin(before)
             replays = self.motions.replays(simulator, names, self.identified)
-            misfit = Misfit(replays, bounds, seconds, shares=independent(dataset.labels))
+            misfit = Misfit(replays, bounds, seconds, shares=shares)
             known = {**self.identified.parameters, **guess}
             return misfit, first_points(misfit, {name: known[name] for name in bounds})
 
-        def search(misfit: Misfit, starts: Sequence[Mapping[str, float]], is_last: IsLast) -> Identification:
-            most = wanted.max_evaluations
-            with shown(self.title, most) as report:
-                return search_parameters(misfit, starts, most, wanted.tolerance, report, is_last)
-
-        released = key != _BESIDE and any(dataset.begin_of(name) == RELEASED for name in self.train)
-        return refined_searches(prepared, search, released, lambda number, work: self.once(f"{key} {number}", work))[-1]
+        options = (wanted.max_evaluations, wanted.tolerance, self.kept, key)
+        return refined_searches(prepared, self.motions, () if key == _BESIDE else self.train, *options)[-1]
 
     @cached_property
     def _bounds_of_others(self) -> dict[str, Bounds]:
@@ -413,14 +396,4 @@ class _LawSearch:
         if modulus is not None and modulus.prior is not None:
             share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
             prior = Prior(share * modulus.prior.mean, share * modulus.prior.deviation)
-        return bounds_of_constant(name, value, self.guess, 1.0 if self.states else _FURTHER, prior)
-
-
-def _deviation(found: Identification) -> dict[str, float]:
-    """Standard deviations of identified parameters; empty if they are not known."""
-    return {} if found.uncertainty is None else dict(found.uncertainty.deviation)
-
-
-def _refined_groups(law: LawClass) -> set[str]:
-    """Groups of terms of a law when it is refined, which adds viscosities."""
-    return {*law.groups, "viscosity"}
+        return bounds_of_constant(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)

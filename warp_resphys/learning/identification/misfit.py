@@ -241,7 +241,9 @@ class Misfit(BoundedMisfit):
             observed = self._replays[number][0].trials
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
             flat = weighted.reshape(*weighted.shape[:2], -1)
-            slopes = self._slopes(flat[1:] - flat[:1], moves, steps, observed)  # (R, 3 T M, P)
+            slopes = np.zeros((*flat.shape[1:], len(unit)))  # (R, 3 T M, P)
+            for changed, owners in zip(flat[1:], self._owners(observed), strict=derivatives):
+                slopes += (changed - flat[0])[..., None] * owners[:, None] / steps
             columns = nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
             shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
             shown = shown if self._shares is None else self._shares * shown
@@ -251,25 +253,13 @@ class Misfit(BoundedMisfit):
             trials += [LinearTrial(r, s, n, name, observed.session, c) for r, s, n, name, c in of_trials]
         return LinearMisfit(trials, *self.prior_rows(unit), nuisances)
 
-    def _slopes(
-        self, change: FloatArray, moves: Sequence[Sequence[int]], steps: FloatArray, trials: TrialBatch
-    ) -> FloatArray:
-        """(R, D, P) derivatives, from changes (E, R, D) of trials by `_moves_of` parameters, by steps (P,) of these."""
-        slopes, owners = np.zeros((*change.shape[1:], len(steps))), self._owners(trials)
-        for number, (own, columns) in enumerate(zip(change, moves, strict=True)):
-            for column in columns:
-                mine = owners[number, :, column] > 0.0
-                slopes[mine, :, column] = own[mine] / steps[column]
-        return slopes
-
     def _owners(self, trials: TrialBatch) -> FloatArray:
         """(S, R, P) one where a motion of `_moves_of` changes a parameter of a trial, else zero."""
         owners = np.zeros((len(self._moves), len(trials.names), len(self.bounds)))
         names = [split_name(name)[1] for name in self.bounds]
-        for number, columns in enumerate(self._moves):
-            for column in columns:
-                owner = names[column]
-                owners[number, :, column] = [not owner or owner in (t, trials.session) for t in trials.names]
+        for number, column in ((number, column) for number, moved in enumerate(self._moves) for column in moved):
+            owner = names[column]
+            owners[number, :, column] = [not owner or owner in (t, trials.session) for t in trials.names]
         return owners
 
     @property

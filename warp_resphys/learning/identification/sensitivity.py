@@ -29,7 +29,7 @@ from ..observed_motions import ObservedMotions
 from ..parameters import HUNG, configured_parameters, own_name, split_name
 from ..placement import DisplacedMarkers, Placement, by_placement, placement_of
 from ..replay import exact
-from .identification import Identification
+from .search import Identification
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ def sensitivities(
     for name, word in _responses(motions.dataset).items():
         inputs = motions.dataset.inputs[name.removesuffix(f"_{word}")]
         moved = {name: 1.0 if word == "factor" else float(np.abs(inputs).max())} | moved
-    moved |= {} if identified.uncertainty is None else identified.uncertainty.deviation
+    moved |= identified.deviation
     moved = {name: _DIFFERENCE * size for name, size in moved.items()}
     with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
         for _, some in (part for whole in motions.dataset.batches(names) for part in cut(whole, batch)):

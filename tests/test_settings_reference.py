@@ -72,7 +72,7 @@ def test_a_stage_has_the_keys_that_it_reads_alone():
         with pytest.raises(AttributeError, match=key):
             read()
     with pytest.raises(AttributeError, match="identify"):
-        _ = stage.identified
+        _ = stage.identify
     content = stage.content()
     assert {*content} == {"simulation", "law", "parallel", "shared"}
     assert (content["law"], content["parallel"]) == (run.plain()["law"], {"batch": None})

@@ -23,7 +23,7 @@ from ..io.settings import parse
 from ..mesh.volume_mesh import boundary_triangles
 from ..robot.description import Description
 from ..robot.robot import Robot
-from ..settings.observed import MarkerSettings
+from ..settings.observed import BindingSettings, MarkerSettings
 from ..settings.stage_keys import StageSettings
 from ..stepping.rollout import states
 from ..stepping.state import State
@@ -186,7 +186,7 @@ def laboratory_robot(settings: StageSettings, upright: bool = False, on_failure:
         material=settings.laboratory.material,
         mesh=build_body(target, settings.payload_at).mesh,
         payload_at=settings.payload_at,
-        markers=MarkerSettings.model_validate(settings.binding.plain()),
+        markers=MarkerSettings.of(BindingSettings.of(settings.binding)),
         labels=settings.binding.observed,
         bound=torch.from_numpy(setup.tracked),
     )

@@ -99,7 +99,7 @@ class Experiment:
 
     def settings_of(self, kind: str) -> SimulatorSettings:
         """Settings of a simulator of some kind, see `simulator`."""
-        settings, identified = self.settings, self.settings.identified
+        settings, identified = self.settings, self.settings.identify
         own: dict[str, Any] = {"gravity": tuple(self.dataset.gravity.tolist())}
         if kind == "published":
             published = settings.published
@@ -143,7 +143,7 @@ class Experiment:
     def identification(self, model: str) -> dict[str, Any]:
         """Returns the identification of a model: parameters, their uncertainty and the placement of markers, if any."""
         key = self.sources(model)[1]
-        if key is None or (key != LAW and self.settings.identified is None):
+        if key is None or (key != LAW and self.settings.identify is None):
             return {}
         identified = read_if_there(self.folder / IDENTIFICATION)
         if key != LAW:
@@ -164,7 +164,7 @@ class Experiment:
     def models(self) -> list[str]:
         """Names of the models that are compared; the law is one of them if it helps on the validation trials."""
         settings = self.settings
-        return models_of(settings.published, settings.identified, settings.correct_uncorrected, self.has_law)
+        return models_of(settings.published, settings.identify, settings.correct_uncorrected, self.has_law)
 
     @property
     def has_law(self) -> bool:
@@ -178,7 +178,7 @@ class Experiment:
     def model_simulator(self, model: str) -> Simulator:
         """The simulator that a model uses or corrects."""
         kind = self.sources(model)[0]
-        return self.simulator("simulation" if kind == "identified" and self.settings.identified is None else kind)
+        return self.simulator("simulation" if kind == "identified" and self.settings.identify is None else kind)
 
     def model(self, name: str) -> Model:
         """Returns a model that is compared, with what this run has learned for it."""

@@ -91,7 +91,7 @@ def identify_law(context: StageContext) -> None:
     known = None if file is None else read_law(file)
     law = law_search.identify_law(
         *(experiment.simulator("identified"), experiment.motions),
-        {} if settings.identified is None else settings.identify.parameters,
+        {} if settings.identify is None else settings.identify.parameters,
         identified=experiment.identified("sysid"),
         train=settings.split.train,
         validation=settings.split.validation,

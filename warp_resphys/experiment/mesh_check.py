@@ -33,7 +33,7 @@ def check_mesh(context: StageContext) -> None:
     times, parts = settings.mesh_check, settings.parts
     refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
     other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})
-    model = "simulation" if settings.identified is None else "sysid"
+    model = "simulation" if settings.identify is None else "sysid"
     content: dict[str, Any] = {"model": model}
     try:
         experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]

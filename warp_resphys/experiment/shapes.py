@@ -86,7 +86,7 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
     """Result of a shape, which its target holds or inflates, and releases."""
     target, mesh = _target(settings, shape), build_body(BodySettings.of(shape)).mesh
     seen = vertices_in(target.body.mesh, mesh).to(target.rest_positions)
-    models = ("simulation", *(("sysid",) if settings.identified else ()), *((LAW,) if experiment.has_law else ()))
+    models = ("simulation", *(("sysid",) if settings.identify else ()), *((LAW,) if experiment.has_law else ()))
     with torch.no_grad():
         held, substeps = _held(target, shape), substeps_of(settings.time_step, settings.target, "target")
         observed = seen(target.rollout(held, settings.data.steps * substeps).q[::substeps, 0]).cpu().numpy()

@@ -263,7 +263,7 @@ def describe(folder: Path, model: str) -> Description:
     if model not in models:
         raise InputError(f"the model is {model!r}: {folder} has {listed(models)}.")
     kind, _ = experiment.sources(model)
-    kind = "simulation" if kind == "identified" and settings.identified is None else kind
+    kind = "simulation" if kind == "identified" and settings.identify is None else kind
     simulator, dataset = experiment.simulator(kind), experiment.dataset
     identified = experiment.identification(model)
     errors = read_if_there(folder / ERRORS)

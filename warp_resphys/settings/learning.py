@@ -84,19 +84,14 @@ Ranges = Annotated[
 Guesses = Annotated[dict[str, float], BeforeValidator(without_null, json_schema_input_type=dict[str, float | None])]
 
 
-class IdentifiedSettings(Settings):
-    """Differences of the identified from the uncorrected simulator."""
+class IdentifySettings(Settings):
+    """Physical parameters to identify, and differences of the identified simulator from the uncorrected one."""
 
     integrator: Integrator | None = setting(None, "integrator of the identified simulator; null: as uncorrected")
     substeps: Natural = setting(1, "substeps per time step, with an integrator of its own")
     elastic: Ranges | None = setting(
         None, "ranges of youngs_modulus and poissons_ratio for the published identification of these two"
     )
-
-
-class IdentifySettings(IdentifiedSettings):
-    """Physical parameters to identify."""
-
     parameters: Ranges = setting({}, "ranges by name; null, or ~identify.parameters.NAME, takes one out")
     placement: PlacementSettings | None = setting(None, "identify positions of markers and pose of the recordings")
     first_guess: Guesses = setting({}, "of parameters without a value in the data sheet")

@@ -13,7 +13,6 @@ from .learning import (
     AblationSettings,
     ActuationSettings,
     BaselineSettings,
-    IdentifiedSettings,
     IdentifySettings,
     InTheLoopSettings,
     LawSettings,
@@ -185,11 +184,6 @@ class RunKeys(SimulatorSettings):
         return () if self.recorded is None else self.recorded.input_scales
 
     @property
-    def identified(self) -> IdentifiedSettings | None:
-        """Differences of the identified simulator; None where nothing is identified."""
-        return None if self.identify is None else IdentifiedSettings.of(self.identify)
-
-    @property
     def with_law(self) -> bool:
         """Whether the law of the material is identified."""
         return self.law is not None
@@ -198,7 +192,7 @@ class RunKeys(SimulatorSettings):
     def binding(self) -> BindingSettings:
         """Positions of markers, and how they are bound to the body."""
         assert self.markers is not None
-        return BindingSettings.of(self.markers)
+        return self.markers
 
     @property
     def batch(self) -> int | None:
@@ -242,7 +236,7 @@ class RunKeys(SimulatorSettings):
 
 
 def models_of(
-    published: Any, identified: IdentifiedSettings | None, correct_uncorrected: bool, law: bool = False
+    published: Any, identified: IdentifySettings | None, correct_uncorrected: bool, law: bool = False
 ) -> list[str]:
     """Returns the names of the models that an experiment compares.
 

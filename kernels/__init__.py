@@ -3,7 +3,8 @@
 All kernels use float64: in single precision the forces of a nearly incompressible solid have no correct digit. Every
 file is a Warp module of its own, and so is every material law (`modules`), so that a run compiles only what it needs.
 Warp does not differentiate these kernels, as ``wp.svd3`` has a wrong adjoint at the rest state; adjoints are written
-out. The exception are energies given as one Warp function (`energy_functions`).
+out. The exception are energies given as one Warp function (`energy_functions`). An energy of a point by itself is a law
+(`laws`); arguments of kernels are constants, inputs and outputs, in this order, and the outputs' names end in ``_out``.
 
 The first argument of a local step, a tangent or an assembly is ``active`` (B), zero for environments to skip; tangents
 also have ``clamp`` (B), non-zero where negative eigenvalues are clamped.

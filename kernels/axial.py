@@ -64,14 +64,14 @@ def muscle_pull(strain: wp.float64, toe: wp.float64):
 
 @wp.func
 def thread_tension(length: wp.float64, v: wp.vec2d):
-    """Tension-only thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a short toe; v = (k, toe)."""
+    """Describes a thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a toe; v = (k, toe)."""
     energy, force, slope = thread_pull(length - ONE, v[1])
     return v[0] * energy, v[0] * force, v[0] * slope, wp.vec2d(force, ZERO)
 
 
 @wp.func
 def string_tension(length: wp.float64, v: string_values):
-    """Tension-only spring from a point, ``k s(l - L)``."""
+    """Describes a tension-only spring from a point, ``k s(l - L)``."""
     energy, force, slope = thread_pull(length - v[4], v[5])
     by_values = string_values(ZERO, ZERO, ZERO, force, -v[3] * slope, ZERO)
     return v[3] * energy, v[3] * force, v[3] * slope, by_values
@@ -79,7 +79,7 @@ def string_tension(length: wp.float64, v: string_values):
 
 @wp.func
 def muscle_tension(length: wp.float64, v: wp.vec4d):
-    """Contractile fibre, ``sigma l + k s(l - 1 + c)``: active stress and a spring; v = (sigma, c, k, toe)."""
+    """Describes active stress and a contracted spring, ``sigma l + k s(l - 1 + c)``; v = (sigma, c, k, toe)."""
     energy, force, slope = muscle_pull(length - ONE + v[1], v[3])
     by_values = wp.vec4d(ONE, v[2] * slope, force, ZERO)
     return v[0] * length + v[2] * energy, v[0] + v[2] * force, v[2] * slope, by_values
@@ -95,7 +95,7 @@ def stiffness_across(length: wp.float64, pull: wp.float64, slope: wp.float64) ->
 
 @wp.func
 def inertia_tension(length: wp.float64, v: wp.vec4d):
-    """Inertia of a point in a step, ``k / 2 l^2`` from its inertial target; v = (target, k) [m, N/m]."""
+    """Describes the inertia of a point in a step, ``k / 2 l^2`` from its target; v = (target, k) [m, N/m]."""
     pull = v[3] * length
     return HALF * pull * length, pull, v[3], wp.vec4d(ZERO, ZERO, ZERO, length)
 

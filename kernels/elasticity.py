@@ -21,7 +21,7 @@ def strain(
     positions: wp.array2d[wp.vec3d],
     strain_out: wp.array2d[wp.mat33d],  # (B, P)
 ):
-    """Green strain."""
+    """Computes the Green strain."""
     b, p = wp.tid()
     strain_out[b, p] = green_strain(matrix_at(points, positions, b, p))
 
@@ -33,7 +33,7 @@ def strain_adjoint(
     adjoint_strain: wp.array2d[wp.mat33d],  # (B, P)
     stress_out: wp.array2d[wp.mat33d],  # (B, P) adjoint of F
 ):
-    """As dE = sym(F^T dF), the adjoint of F is F sym(adjoint E)."""
+    """Computes the adjoint F sym(adjoint E) of F, as dE = sym(F^T dF)."""
     b, p = wp.tid()
     f = matrix_at(points, positions, b, p)
     w = adjoint_strain[b, p]
@@ -42,7 +42,7 @@ def strain_adjoint(
 
 @wp.func
 def isotropic(strain: wp.mat33d, dilation: wp.float64, shape: wp.float64, volume: wp.float64) -> wp.mat33d:
-    """2 mu E + lambda e I."""
+    """Returns 2 mu E + lambda e I."""
     t = volume * dilation
     return TWO * shape * strain + wp.mat33d(t, ZERO, ZERO, ZERO, t, ZERO, ZERO, ZERO, t)
 
@@ -181,7 +181,7 @@ def adjoint_kernel(law: Law) -> Any:
         strain_out: wp.array2d[wp.mat33d],  # (B, P) dL/d strain_offset
         dilation_out: wp.array2d[wp.float64],  # (B, P) dL/d dilation_offset
     ):
-        """dL/dtheta = -z . d(internal residual)/dtheta = -dP/dtheta : grad z, at fixed positions."""
+        """Computes dL/dtheta = -z . d(internal residual)/dtheta = -dP/dtheta : grad z, at fixed positions."""
         b, p = wp.tid()
         f = matrix_at(points, positions, b, p)
         dz = matrix_at(points, direction, b, p)

@@ -36,7 +36,7 @@ def local_step(
     stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
 ):
-    """Force and energy of each point."""
+    """Computes force and energy of each point."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -65,7 +65,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Second derivative, without negative eigenvalues as the energy is convex."""
+    """Computes the second derivative, without negative eigenvalues as the energy is convex."""
     b, p = wp.tid()
     if active[b] == 0:
         return

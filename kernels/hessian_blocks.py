@@ -42,7 +42,7 @@ def cell_blocks(
     block_offset: int,
     blocks_out: wp.array2d[wp.mat33d],  # (B, C K (K + 1) / 2 from block_offset on) [N/m], rows a >= columns c
 ):
-    """Block (a, c) of a cell: d force_a / d x_c."""
+    """Computes the blocks (a, c) of a cell, d force_a / d x_c."""
     b, cell, a = wp.tid()
     if active[b] == 0:
         return

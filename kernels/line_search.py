@@ -103,7 +103,7 @@ def within_rounding(
     b: int,
     lane: int,
 ) -> bool:
-    """Whether the first step without loads, and the balancing forces after it, are within the rounding of the state."""
+    """Returns whether the first step without loads, and the forces after it, are within the rounding of the state."""
     if iterations != 1 or progress.force[b] != wp.float64(0.0):
         return False
     moved, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)

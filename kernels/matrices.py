@@ -16,7 +16,7 @@ ZERO, HALF, ONE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0)
 
 @wp.func
 def cofactor(a: wp.mat33d) -> wp.mat33d:
-    """Derivative of the determinant: det(A) A^-T, also where A is singular."""
+    """Returns the derivative of the determinant, det(A) A^-T, also where A is singular."""
     return wp.mat33d(
         a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1],
         a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2],
@@ -32,7 +32,7 @@ def cofactor(a: wp.mat33d) -> wp.mat33d:
 
 @wp.func
 def annul(p: wp.float64, q: wp.float64, pq: wp.float64, rp: wp.float64, rq: wp.float64, vp: wp.vec3d, vq: wp.vec3d):
-    """Jacobi's rotation of axes p and q that makes the entry pq of a symmetric matrix zero.
+    """Applies Jacobi's rotation of axes p and q that makes the entry pq of a symmetric matrix zero.
 
     Returns the entries pp, qq, rp and rq, with r the third axis, and the vectors of the two axes.
     """
@@ -47,7 +47,7 @@ def annul(p: wp.float64, q: wp.float64, pq: wp.float64, rp: wp.float64, rq: wp.f
 
 @wp.func
 def symmetric_eigen(a: wp.mat33d):
-    """V, det V = 1, and e of a symmetric A = V diag(e) V^T, in no order (Golub and Van Loan 2013, section 8.5)."""
+    """Returns V, det V = 1, and e of A = V diag(e) V^T, in no order (Golub and Van Loan 2013, section 8.5)."""
     x, y, z, xy, xz, yz = a[0, 0], a[1, 1], a[2, 2], a[0, 1], a[0, 2], a[1, 2]
     i, j, k = wp.vec3d(ONE, ZERO, ZERO), wp.vec3d(ZERO, ONE, ZERO), wp.vec3d(ZERO, ZERO, ONE)
     small = ROUNDING * wp.ddot(a, a)
@@ -63,7 +63,7 @@ def symmetric_eigen(a: wp.mat33d):
 
 @wp.func
 def general_svd(f: wp.mat33d):
-    """F = U diag(s) V^T with det U = det V = 1; the smallest s carries the sign of det F."""
+    """Returns U, s and V of F = U diag(s) V^T, det U = det V = 1; the smallest s carries the sign of det F."""
     u, s, v = wp.svd3(f)
     if wp.determinant(u) < ZERO:
         u = wp.mat33d(u[0, 0], u[0, 1], -u[0, 2], u[1, 0], u[1, 1], -u[1, 2], u[2, 0], u[2, 1], -u[2, 2])
@@ -76,7 +76,7 @@ def general_svd(f: wp.mat33d):
 
 @wp.func
 def newton_rotation(f: wp.mat33d):
-    """Newton's iteration R <- (R + R^-T) / 2 from R = F (Higham 1986), and whether it converged.
+    """Returns R by Newton's iteration R <- (R + R^-T) / 2 from R = F (Higham 1986), and whether it converged.
 
     It does not where F is inverted or too flat.
     """
@@ -96,7 +96,7 @@ def newton_rotation(f: wp.mat33d):
 
 @wp.func
 def polar_rotation(f: wp.mat33d) -> wp.mat33d:
-    """Rotation of the polar decomposition, det R = 1."""
+    """Returns the rotation of the polar decomposition, det R = 1."""
     r, converged = newton_rotation(f)
     if not converged:
         u, _s, v = general_svd(f)
@@ -106,7 +106,7 @@ def polar_rotation(f: wp.mat33d) -> wp.mat33d:
 
 @wp.func
 def signed_svd(f: wp.mat33d):
-    """F = U diag(s) V^T with det U = det V = 1; where det F < 0, the last s is the smallest and negative.
+    """Returns U, s and V of F = U diag(s) V^T, det U = det V = 1; if det F < 0, the last and smallest s is negative.
 
     By the eigenvectors of the symmetric factor of F = R S, in half the time of a general one.
     """

@@ -275,7 +275,7 @@ def begin_search(progress: SolverProgress, slope: wp.float64, b: int):
 
 @wp.func
 def may_be_rounding(progress: SolverProgress, b: int, norm: wp.float64, stalls: int) -> bool:
-    """Whether to measure the rounding error of a stalled residual: once, and again every few stalls."""
+    """Returns whether to measure the rounding error of a stalled residual: once, and again every few stalls."""
     stuck = progress.iterations[b] >= STALLS_BEFORE_CHECK and stalls >= STALLS_BEFORE_CHECK
     return stuck and (norm <= progress.rounding[b] or stalls % STALLS_BETWEEN_CHECKS == 0)
 
@@ -330,7 +330,7 @@ def accept_trial(
 
 @wp.kernel
 def allow_all(share_out: wp.array[wp.float64]):
-    """The whole step is allowed."""
+    """Allows the whole step."""
     share_out[wp.tid()] = ONE
 
 

@@ -86,16 +86,16 @@ class RecordedLaunch:
 
     def launch(self, stream: Any = None) -> None:
         """Launches the kernel."""
-        own = RecordedLaunch
-        own._running.append(None)
-        if own._captured:
-            own._running.pop()
-            with _WARP:  # held by the thread that captures, and its own launches
-                own._running.append(None)
+        running = RecordedLaunch._running
+        running.append(None)
+        if RecordedLaunch._captured:
+            running.pop()
+            with _WARP:  # locked by the thread that captures, which may launch
+                running.append(None)
         try:
             self._command.launch(stream)
         finally:
-            own._running.pop()
+            running.pop()
 
     @classmethod
     def forked(cls) -> None:
@@ -127,12 +127,12 @@ def launch_stream(device: torch.device) -> Any:
     if device.type == "cpu":
         return None
     handle = torch.cuda.current_stream(device).cuda_stream
-    own = wp.get_device(str(device)).stream
-    # Torch may use Warp's own stream; a second wp.Stream on its handle would destroy it when collected.
-    return own if handle == own.cuda_stream else _stream(str(device), handle)
+    of_warp = wp.get_device(str(device)).stream
+    # Torch may use Warp's stream; a second wp.Stream on its handle would destroy it when collected.
+    return of_warp if handle == of_warp.cuda_stream else _stream(str(device), handle)
 
 
 @functools.cache
 def _stream(device: str, handle: int) -> Any:
-    """Cached: Warp unregisters a stream with its object, and torch reuses a few streams."""
+    """Returns a stream; cached, as Warp unregisters a stream with its object, and torch reuses a few."""
     return wp.Stream(device, cuda_stream=handle)

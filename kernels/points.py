@@ -37,7 +37,7 @@ class VectorPoints:
 
 @wp.func
 def matrix_at(points: MatrixPoints, positions: wp.array2d[wp.vec3d], b: int, p: int) -> wp.mat33d:
-    """F = sum_a x_a g_a^T."""
+    """Returns F = sum_a x_a g_a^T."""
     nodes = points.nodes[p / points.per_cell]
     operators = points.operators[p]
     f = wp.mat33d(ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)
@@ -48,7 +48,7 @@ def matrix_at(points: MatrixPoints, positions: wp.array2d[wp.vec3d], b: int, p: 
 
 @wp.func
 def vector_at(points: VectorPoints, positions: wp.array2d[wp.vec3d], b: int, p: int) -> wp.vec3d:
-    """sum_a g_a x_a: a deformed line, or a position."""
+    """Returns sum_a g_a x_a, a deformed line, or a position."""
     nodes = points.nodes[p / points.per_cell]
     operators = points.operators[p]
     x = wp.vec3d(ZERO, ZERO, ZERO)
@@ -59,7 +59,7 @@ def vector_at(points: VectorPoints, positions: wp.array2d[wp.vec3d], b: int, p: 
 
 @wp.func
 def green_strain(f: wp.mat33d) -> wp.mat33d:
-    """E = (F^T F - I) / 2."""
+    """Returns E = (F^T F - I) / 2."""
     e = HALF * (wp.transpose(f) * f)
     return e - wp.mat33d(HALF, ZERO, ZERO, ZERO, HALF, ZERO, ZERO, ZERO, HALF)
 
@@ -194,7 +194,7 @@ def inertia_residual(
     residual_out: wp.array2d[wp.vec3d],  # (B, N) [N]
     energy_out: wp.array2d[wp.float64],  # (B, N) [J]
 ):
-    """Inertia less the loads, k (x - y) - f, and its energy."""
+    """Computes inertia less the loads, k (x - y) - f, and its energy."""
     b, i = wp.tid()
     offset = positions[b, i] - target[b, i]
     pull = inertia[b, i] * offset

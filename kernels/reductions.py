@@ -30,7 +30,7 @@ def masked_norm(
     vectors_out: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices
     norm_out: wp.array[wp.float64],  # (B)
 ):
-    """The norm over all free vertices."""
+    """Computes the norm over all free vertices."""
     b, lane = wp.tid()
     total = wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):

@@ -265,7 +265,7 @@ def tiled_kernels(scalar: Any) -> SimpleNamespace:
         factors: wp.array3d[scalar],  # (B or 1, n rounded up to tiles, (W + 1) T)
         columns_out: wp.array3d[scalar],  # (B, m, n) right-hand sides, overwritten by the solutions
     ):
-        """Forward and backward substitution, one block per right-hand side."""
+        """Substitutes forwards and backwards, one block per right-hand side."""
         b, m, _ = wp.tid()
         substitute(factors[wp.min(b, factors.shape[0] - 1)], columns_out[b, m])
 

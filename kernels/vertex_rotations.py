@@ -18,7 +18,7 @@ def cell_gradients(
     positions: wp.array2d[wp.vec3d],  # (B, N) [m]
     gradient_out: wp.array2d[wp.mat33d],  # (B, C)
 ):
-    """Weighted mean deformation gradients of cells."""
+    """Computes weighted mean deformation gradients of cells."""
     b, cell = wp.tid()
     f = wp.mat33d()
     for a in range(points.nodes.shape[1]):
@@ -44,16 +44,16 @@ def sum_at_vertices(
 
 @wp.kernel
 def rotation(
-    held: wp.array[int],  # (N) not zero: vertices without rotation
+    fixed: wp.array[int],  # (N) not zero: vertices without rotation
     gradient: wp.array2d[wp.mat33d],  # (B, N) up to a positive factor
     rotation_out: wp.array2d[wp.mat33d],
 ):
-    """The nearest rotations, the identity where a gradient is singular or inverted."""
+    """Computes the nearest rotations, the identity where a gradient is singular or inverted."""
     b, i = wp.tid()
     f = gradient[b, i]
     size = wp.determinant(f)
     rotation_out[b, i] = wp.identity(n=3, dtype=wp.float64)
-    if held[i] == 0 and size > SMALLEST:
+    if fixed[i] == 0 and size > SMALLEST:
         rotation_out[b, i] = polar_rotation((ONE / wp.pow(size, THIRD)) * f)
 
 
@@ -64,7 +64,7 @@ def rotation_since(
     rotation: wp.array2d[wp.mat33d],  # (B, N)
     since_out: wp.array2d[wp.mat33d],  # (B, F)
 ):
-    """Rotations of vertices from earlier ones to the present ones."""
+    """Computes rotations of vertices from earlier ones to the present ones."""
     b, k = wp.tid()
     since_out[b, k] = rotation[b, vertices[k]] * wp.transpose(before[b, k])
 

@@ -36,7 +36,7 @@ class PairKeys:
 
 @wp.func
 def lower(x: wp.vec3d, r: wp.float64) -> wp.vec3:
-    """Corner of a box in float32, rounded outwards."""
+    """Returns the corner of a box in float32, rounded outwards."""
     y, e = wp.vec3(x - wp.vec3d(r, r, r)), wp.vec3()
     for i in range(3):
         e[i] = wp.abs(y[i]) * (SAFE - wp.float32(1.0))
@@ -45,13 +45,13 @@ def lower(x: wp.vec3d, r: wp.float64) -> wp.vec3:
 
 @wp.func
 def upper(x: wp.vec3d, r: wp.float64) -> wp.vec3:
-    """The opposite corner."""
+    """Returns the opposite corner."""
     return -lower(-x, r)
 
 
 @wp.func
 def low_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> wp.vec3:
-    """Lower corner of the box of all places where a primitive may be, widened by more."""
+    """Returns the lower corner of the box of all places where a primitive may be, widened by more."""
     low = lower(sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more)
     for a in range(1, nodes.shape[0]):
         low = wp.min(low, lower(sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more))
@@ -60,7 +60,7 @@ def low_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> 
 
 @wp.func
 def high_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> wp.vec3:
-    """Upper corner of that box."""
+    """Returns the upper corner of that box."""
     high = upper(sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more)
     for a in range(1, nodes.shape[0]):
         high = wp.max(high, upper(sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more))
@@ -75,7 +75,7 @@ def boxes(
     upper_out: wp.array[wp.vec3],
     group_out: wp.array[int],
 ):
-    """Boxes of all places where a primitive may be."""
+    """Computes the boxes of all places where a primitive may be."""
     b, k = wp.tid()
     i = b * nodes.shape[0] + k
     lower_out[i] = low_corner(sweep, b, nodes[k], NOTHING)
@@ -85,7 +85,7 @@ def boxes(
 
 @wp.func
 def may_touch(sweep: Sweep, b: int, kind: int, v: wp.vec4i) -> bool:
-    """Whether a pair may come within reach."""
+    """Returns whether a pair may come within reach."""
     x, r = Corners(), wp.vec4d()
     same = sweep.piece[v[0]] == sweep.piece[v[3]]
     for i in range(4):
@@ -110,20 +110,20 @@ def close_pairs(
     per_environment: wp.int64,  # number of all conceivable pairs of an environment
     pairs_out: PairKeys,
 ):
-    """Pairs of a vertex and a triangle, or of edges, without a vertex in common."""
+    """Finds pairs of a vertex and a triangle, or of edges, without a vertex in common."""
     b, i = wp.tid()
-    own = first[i]
-    low, high = low_corner(sweep, b, own, sweep.reach), high_corner(sweep, b, own, sweep.reach)
+    vertices = first[i]
+    low, high = low_corner(sweep, b, vertices, sweep.reach), high_corner(sweep, b, vertices, sweep.reach)
     query = wp.bvh_query_aabb(hierarchy, low, high, wp.bvh_get_group_root(hierarchy, b))
     hit = wp.int32(0)
     count = second.shape[0]
     while wp.bvh_query_next(query, hit):
         j = hit - b * count
         other = second[j]
-        v = wp.vec4i(own[0], other[0], other[1], other[other.shape[0] - 1])
+        v = wp.vec4i(vertices[0], other[0], other[1], other[other.shape[0] - 1])
         distinct = v[0] != v[1] and v[0] != v[2] and v[0] != v[3]
         if kind == EDGE_EDGE:
-            v = wp.vec4i(own[0], own[1], other[0], other[1])
+            v = wp.vec4i(vertices[0], vertices[1], other[0], other[1])
             distinct = j > i and v[0] != v[2] and v[0] != v[3] and v[1] != v[2] and v[1] != v[3]
         if distinct and may_touch(sweep, b, kind, v):
             slot = wp.atomic_add(pairs_out.count, 0, 1)
@@ -134,7 +134,7 @@ def close_pairs(
 
 @wp.func
 def side(x: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.float64:
-    """Six times the signed volume of a tetrahedron."""
+    """Returns six times the signed volume of a tetrahedron."""
     return wp.dot(x - a, wp.cross(b - a, c - a))
 
 
@@ -147,7 +147,7 @@ def crossings(
     count_out: wp.array[int],  # (B) edges that cross a triangle
     edge_out: wp.array[int],  # (B) the first of them
 ):
-    """Edges that pass through triangles without a vertex in common."""
+    """Finds edges that pass through triangles without a vertex in common."""
     b, e = wp.tid()
     i, j = edges[e, 0], edges[e, 1]
     x, y = sweep.origin[b, i], sweep.origin[b, j]

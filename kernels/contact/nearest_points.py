@@ -47,14 +47,14 @@ class Nearest:
 
 @wp.func
 def along(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d) -> wp.float64:
-    """Share of the way from a to b at which it is nearest to p."""
+    """Returns the share of the way from a to b at which it is nearest to p."""
     e = b - a
     return wp.clamp(wp.dot(p - a, e) / wp.dot(e, e), ZERO, ONE)
 
 
 @wp.func
 def on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
-    """Weights of the corners at the place nearest to p (Ericson 2005); a weight is zero on the side opposite to it."""
+    """Returns the weights of the corners at the place nearest to p (Ericson 2005); zero on the opposite side."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = wp.dot(ab, ap), wp.dot(ac, ap)
     if d1 <= ZERO and d2 <= ZERO:
@@ -85,7 +85,7 @@ def on_triangle(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def on_edges(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec2d:
-    """Shares of the ways from a to b and from c to d at which the two are nearest to each other (Ericson 2005)."""
+    """Returns the shares of the ways from a to b and from c to d at which the two are nearest (Ericson 2005)."""
     e, f, r = b - a, d - c, a - c
     ee, ff, ef = wp.dot(e, e), wp.dot(f, f), wp.dot(e, f)
     er, fr = wp.dot(e, r), wp.dot(f, r)
@@ -166,7 +166,7 @@ def edge_weights(feature: int, x: Corners):
 
 @wp.func
 def nearest(kind: int, feature: int, x: Corners) -> Nearest:
-    """Nearest points of a feature of a pair.
+    """Returns the nearest points of a feature of a pair.
 
     Features of a vertex x0 and a triangle: 0 the triangle, 1 to 3 its sides opposite to x1 to x3, 4 to 6 its corners.
     Features of two edges: 3 i + j, where i and j are 0 for an edge, 1 and 2 for its ends.
@@ -203,7 +203,7 @@ def nearest(kind: int, feature: int, x: Corners) -> Nearest:
 
 @wp.func
 def part(kind: int, feature: int, degree: wp.vec4d) -> wp.float64:
-    """Coefficient of a feature's barrier in that of its pair.
+    """Returns the coefficient of a feature's barrier in that of its pair.
 
     The sum over all pairs counts what several triangles or edges share once (inclusion and exclusion).
     """
@@ -223,7 +223,7 @@ def part(kind: int, feature: int, degree: wp.vec4d) -> wp.float64:
 
 @wp.func
 def corners(positions: wp.array2d[wp.vec3d], b: int, v: wp.vec4i) -> Corners:
-    """Positions of the vertices of a pair."""
+    """Returns the positions of the vertices of a pair."""
     x = Corners()
     for i in range(4):
         x[i] = positions[b, v[i]]
@@ -232,7 +232,7 @@ def corners(positions: wp.array2d[wp.vec3d], b: int, v: wp.vec4i) -> Corners:
 
 @wp.func
 def apart(kind: int, x: Corners, most: wp.float64) -> bool:
-    """Whether the boxes of the two parts of a pair are further apart than a distance."""
+    """Returns whether the boxes of the two parts of a pair are further apart than a distance."""
     low, high, one = x[0], x[0], x[1]
     if kind == EDGE_EDGE:
         low, high, one = wp.min(x[0], x[1]), wp.max(x[0], x[1]), x[2]
@@ -243,7 +243,7 @@ def apart(kind: int, x: Corners, most: wp.float64) -> bool:
 
 @wp.func
 def features(kind: int) -> int:
-    """Number of features of a pair."""
+    """Returns the number of features of a pair."""
     return wp.where(kind == VERTEX_TRIANGLE, TRIANGLE_FEATURES, EDGE_FEATURES)
 
 
@@ -291,7 +291,7 @@ def bound(
 
 @wp.kernel
 def distances(pairs: Pairs, positions: wp.array2d[wp.vec3d], distance_out: wp.array[wp.float64]):
-    """Distances of all pairs [m]."""
+    """Computes the distances of all pairs [m]."""
     c = wp.tid()
     distance_out[c] = nearest(pairs.kind[c], 0, corners(positions, pairs.environment[c], pairs.nodes[c])).d
 
@@ -314,7 +314,7 @@ def pair_features(
     positions: wp.array2d[wp.vec3d],
     features_out: Features,
 ):
-    """Weights of the nearest points of all features of pairs, the directions in which they can slide, and parts."""
+    """Computes weights of nearest points, directions in which these can slide, and parts of all features of pairs."""
     a, feature = wp.tid()
     c = chosen[a]
     kind = pairs.kind[c]

@@ -121,7 +121,7 @@ def from_cylinder(y: wp.vec3d, s: wp.vec3d) -> Distance:
 
 @wp.func
 def spline(t: wp.float64, derivative: int) -> wp.vec4d:
-    """Weights of four coefficients at the share t of the interval between the second and the third."""
+    """Returns the weights of four coefficients at the share t of the interval between the second and the third."""
     s = ONE - t
     if derivative == 1:
         middle = wp.vec2d(t * (HALF * THREE * t - TWO), -s * (HALF * THREE * s - TWO))
@@ -215,7 +215,7 @@ def measure(
     distance_out: wp.array3d[wp.float64],  # (B, P, O) [m]
     normal_out: wp.array3d[wp.vec3d],  # (B, P, O)
 ):
-    """Distances and normals of positions."""
+    """Computes distances and normals of positions."""
     b, p, k = wp.tid()
     at = distance(o, b, k, positions[b, p])
     distance_out[b, p, k] = at.d
@@ -231,7 +231,7 @@ def measure_adjoint(
     position_out: wp.array3d[wp.vec3d],  # (B, P, O) parts of the derivative by the position
     turn_out: wp.array3d[wp.mat33d],  # (B, P, O)
 ):
-    """Derivatives of a loss by positions and rotations, from those by distances and normals."""
+    """Computes derivatives of a loss by positions and rotations, from those by distances and normals."""
     b, p, k = wp.tid()
     x = positions[b, p]
     at = distance(o, b, k, x)
@@ -242,7 +242,7 @@ def measure_adjoint(
 
 @wp.kernel(module="unique")
 def from_surface(surface: wp.uint64, places: wp.array[wp.vec3], distance_out: wp.array[float]):
-    """Signed distances of places from a closed surface [m]."""
+    """Computes signed distances of places from a closed surface [m]."""
     i = wp.tid()
     query = wp.mesh_query_point_sign_winding_number(surface, places[i], 1.0e6)
     nearest = wp.mesh_eval_position(surface, query.face, query.u, query.v)

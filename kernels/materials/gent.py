@@ -12,7 +12,7 @@ ROOM = wp.constant(wp.float64(0.95))  # fraction of the limit above which the en
 
 @wp.func
 def energy_density(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
-    """-mu J_m / 2 ln(1 - x), x = (I1 - 3 - 2 (J - 1) + (J - 1)^2) / J_m; its parabola beyond 95 % of the limit."""
+    """Returns -mu J_m / 2 ln(1 - x) as in the module's docstring, its parabola beyond 95 % of the limit."""
     change = wp.determinant(f) - wp.float64(1.0)
     x = (wp.ddot(f, f) - wp.float64(3.0) - wp.float64(2.0) * change + change * change) / p[1]
     inside = wp.min(x, ROOM)
@@ -23,6 +23,6 @@ def energy_density(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
 
 @wp.func
 def volume_energy(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
-    """Lambda / 2 (J - 1)^2."""
+    """Returns lambda / 2 (J - 1)^2."""
     change = wp.determinant(f) - wp.float64(1.0)
     return wp.float64(0.5) * (p[2] - TWO_THIRDS * p[0]) * change * change

@@ -18,7 +18,7 @@ THREE, FOUR = wp.float64(3.0), wp.float64(4.0)
 
 @wp.func
 def volume_slope(m: wp.vec3d, jac: wp.float64) -> wp.float64:
-    """Derivative of the terms in J by J."""
+    """Returns the derivative of the terms in J by J."""
     return TWO * m[0] * (jac - TWO) - FOUR * m[1] + m[2] * (jac - ONE)
 
 

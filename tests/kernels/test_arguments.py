@@ -6,6 +6,7 @@ import importlib
 import inspect
 import pkgutil
 import re
+import sys
 import textwrap
 from pathlib import Path
 from types import SimpleNamespace
@@ -167,3 +168,12 @@ def test_outputs_come_last_and_end_in_out(name):
     written = written_by(kernels()[name])
     assert {argument for argument in arguments if argument.endswith("_out")} == written
     assert set(arguments[len(arguments) - len(written) :]) == written
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="Warp compiles for CUDA on Linux")
+def test_every_module_compiles_for_a_gpu(tmp_path):
+    """Without one; lanes are those of a CPU."""
+    for module in {kernel.module for (file, _), kernel in kernels().items() if file != "lanes.py"}:
+        wp.compile_aot_module(module, arch=80, module_dir=tmp_path)
+    assert len(list(tmp_path.glob("*.cubin")) + list(tmp_path.glob("*.ptx"))) > 20

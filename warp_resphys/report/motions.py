@@ -53,6 +53,7 @@ _WIDTHS: Final = ((4.0, 2.0), (6.0, 3.0))  # Widths [px] of the path and of the 
 _APART: Final = 0.012  # Least length of line segments, over half a view's height; shorter ones have ragged edges.
 # Shifts to the viewer, over half a view's height.
 _BEFORE: Final = {"rings": 2.5, "path": 4.0, "trail": 4.5, "dots": 5.0}
+_NEAREST: Final = {"rings": 9.0, "dots": 14.0}  # Largest shifts, which are still in front of the camera.
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +141,7 @@ class ComparedMotion:
         layers.append(stems(self._feet(positions[-1]), simulated[-1], OUTLINE, 2.0))
         room = headroom * height
         places = ((axes, middle + room * axes[1], height + room), (second, near, near_height))
-        return [View([*layers, *self._dots(simulated, at[2], _RADII[size])], *at) for at in places]
+        return [View([*layers, *self._dots(simulated, at[2], height, _RADII[size])], *at) for at in places]
 
     def _feet(self, positions: FloatArray) -> FloatArray:
         """Returns the points (T, M, 3) of a body (T, N, 3) that are closest to the markers at rest."""
@@ -152,13 +153,21 @@ class ComparedMotion:
         weights = (np.linalg.pinv(matrix) @ right[..., None])[..., 0]  # (M, 3), their sum one
         return np.asarray(np.einsum("tmki,mk->tmi", positions[:, closest.triangles], weights))
 
-    def _dots(self, simulated: FloatArray, half: float, radius: float) -> list[Layer]:
-        """Returns dots of the measured markers and rings of the simulated ones (B, T, M, 3), in the foreground."""
-        size, layers = 2.0 * half * radius, []
+    def _dots(self, simulated: FloatArray, half: float, height: float, radius: float) -> list[Layer]:
+        """Returns dots of the measured markers and rings of the simulated ones (B, T, M, 3), in the foreground.
+
+        Args:
+            simulated: Of the models [m].
+            half: Half the height of the view [m].
+            height: That of the view of the whole body, behind which no marker is to be hidden [m].
+            radius: Of a dot, over the height of the view.
+        """
+        size, layers = 2.0 * half * radius, list[Layer]()
+        rings, dots = (min(_BEFORE[name] * height, _NEAREST[name] * half) for name in ("rings", "dots"))
         for behind, places in zip(reversed(range(len(simulated))), simulated, strict=True):
             colour, wide = BEHIND if behind else _SOLID, (_RING + _WIDER * behind) * size
-            layers.append(Layer("rings", places, None, colour, size=wide, shift=_BEFORE["rings"] * half))
-        return [*layers, Layer("balls", self.measured, None, MEASURED, size=size, shift=_BEFORE["dots"] * half)]
+            layers.append(Layer("rings", places, None, colour, size=wide, shift=rings))
+        return [*layers, Layer("balls", self.measured, None, MEASURED, size=size, shift=dots)]
 
     def _follow(self, simulated: FloatArray, axes: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, float]:
         """Returns the middle (T, 3) of the markers in each frame, and half the height of a view that contains them [m].

@@ -134,8 +134,9 @@ def range_table(metrics: Mapping[str, Any], trials: Sequence[str]) -> PageTable 
     models = [model for model in MODELS if model in metrics.get("range", {})]
     rows = [Row(MODELS[m].name, [cell(left[m]["first_s"]) for left in columns.values()]) for m in models]
     fades = any(metrics["range"][m]["first_s"] for m in models if m == "resphys") and "law" in metrics["errors_mm"]
-    note = "There the learned force of ResPhys fades out, and the law remains." if fades else ""
-    return PageTable("Left the training range, the first one", [*columns], rows, note) if rows else None
+    note = "Small: when the first of them left."
+    note += " There the learned force of ResPhys fades out, and the law remains." if fades else ""
+    return PageTable("Roll-outs that left the training range", [*columns], rows, note) if rows else None
 
 
 SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (

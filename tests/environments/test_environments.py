@@ -5,6 +5,7 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
@@ -17,6 +18,7 @@ from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.robot import Robot
+from warp_resphys.stepping.state import State
 from warp_resphys.studies.live import LiveRobot
 
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
@@ -147,18 +149,16 @@ class Brittle(World):
 
     def __init__(self):
         self.count, self.time_step, self.input, self.parts, self.number = 2, 0.01, "place", 1, 0
-        self.places = np.zeros((2, 1, 3))
+        self.rest = State(torch.zeros(2, 1, 3), torch.zeros(2, 1, 3))
 
-    def begin(self, chosen):
-        self.places[chosen] = 0.0
-
-    def step(self, commands):
+    def step(self, state, commands):
         self.number += 1
-        self.places[:, 0, :1] = commands
-        return np.array([self.number == 12, False])
+        q = torch.zeros(2, 1, 3)
+        q[:, 0, :1] = torch.as_tensor(commands)
+        return State(q, state.v).with_memory({"lost": state.lost | torch.tensor([self.number == 12, False])})
 
-    def markers(self):
-        return self.places
+    def markers(self, state):
+        return state.q.numpy()
 
 
 class TestFailures:

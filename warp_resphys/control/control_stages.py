@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +24,8 @@ from ..report.motions import DrivenBodies
 from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stage_keys import StageSettings
+from ..stepping.rollout import rollout
+from ..stepping.state import State
 from .control_files import (
     BASELINES,
     PLANNED,
@@ -117,14 +120,11 @@ def fit_baselines(context: StageContext) -> None:
     parts, steps = task.parts, max(round(feedback.settles / robot.time_step), 2)
     pressed = _PRESSED * limits.range * np.eye(parts)
     laboratory = Laboratory(settings, context.run_dir, driven.name, parts, len(motions_of(settings.control)))
-    rest, seen = laboratory.rest(), []
+    rest, pressing = laboratory.seen_at_rest(), repeat(limits.low + pressed, steps)
     with Progress(context.name, steps, "steps") as progress:
-        for number in range(steps):
-            laboratory.step(limits.low + pressed)
-            seen.append(laboratory.seen(number + 1))
-            progress.advance()
-    last = np.mean(seen[-max(steps // 5, 1) :], axis=0)
-    moved = (last - rest).reshape(parts, -1) @ task.tracked.T  # (n, d)
+        moving = rollout(laboratory.step, laboratory.rest, progress.each(pressing), lambda state: state)
+    last = [laboratory.seen(state, number) for number, state in enumerate(moving)][-max(steps // 5, 1) :]
+    moved = (np.mean(last, axis=0) - rest).reshape(parts, -1) @ task.tracked.T  # (n, d)
     write_baselines(context.run_dir / BASELINES, linear, moved.T / np.diag(pressed))
 
 
@@ -189,7 +189,7 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     task, driven, count = Task(control, robot), driven_input(robot), len(controllers_of(control))
     laboratory = Laboratory(settings, folder, driven.name, count, motions_of(control).index(name))
     plans = {model: read_motion(folder / plans_file(model), PLANNED, name) for model in control.models}
-    rest, path = laboratory.rest(), plans[control.models[-1]]["path"]
+    rest, path = laboratory.seen_at_rest(), plans[control.models[-1]]["path"]
     linear, jacobian = read_baselines(folder / BASELINES)
     controllers = list[Controller]()
     for model in control.receding:
@@ -202,20 +202,25 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     for gain in control.feedback.gains:
         own = rest[len(plans) + len(controllers)]
         controllers.append(JacobianFeedback(jacobian, control.limits, gain, task.time_step, task.tracked, path, own))
-    points, inputs, seconds = list[FloatArray](), list[FloatArray](), list[FloatArray]()
-    for step in range(steps):
-        seen = laboratory.seen(step)
+    inputs, seconds = list[FloatArray](), list[FloatArray]()
+
+    def step(state: State, number: int) -> State:
+        seen = laboratory.seen(state, number)
         acting, took = np.zeros((count, task.parts)), np.zeros(count)
-        acting[: len(plans)] = [plan["inputs"][step] for plan in plans.values()]
+        acting[: len(plans)] = [plan["inputs"][number] for plan in plans.values()]
         for row, controller in enumerate(controllers, len(plans)):
             began = time.perf_counter()
-            acting[row] = controller(step, seen[row])
+            acting[row] = controller(number, seen[row])
             took[row] = time.perf_counter() - began
-        laboratory.step(acting)
-        points.append(laboratory.markers().reshape(count, -1) @ task.tracked.T)
         inputs.append(acting)
         seconds.append(took)
         report()
+        return laboratory.step(state, acting)
+
+    def point(state: State) -> FloatArray:
+        return np.asarray(laboratory.markers(state).reshape(count, -1) @ task.tracked.T)
+
+    points = rollout(step, laboratory.rest, range(steps), point)[1:]
     series = (("points", points, "m"), ("inputs", inputs, driven.unit), ("seconds", seconds, "s"))
     return {key: (np.stack(values, 1), unit) for key, values, unit in series}
 
@@ -297,18 +302,15 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     steps = max(int(min(len(driven["path"]), seconds / robot.time_step)), 1)
     laboratory = Laboratory(settings, folder, driven_input(robot).name, len(rows), 0)
     tracked = tracked_of(robot.labels, control.tracked)
-    bodies, points = [laboratory.bodies()[1]], [laboratory.markers()]
+    acting = driven["inputs"][rows, :steps].swapaxes(0, 1)
     with Progress("laboratory", steps, "steps") as progress:
-        for number in range(steps):
-            laboratory.step(driven["inputs"][rows, number])
-            bodies.append(laboratory.bodies()[1])
-            points.append(laboratory.markers())
-            progress.advance()
-    markers = np.stack(points, 1)  # (C, T + 1, M, 3)
+        moved = rollout(laboratory.step, laboratory.rest, progress.each(acting), lambda state: state)
+    bodies = np.stack([laboratory.bodies(state)[1] for state in moved], 1)
+    markers = np.stack([laboratory.markers(state) for state in moved], 1)  # (C, T + 1, M, 3)
     return DrivenBodies(
         robot.time_step * np.arange(steps + 1, dtype=np.float64),
-        laboratory.bodies()[0],
-        dict(zip(controllers, np.stack(bodies, 1), strict=True)),
+        laboratory.bodies(laboratory.rest)[0],
+        dict(zip(controllers, bodies, strict=True)),
         dict(zip(controllers, markers.reshape(*markers.shape[:2], -1) @ tracked.T, strict=True)),
         driven["path"],
         np.array([control.right, control.up], dtype=np.float64),

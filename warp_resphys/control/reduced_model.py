@@ -64,6 +64,7 @@ class ReducedState:
         previous: (2, B, r) coordinates and rates one step earlier.
         looks_back: (B,) whether the integrator may use ``previous``; false before the first step.
         left: (B,) whether the learned force was ever evaluated outside its training range.
+        lost: (B,) whether a world has found that the model diverged; it stands at rest then.
     """
 
     z: FloatArray
@@ -74,6 +75,7 @@ class ReducedState:
     previous: FloatArray
     looks_back: BoolArray
     left: BoolArray
+    lost: BoolArray
 
     def moved(self, z: FloatArray, v: FloatArray, time_step: float) -> "ReducedState":
         """Returns the state with its coordinates (B, r) and rates changed at once, and a past that fits them."""
@@ -194,7 +196,7 @@ class ReducedModel:
         z = np.repeat(self._equilibrium(Monomials(u[:1])), count, axis=0)
         still, relaxed = np.stack([z, np.zeros_like(z)]), np.zeros((len(self.times), *z.shape))
         memory, no = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
-        return ReducedState(still[0], still[1], relaxed, u, memory, still, no, no)
+        return ReducedState(still[0], still[1], relaxed, u, memory, still, no, no, no)
 
     def _equilibrium(self, u: Monomials) -> FloatArray:
         """Coordinates (S, r) with A (z - z_0) = learned force, by Newton's method with step halving."""
@@ -307,7 +309,8 @@ class ReducedModel:
             strain = self.relaxed(strain, z - now[0])
             now, before = np.stack([z, (z - at) / step[rows]]), now
             states.append(z)
-        end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, np.ones(batch, dtype=np.bool_), left)
+        looks_back = np.ones(batch, dtype=np.bool_)
+        end = ReducedState(now[0], now[1], strain, acting[-1], memory, before, looks_back, left, start.lost)
         return np.stack(states), u, end
 
     def relaxed(self, strains: FloatArray, change: FloatArray) -> FloatArray:

@@ -352,7 +352,7 @@ def _errors(model: ReducedModel, motions: Motions, z: FloatArray, rates: FloatAr
     off, moved, looks = [], [], np.ones(z.shape[1], dtype=np.bool_)
     for at in range(2, len(commands) - steps, max(steps // 3, 1)):
         before = np.stack([z[at - 1], rates[at - 1]])
-        start = ReducedState(z[at], rates[at], strains[at], acting[at - 1], memories[at], before, looks, ~looks)
+        start = ReducedState(z[at], rates[at], strains[at], acting[at - 1], memories[at], before, looks, ~looks, ~looks)
         predicted, true = model.respond(start, commands[at : at + steps]), y[at + 1 : at + steps + 1]
         off.append(_distances(predicted, true).mean())
         moved.append(_distances(np.broadcast_to(y[at], true.shape), true).mean())

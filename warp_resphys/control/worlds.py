@@ -2,8 +2,9 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from ..settings.observed import BindingSettings, MarkerSettings
 from ..settings.stage_keys import StageSettings
 from ..stepping.rollout import states
 from ..stepping.state import State
-from .reduced_model import ReducedModel
+from .reduced_model import ReducedModel, ReducedState
 
 _FURTHEST: Final = 20.0  # coordinates at which a reduced model has failed, relative to those of equilibria
 _LEAST: Final = 1e-3  # lower bound of drawn positive parameters, relative to the identified value
@@ -36,8 +37,13 @@ _BEFORE: Final = 1_000_000  # number of the first of the frames taken before the
 _LABORATORY: Final = "laboratory"
 
 
-class World(ABC):
-    """B bodies that take commands and have markers.
+S = TypeVar("S", State, ReducedState)
+
+
+class World(ABC, Generic[S]):
+    """B bodies that take commands and have markers; a stepper (`stepping.rollout`).
+
+    Bodies begin in ``rest``; those that begin again do so by ``world.rest.where(chosen, state)``.
 
     Attributes:
         count: B.
@@ -46,11 +52,10 @@ class World(ABC):
         parts: number n of its values.
         noise: standard deviation of observed markers [m]; None if the caller chooses it.
         travel: (3,) way by which commands may move a body as a whole [m].
-        state: of the bodies.
+        rest: state of the bodies at rest without inputs.
     """
 
-    state: Any
-    _rest: Any  # state from which bodies begin
+    rest: S
     count: int
     time_step: float
     input: str
@@ -58,23 +63,23 @@ class World(ABC):
     noise: float | None = None
     travel: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def begin(self, chosen: BoolArray) -> None:
-        """Brings the chosen bodies (B,) back to rest without inputs."""
-        self.state = self._rest.where(chosen, self.state)
+    @abstractmethod
+    def step(self, state: S, commands: FloatArray) -> S:
+        """Returns the state after one time step under commands (B, n); bodies that fail are lost, and stand at rest."""
 
     @abstractmethod
-    def step(self, commands: FloatArray) -> BoolArray:
-        """Makes one time step under commands (B, n); returns which bodies (B,) have failed since `begin`."""
-
-    @abstractmethod
-    def markers(self) -> FloatArray:
+    def markers(self, state: S) -> FloatArray:
         """Markers (B, M, 3), without noise [m]."""
 
+    def lost(self, state: S) -> BoolArray:
+        """Which bodies (B,) have failed since they began."""
+        return np.asarray(torch.as_tensor(state.lost).cpu().numpy())
+
     def vary(self, random: Sequence[np.random.Generator]) -> None:
-        """Draws new parameters, by a generator for each body; all bodies `begin` afterwards."""
+        """Draws new parameters, by a generator for each body; all bodies begin again afterwards."""
         del random
 
-    def bodies(self) -> tuple[IntArray, FloatArray]:
+    def bodies(self, state: S) -> tuple[IntArray, FloatArray]:
         """Surface triangles (S, 3) and vertices (B, N, 3) [m]; empty if the body is known by its markers only."""
         return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
 
@@ -83,7 +88,7 @@ class World(ABC):
         return ObstacleSurface()
 
 
-class RobotWorld(World):
+class RobotWorld(World[State]):
     """B copies of a robot in its full simulator.
 
     Args:
@@ -121,7 +126,7 @@ class RobotWorld(World):
         self._substeps = round(self.time_step / robot.time_step)
         self._mixed = np.eye(len(robot.inputs[given].parts)) if mixed is None else mixed
         self.parts, self._spread, self._shown = len(self._mixed), spread, shown
-        self.state = self._rest = self._begun()
+        self.rest = self._begun()
 
     @override
     def vary(self, random: Sequence[np.random.Generator]) -> None:
@@ -141,7 +146,7 @@ class RobotWorld(World):
             parameters["poissons_ratio"] = parameters["poissons_ratio"].clip(0.0, 0.499)
         tensor = self._nominal.simulator.tensor
         self.robot = self._nominal.with_parameters(**{name: tensor(values) for name, values in parameters.items()})
-        self._rest = self._begun()
+        self.rest = self._begun()
 
     def _begun(self) -> State:
         with torch.no_grad():
@@ -149,20 +154,20 @@ class RobotWorld(World):
 
     @override
     @torch.no_grad()
-    def step(self, commands: FloatArray) -> BoolArray:
+    def step(self, state: State, commands: FloatArray) -> State:
         inputs = {self.input: commands @ self._mixed}
-        *_, self.state = states(lambda state, _: self.robot.step(state, **inputs), self.state, range(self._substeps))
-        return np.asarray(self.state.lost.cpu().numpy())
+        *_, state = states(lambda now, _: self.robot.step(now, **inputs), state, range(self._substeps))
+        return state
 
     @override
-    def markers(self) -> FloatArray:
-        markers = self.robot.observe(self.state)
+    def markers(self, state: State) -> FloatArray:
+        markers = self.robot.observe(state)
         markers = markers if self._shown is None else markers[:, list(self._shown)]
         return np.asarray(markers.double().cpu().numpy())
 
     @override
-    def bodies(self) -> tuple[IntArray, FloatArray]:
-        return boundary_triangles(self.robot.simulator.body.mesh), self.state.q.double().cpu().numpy()
+    def bodies(self, state: State) -> tuple[IntArray, FloatArray]:
+        return boundary_triangles(self.robot.simulator.body.mesh), state.q.double().cpu().numpy()
 
     @override
     def obstacles(self) -> ObstacleSurface:
@@ -211,7 +216,7 @@ class Laboratory(RobotWorld):
         name: of the input.
         count: B.
         seed: of the noise.
-        on_failure: ``raise``; or ``count``: a body whose simulation fails stays at rest until `begin`.
+        on_failure: ``raise``; or ``count``: a body whose simulation fails stays at rest until it begins again.
     """
 
     noise: float
@@ -230,53 +235,44 @@ class Laboratory(RobotWorld):
         self._frame = kabsch(reference, places)  # from the frame of the body to that of the experiment
 
     @override
-    def markers(self) -> FloatArray:
-        return np.asarray(self._frame.apply(super().markers()))
+    def markers(self, state: State) -> FloatArray:
+        return np.asarray(self._frame.apply(super().markers(state)))
 
     @override
-    def bodies(self) -> tuple[IntArray, FloatArray]:
-        triangles, vertices = super().bodies()
+    def bodies(self, state: State) -> tuple[IntArray, FloatArray]:
+        triangles, vertices = super().bodies(state)
         return triangles, np.asarray(self._frame.apply(vertices))
 
     @override
     def obstacles(self) -> ObstacleSurface:
         return super().obstacles().carried(self._frame)
 
-    def seen(self, number: int) -> FloatArray:
+    def seen(self, state: State, number: int) -> FloatArray:
         """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""
-        markers = self.markers()
+        markers = self.markers(state)
         random = np.random.default_rng([*self._seeds, number])
         return markers + self.noise * random.standard_normal(markers.shape)
 
-    def rest(self, frames: int = 20) -> FloatArray:
+    def seen_at_rest(self, frames: int = 20) -> FloatArray:
         """Returns noisy markers (B, M, 3) averaged over frames taken before anything moves [m]."""
-        return np.asarray(np.mean([self.seen(_BEFORE + number) for number in range(frames)], axis=0))
+        return np.asarray(np.mean([self.seen(self.rest, _BEFORE + number) for number in range(frames)], axis=0))
 
 
-class ReducedWorld(World):
+class ReducedWorld(World[ReducedState]):
     """B copies of a robot's reduced model, a few hundred times as fast as its simulator."""
 
     def __init__(self, model: ReducedModel, count: int) -> None:
         self._model, self.count, self.time_step = model, count, model.time_step
-        self.input, self.parts = model.name, model.parts
-        self._rest = self.state = model.rest(count=count)
+        self.input, self.parts, self.rest = model.name, model.parts, model.rest(count=count)
         self._furthest = _FURTHEST * np.abs(model.static.coefficients).max()
-        self._lost = np.zeros(count, dtype=np.bool_)
 
     @override
-    def begin(self, chosen: BoolArray) -> None:
-        super().begin(chosen)
-        self._lost = self._lost & ~chosen
-
-    @override
-    def step(self, commands: FloatArray) -> BoolArray:
+    def step(self, state: ReducedState, commands: FloatArray) -> ReducedState:
         with np.errstate(over="ignore", invalid="ignore"):
-            self.state = self._model.step(self.state, commands)
-        self._lost = self._lost | ~(np.abs(self.state.z) < self._furthest).all(axis=1)
-        if self._lost.any():
-            super().begin(self._lost)
-        return self._lost
+            after = self._model.step(state, commands)
+        lost = state.lost | ~(np.abs(after.z) < self._furthest).all(axis=1)
+        return replace(self.rest.where(lost, after), lost=lost) if lost.any() else after
 
     @override
-    def markers(self) -> FloatArray:
-        return self._model.observe(self.state).reshape(self.count, -1, 3)
+    def markers(self, state: ReducedState) -> FloatArray:
+        return self._model.observe(state).reshape(self.count, -1, 3)

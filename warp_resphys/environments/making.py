@@ -20,11 +20,11 @@ from ..energies.contact.obstacle_contact import Contact
 from ..energies.contact.obstacles import HalfSpace
 from ..energies.contact.surface_contact import SurfaceContact
 from ..fem.bodies import Body, Rigid
-from ..io.arrays import BoolArray, FloatArray, IntArray
+from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.boxes import box_hexahedra
 from ..mesh.volume_mesh import Mesh, boundary_triangles
-from ..robot.actuation import BASE
+from ..robot.actuation import BASE, Given
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
@@ -45,6 +45,7 @@ RISE: Final = 0.02  # of the gripper [m], which lifts a ball
 SPEED: Final = 0.02  # of the gripper [m/s]: it rises while it closes
 FINGERS: Final = {"left": 0.0, "right": np.pi}  # angles about z [rad]
 BALL: Final = "ball"
+_GRIPPER: Final = "gripper"  # owner of the memory variable of the height
 _RADIUS, _MASS, _YOUNGS_MODULUS = 0.01, 0.01, 1e7  # of the ball [m, kg, Pa]
 _GAP, _BELOW = 1.5e-3, 1.5e-3  # between fingers and ball at rest, and from the fingers down to the table [m]
 _STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED = 5e4, 0.8, 5e-4, 5e-3  # of all contact [Pa, 1, m, m/s]
@@ -73,7 +74,7 @@ def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
     return Mesh(radius * x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0), cube.cells)
 
 
-class GraspWorld(World):
+class GraspWorld(World[State]):
     """B grippers, which take the command of both fingers, and their own height.
 
     The last marker is the middle of the ball.
@@ -91,38 +92,34 @@ class GraspWorld(World):
         self._scene = gripper(robot)
         self.count, self.time_step, self.input = count, time_step, driven
         self._substeps = round(time_step / robot.time_step)
-        self._height = np.zeros(count)
         with torch.no_grad():
-            self.state = self._rest = self._scene.begin(count)
-
-    @override
-    def begin(self, chosen: BoolArray) -> None:
-        super().begin(chosen)
-        self._height = np.where(chosen, 0.0, self._height)
+            rest = self._scene.begin(count)
+            self.rest = rest.with_memory({"height": rest.q.new_zeros(count)}, _GRIPPER)
 
     @override
     @torch.no_grad()
-    def step(self, commands: FloatArray) -> BoolArray:
-        poses = np.zeros((self._substeps, self.count, 6))  # of the base, alike in the frames of both fingers
-        poses[..., 2] = np.linspace(self._height, commands[:, 1], self._substeps + 1)[1:]
+    def step(self, state: State, commands: FloatArray) -> State:
+        height = torch.as_tensor(commands[:, 1]).to(state.q)
+        poses = state.q.new_zeros(self._substeps, self.count, 6)  # of the base, alike in the frames of both fingers
+        for part, pose in enumerate(poses, 1):
+            pose[:, 2] = torch.lerp(state.memory_of(_GRIPPER)["height"], height, part / self._substeps)
 
-        def step(state: State, pose: FloatArray) -> State:
-            inputs = {self.input: commands[:, :1], BASE: pose}
-            return self._scene.step(state, dict.fromkeys(FINGERS, inputs))
+        def step(before: State, pose: torch.Tensor) -> State:
+            inputs: dict[str, Given] = {self.input: commands[:, :1], BASE: pose}
+            return self._scene.step(before, dict.fromkeys(FINGERS, inputs))
 
-        *_, self.state = states(step, self.state, poses)
-        self._height = commands[:, 1].copy()
-        return np.asarray(self.state.lost.cpu().numpy())
+        *_, after = states(step, state, poses)
+        return after.with_memory({"height": height}, _GRIPPER)
 
     @override
-    def markers(self) -> FloatArray:
-        fingers = torch.cat(list(self._scene.observe(self.state).values()), 1)
-        ball = self.state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
+    def markers(self, state: State) -> FloatArray:
+        fingers = torch.cat(list(self._scene.observe(state).values()), 1)
+        ball = state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
         return np.asarray(torch.cat([fingers, ball], 1).double().cpu().numpy())
 
     @override
-    def bodies(self) -> tuple[IntArray, FloatArray]:
-        return boundary_triangles(self._scene.scene.mesh), self.state.q.double().cpu().numpy()
+    def bodies(self, state: State) -> tuple[IntArray, FloatArray]:
+        return boundary_triangles(self._scene.scene.mesh), state.q.double().cpu().numpy()
 
     @override
     def obstacles(self) -> ObstacleSurface:
@@ -181,7 +178,7 @@ def make_vector(
         bodies, mapping = _grippers(*where, frames)
     else:
         bodies, mapping = _bodies(*where, spread, axis if task == "swing_up" else None, shown, seed, frames)
-    rest = bodies.markers()[0]
+    rest = bodies.markers(bodies.rest)[0]
     goals: RobotTask
     if task in ("reach", "follow"):
         point = _tip(robot, rest, tracked, shown)
@@ -229,12 +226,12 @@ def _bodies(
     shown: list[int] | None,
     seed: int,
     frames: int,
-) -> tuple[World, ActionMapping]:
+) -> tuple[World[Any], ActionMapping]:
     """Robots that are driven as in the trials of their run, or whose base moves along an axis, and the map to inputs.
 
     Worlds begin without inputs.
     """
-    bodies: World
+    bodies: World[Any]
     if axis is not None:
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
         bodies = RobotWorld(robot, BASE, count, spread, along, shown)
@@ -251,7 +248,7 @@ def _bodies(
     return bodies, ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
 
 
-def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> tuple[World, ActionMapping]:
+def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> tuple[World[Any], ActionMapping]:
     """Grippers of two fingers each, and the map from actions to their input and height."""
     driven = driven_input(robot)
     if world == "reduced":

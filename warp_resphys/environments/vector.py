@@ -17,6 +17,7 @@ from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..report.layers import INK, Layer, RenderScene, View, body_layers, chain, obstacle_layers
 from ..report.render import Pixels, Renderer
+from ..stepping.rollout import states
 from .tasks import RobotTask
 
 Observation = NDArray[np.float32]
@@ -83,7 +84,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     def __init__(
         self,
-        world: World,
+        world: World[Any],
         task: RobotTask,
         mapping: ActionMapping,
         tracked: FloatArray,
@@ -104,8 +105,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._up = np.asarray(up, dtype=np.float64)
         self._camera: Camera | None = None
         self._mode = mode
-        world.begin(np.ones(world.count, dtype=np.bool_))
-        self.rests = world.markers()
+        self._state = world.rest
+        self.rests = world.markers(self._state)
         width = 2 * self.rests[0].size + world.parts + task.width
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)
@@ -146,20 +147,20 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     def _begin(self, chosen: BoolArray) -> None:
         assert self._random is not None
-        self.world.begin(chosen)
+        self._state = self.world.rest.where(chosen, self._state)
         for row in np.flatnonzero(chosen):
             self.task.begin(int(row), self._random[row])
         self._commands[chosen] = self._mapping.start
         self._number[chosen], self._over[chosen] = 0, False
         rows = chosen[:, None, None]
-        self.rests = np.where(rows, self.world.markers(), self.rests)
+        self.rests = np.where(rows, self.world.markers(self._state), self.rests)
         seen = self._cameras(chosen)
         self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
 
     def _cameras(self, chosen: BoolArray) -> FloatArray:
         """Observed markers (B, M, 3) [m], with noise for the chosen robots."""
         assert self._random is not None
-        markers = self.world.markers().copy()
+        markers = self.world.markers(self._state).copy()
         if self._noise:
             for row in np.flatnonzero(chosen):
                 markers[row] += self._noise * self._random[row].standard_normal(markers[row].shape)
@@ -168,7 +169,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     @property
     def _points(self) -> FloatArray:
         """Points (B, 3) of the task, without noise [m]."""
-        return np.asarray(self.world.markers().reshape(self.num_envs, -1) @ self.tracked.T)
+        return np.asarray(self.world.markers(self._state).reshape(self.num_envs, -1) @ self.tracked.T)
 
     def _errors(self) -> FloatArray:
         """Distances (B,) of the points from their current goals [mm]."""
@@ -186,8 +187,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             return None
         if self._random is None:
             raise InputError("the environment was not reset: call env.reset(seed=...) before env.render().")
-        triangles, vertices = self.world.bodies()
-        markers, number = self.world.markers(), self._number
+        triangles, vertices = self.world.bodies(self._state)
+        markers, number = self.world.markers(self._state), self._number
         wanted = [self.task.wanted(row, int(number[row])) for row in range(self.num_envs)]
         if self._camera is None:
             # The frame of the first robot, with the size of the task to all sides.
@@ -239,11 +240,12 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         if self._mode is AutoresetMode.DISABLED and self._over.any():
             raise InputError("an episode is over: reset it with options={'reset_mask': ...} before the next step.")
         wanted = mapping.low + 0.5 * (np.clip(given, -1.0, 1.0) + 1.0) * (mapping.high - mapping.low)
-        most, last = mapping.rate * self.world.time_step, self._commands.copy()
-        lost = np.zeros(self.num_envs, dtype=np.bool_)
-        for _ in range(mapping.frames):
-            self._commands = self._commands + np.clip(wanted - self._commands, -most, most)
-            lost |= self.world.step(self._commands)
+        last, frames = self._commands.copy(), np.arange(1, mapping.frames + 1)[:, None, None]
+        most = mapping.rate * self.world.time_step * frames
+        commands = last + np.clip(wanted - last, -most, most)  # (F, B, n)
+        *_, self._state = states(self.world.step, self._state, commands)
+        self._commands = commands[-1]
+        lost = self.world.lost(self._state)
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         changed = (self._commands - last) / (mapping.high - mapping.low)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
+
+T = TypeVar("T")
 
 QUIET_SECONDS = 2.0  # for ``after`` of work that is mostly short
 _BAR_SECONDS = 0.1
@@ -142,6 +144,12 @@ class Progress:
             self._show(now)
         if self._bars is not None:
             self._bars.stop()
+
+    def each(self, items: Iterable[T]) -> Iterator[T]:
+        """Yields items, and counts each of them when the next one is asked for."""
+        for item in items:
+            yield item
+            self.advance()
 
     def advance(self, count: int = 1, **fields: object) -> None:
         """Counts further units; `fields` are named values to show, such as a loss."""

@@ -20,27 +20,16 @@ _AHEAD = 0.3  # prediction horizon of the validation [s]
 
 @dataclass(frozen=True)
 class LinearModel:
-    """s' = A s + B u, y = y_0 + C s, with a state s of delayed markers and inputs u in units of `scale`.
+    """s' = A s + B u, y = y_0 + C s, with a state s of delayed markers and inputs u in units of `scale`."""
 
-    Attributes:
-        time_step: h [s].
-        scale: (n,) of the inputs.
-        rest: (3 M,) y_0, markers without inputs [m].
-        basis: (D 3 M, q) orthonormal; projects D frames of markers, latest first, to s.
-        a: (q, q).
-        b: (q, n).
-        c: (3 M, q).
-        validation_mm: mean prediction error on the validation trials [mm].
-    """
-
-    time_step: float
-    scale: FloatArray
-    rest: FloatArray
-    basis: FloatArray
-    a: FloatArray
-    b: FloatArray
-    c: FloatArray
-    validation_mm: float
+    time_step: float  # h [s]
+    scale: FloatArray  # (n,) of the inputs
+    rest: FloatArray  # (3 M,) y_0, markers without inputs [m]
+    basis: FloatArray  # (D 3 M, q) orthonormal; projects D frames of markers, latest first, to s
+    a: FloatArray  # (q, q)
+    b: FloatArray  # (q, n)
+    c: FloatArray  # (3 M, q)
+    validation_mm: float  # mean prediction error on the validation trials [mm]
 
     @property
     def parts(self) -> int:

@@ -93,27 +93,18 @@ class ReducedForce:
 
     The network's inputs are [p(u) + E(u) (z - z_0(u), z'), t + S (u, m)], standardised and clipped to the training
     range, with m the filtered inputs. Beyond the range a force on an identified law fades out.
-
-    Attributes:
-        network: predicts a force in reduced modes.
-        range_: of its inputs; None for no clipping.
-        places: p, (m,), standardised position and velocity modes at rest where z = z_0(u).
-        seen: E, (m, 2 r).
-        conditions: t, (k,), the network's standardised inputs beside the state, at u = 0.
-        conditions_by: S, (k, n (1 + F)), their derivatives by the inputs and the filtered inputs; empty where the
-            network takes no inputs.
-        usual: c_0, (c,).
-        push: G, (r, c).
     """
 
-    network: StateMap
-    range_: Range | None
-    places: Polynomial
-    seen: Polynomial
-    conditions: FloatArray
+    network: StateMap  # predicts a force in reduced modes
+    range_: Range | None  # of its inputs; None for no clipping
+    places: Polynomial  # p, (m,), standardised position and velocity modes at rest where z = z_0(u)
+    seen: Polynomial  # E, (m, 2 r)
+    conditions: FloatArray  # t, (k,), the network's standardised inputs beside the state, at u = 0
+    # S, (k, n (1 + F)), their derivatives by the inputs and the filtered inputs; empty where the network takes no
+    # inputs
     conditions_by: FloatArray
-    usual: Polynomial
-    push: Polynomial
+    usual: Polynomial  # c_0, (c,)
+    push: Polynomial  # G, (r, c)
 
     @cached_property
     def outputs(self) -> Evaluator:

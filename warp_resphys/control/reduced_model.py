@@ -53,29 +53,17 @@ _MOVED: Final = 1e-4  # root mean square displacement of the vertices for deriva
 
 @dataclass(frozen=True)
 class ReducedState:
-    """The state of B reduced models.
+    """The state of B reduced models."""
 
-    Attributes:
-        z: (B, r) coordinates.
-        v: (B, r) their rates [1/s].
-        strains: (K, B, r) y_k of the Prony branches.
-        acting: (B, n') moving inputs after their response to the commands, in units of the model's scale.
-        memory: of the inputs' response, entries (..., B, n).
-        previous: (2, B, r) coordinates and rates one step earlier.
-        looks_back: (B,) whether the integrator may use ``previous``; false before the first step.
-        left: (B,) whether the learned force was ever evaluated outside its training range.
-        lost: (B,) whether a world has found that the model diverged; it stands at rest then.
-    """
-
-    z: FloatArray
-    v: FloatArray
-    strains: FloatArray
-    acting: FloatArray
-    memory: Mapping[str, FloatArray]
-    previous: FloatArray
-    looks_back: BoolArray
-    left: BoolArray
-    lost: BoolArray
+    z: FloatArray  # (B, r) coordinates
+    v: FloatArray  # (B, r) their rates [1/s]
+    strains: FloatArray  # (K, B, r) y_k of the Prony branches
+    acting: FloatArray  # (B, n') moving inputs after their response to the commands, in units of the model's scale
+    memory: Mapping[str, FloatArray]  # of the inputs' response, entries (..., B, n)
+    previous: FloatArray  # (2, B, r) coordinates and rates one step earlier
+    looks_back: BoolArray  # (B,) whether the integrator may use ``previous``; false before the first step
+    left: BoolArray  # (B,) whether the learned force was ever evaluated outside its training range
+    lost: BoolArray  # (B,) whether a world has found that the model diverged; it stands at rest then
 
     def moved(self, z: FloatArray, v: FloatArray, time_step: float) -> "ReducedState":
         """Returns the state with its coordinates (B, r) and rates changed at once, and a past that fits them."""
@@ -107,53 +95,30 @@ class ReducedState:
 
 @dataclass(frozen=True)
 class ReducedModel:
-    """The reduced model of a robot; the module's docstring has the equations.
+    """The reduced model of a robot; the module's docstring has the equations."""
 
-    Attributes:
-        time_step: h [s].
-        integrator: ``implicit_euler`` or ``bdf2``.
-        labels: of the M observed points.
-        name: of the input.
-        scale: (n,) of the inputs.
-        range: (2, n) least and largest commands of the trials; the model depends on the n' that differ.
-        acts: arguments of `InputResponse`, from the commands to the inputs.
-        filters: F time constants of the filtered inputs that the network takes [s].
-        times: K relaxation times tau_k of the Prony branches [s].
-        static: z_0, (r,).
-        observed: y_0, (3 M,) [m].
-        stiffness: A, (r, r) [1/s^2].
-        damping: D, (r, r) [1/s].
-        shown: C, (3 M, r) [m].
-        branches: B_k, (K, r, r) [1/s^2].
-        shape: x_0, (3 N,) displacements of the vertices [m].
-        basis: Psi, (3 N, r).
-        curved: H, (r, r, 3 M), symmetric [m].
-        force: the learned force; None for a simulator alone.
-        quality: errors, and counts of the samples that the model was fitted to.
-        robot: `reduction.fingerprint` of its robot.
-    """
-
-    time_step: float
-    integrator: str
-    labels: tuple[str, ...]
-    name: str
-    scale: FloatArray
-    range: FloatArray
-    acts: Mapping[str, Any]
-    filters: tuple[float, ...]
-    times: tuple[float, ...]
-    static: Polynomial
-    observed: Polynomial
-    stiffness: Polynomial
-    damping: SquaredPolynomial
-    shown: Polynomial
-    branches: SquaredPolynomial
-    shape: Polynomial
-    basis: FloatArray
-    curved: FloatArray
-    force: ReducedForce | None = None
+    time_step: float  # h [s]
+    integrator: str  # ``implicit_euler`` or ``bdf2``
+    labels: tuple[str, ...]  # of the M observed points
+    name: str  # of the input
+    scale: FloatArray  # (n,) of the inputs
+    range: FloatArray  # (2, n) least and largest commands of the trials; the model depends on the n' that differ
+    acts: Mapping[str, Any]  # arguments of `InputResponse`, from the commands to the inputs
+    filters: tuple[float, ...]  # F time constants of the filtered inputs that the network takes [s]
+    times: tuple[float, ...]  # K relaxation times tau_k of the Prony branches [s]
+    static: Polynomial  # z_0, (r,)
+    observed: Polynomial  # y_0, (3 M,) [m]
+    stiffness: Polynomial  # A, (r, r) [1/s^2]
+    damping: SquaredPolynomial  # D, (r, r) [1/s]
+    shown: Polynomial  # C, (3 M, r) [m]
+    branches: SquaredPolynomial  # B_k, (K, r, r) [1/s^2]
+    shape: Polynomial  # x_0, (3 N,) displacements of the vertices [m]
+    basis: FloatArray  # Psi, (3 N, r)
+    curved: FloatArray  # H, (r, r, 3 M), symmetric [m]
+    force: ReducedForce | None = None  # the learned force; None for a simulator alone
+    # errors, and counts of the samples that the model was fitted to
     quality: Mapping[str, Any] = field(default_factory=dict)
-    robot: str = ""
+    robot: str = ""  # `reduction.fingerprint` of its robot
 
     @property
     def modes(self) -> int:

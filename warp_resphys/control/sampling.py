@@ -33,41 +33,25 @@ _FASTEST, _FAST, _SLOWEST = 0.05, 0.25, 0.45
 
 @dataclass(frozen=True)
 class Motions:
-    """B sampled motions over T steps.
+    """B sampled motions over T steps."""
 
-    Attributes:
-        q: (T + 1, B, N, 3) [m].
-        v: (T + 1, B, N, 3) [m/s].
-        y: (T + 1, B, 3 M) observed points [m].
-        commands: (T, B, n) in the unit of the input.
-        acting: (T, B, n') moving inputs after their response to the commands, in units of the scale.
-    """
-
-    q: torch.Tensor
-    v: torch.Tensor
-    y: FloatArray
-    commands: FloatArray
-    acting: FloatArray
+    q: torch.Tensor  # (T + 1, B, N, 3) [m]
+    v: torch.Tensor  # (T + 1, B, N, 3) [m/s]
+    y: FloatArray  # (T + 1, B, 3 M) observed points [m]
+    commands: FloatArray  # (T, B, n) in the unit of the input
+    acting: FloatArray  # (T, B, n') moving inputs after their response to the commands, in units of the scale
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """Linearisation about an equilibrium, in the basis of its slowest vibrations.
+    """Linearisation about an equilibrium, in the basis of its slowest vibrations."""
 
-    Attributes:
-        shapes: (3 N, r), orthonormal in the mass.
-        stiffness: (r, r) [1/s^2].
-        damping: (r, r) [1/s].
-        shown: (3 M, r) derivatives of the observed points with respect to the vibrations' amplitudes.
-        branches: (K, r, r) of the Prony branches [1/s^2].
-        push: (r, c) derivatives of the force with respect to the network's outputs; None without a network.
-    """
-
-    shapes: torch.Tensor
-    stiffness: FloatArray
-    damping: FloatArray
-    shown: FloatArray
-    branches: FloatArray
+    shapes: torch.Tensor  # (3 N, r), orthonormal in the mass
+    stiffness: FloatArray  # (r, r) [1/s^2]
+    damping: FloatArray  # (r, r) [1/s]
+    shown: FloatArray  # (3 M, r) derivatives of the observed points with respect to the vibrations' amplitudes
+    branches: FloatArray  # (K, r, r) of the Prony branches [1/s^2]
+    # (r, c) derivatives of the force with respect to the network's outputs; None without a network
     push: FloatArray | None
 
     def slowest(self, modes: int) -> "Tangent":

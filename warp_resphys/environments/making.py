@@ -188,8 +188,7 @@ def make_vector(
     else:
         point = np.eye(3, rest.size, rest.size - 3) if task == "grasp" else _tip(robot, rest, tracked, shown)
         goals = _lift(robot, num_envs, up, point @ rest.ravel(), task == "grasp")
-    deviation = noise if bodies.noise is None else bodies.noise
-    return RobotVectorEnv(bodies, goals, mapping, point, actions, deviation, autoreset_mode, render_mode, up)
+    return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
 
 
 def _lift(robot: Robot, count: int, up: FloatArray, place: FloatArray, grasps: bool) -> SwingTask:

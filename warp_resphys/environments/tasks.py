@@ -19,15 +19,10 @@ _OF_REACH: Final = 0.6  # size of a figure, as a share of the reach
 
 @dataclass(frozen=True)
 class Reach:
-    """Positions of a point of a robot in equilibrium.
+    """Positions of a point of a robot in equilibrium."""
 
-    Attributes:
-        places: (S, 3) sampled positions [m].
-        actions: (S, n) of the inputs, from -1 to 1.
-    """
-
-    places: FloatArray
-    actions: FloatArray
+    places: FloatArray  # (S, 3) sampled positions [m]
+    actions: FloatArray  # (S, n) of the inputs, from -1 to 1
 
     @property
     def size(self) -> float:

@@ -35,21 +35,13 @@ _BEFORE: Final = {"goals": 4.0, "markers": 5.0}  # shift towards the camera, in 
 
 @dataclass(frozen=True)
 class ActionMapping:
-    """Map from actions to the input of a world.
+    """Map from actions to the input of a world."""
 
-    Attributes:
-        low: (n,) of the input, at actions of -1.
-        high: (n,) of the input, at actions of 1.
-        rate: (n,) largest change of the input per second.
-        start: (n,) of the input before the first action.
-        frames: number of simulation steps of an action.
-    """
-
-    low: FloatArray
-    high: FloatArray
-    rate: FloatArray
-    start: FloatArray
-    frames: int
+    low: FloatArray  # (n,) of the input, at actions of -1
+    high: FloatArray  # (n,) of the input, at actions of 1
+    rate: FloatArray  # (n,) largest change of the input per second
+    start: FloatArray  # (n,) of the input before the first action
+    frames: int  # number of simulation steps of an action
 
 
 class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
@@ -65,7 +57,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         mapping: from actions to the input of the world.
         tracked: (3, 3 M) from the markers to the point of the task.
         actions: number A of actions of an episode.
-        noise: standard deviation of observed coordinates [m].
+        noise: standard deviation of observed coordinates [m], if the world has none.
         autoreset_mode: when episodes are reset, as in Gymnasium.
         render_mode: ``rgb_array`` for pictures, or None.
         up: (3,) upward direction of the pictures.
@@ -97,7 +89,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         if render_mode not in (None, *RENDER_MODES):
             raise InputError(f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays.")
         self.world, self.task, self._mapping, self.tracked = world, task, mapping, tracked
-        self.actions, self.frames, self._noise = actions, mapping.frames, noise
+        self.actions, self.frames = actions, mapping.frames
+        self._noise = noise if world.noise is None else world.noise
         self.num_envs, self.render_mode = world.count, render_mode
         mode = AutoresetMode(autoreset_mode)
         rate = round(1.0 / (world.time_step * mapping.frames))

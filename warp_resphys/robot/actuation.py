@@ -172,19 +172,14 @@ class InputReader:
 
 @dataclass(frozen=True)
 class Acting:
-    """Inputs that act during a step of B environments.
+    """Inputs that act during a step of B environments."""
 
-    Attributes:
-        inputs: of the simulator.
-        conditions: (B, A) inputs of the network beside the state; None if it has none.
-        memory: memory variables of the robot's actuators and base after the step (`State.memory_of`), such as
-            ``pressure.queue`` (B, K, C), see `InputResponse`, and ``base`` (B, 2, 6) [m, rad].
-        base: (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved.
-    """
-
-    inputs: Inputs
-    conditions: torch.Tensor | None
+    inputs: Inputs  # of the simulator
+    conditions: torch.Tensor | None  # (B, A) inputs of the network beside the state; None if it has none
+    # memory variables of the robot's actuators and base after the step (`State.memory_of`), such as ``pressure.queue``
+    # (B, K, C), see `InputResponse`, and ``base`` (B, 2, 6) [m, rad]
     memory: dict[str, torch.Tensor]
+    # (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved
     base: torch.Tensor | None
 
 

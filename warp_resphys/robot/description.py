@@ -58,53 +58,34 @@ _SETTINGS: Final[Mapping[str, type[Settings]]] = {
 
 @dataclass(frozen=True)
 class Description:
-    """Everything that defines a robot.
+    """Everything that defines a robot."""
 
-    Attributes:
-        name: of the experiment and the run.
-        model: name of the experiment's model, such as ``resphys``.
-        settings: of its simulator, without mesh and device.
-        material: of its body, before identification.
-        mesh: rest shape.
-        parameters: identified values by name, see `learning.parameters`.
-        uncertainty: standard deviations and correlations of the parameters, if identification estimated them.
-        payload_at: the vertices that a payload hangs on; None for none.
-        markers: settings of the markers; None if every vertex is observed.
-        labels: of the M markers.
-        sets: groups of markers, by their numbers.
-        bound: (M, 3) positions of the markers on the undeformed body [m].
-        placement: identified positions of the markers, in the form of `Placement.plain`.
-        learned: the network, with its input range and the frame of its forces; None for a simulator alone.
-        filters: time constants of the filtered inputs that the network takes [s].
-        sees_payload: whether the network takes the payload.
-        told_of_base: (15,) which of the numbers of `frames.base_movement` the network takes; None for none.
-        seen: by input, the least and the largest value of each part in the experiment's trials.
-        intervals: half-widths of the markers' prediction intervals, at `level`.
-        level: nominal coverage of the intervals.
-        errors_mm: of the model in the test trials, as in errors.json.
-    """
-
-    name: str
-    model: str
-    settings: SimulatorSettings
-    material: MaterialSettings
-    mesh: Mesh
+    name: str  # of the experiment and the run
+    model: str  # name of the experiment's model, such as ``resphys``
+    settings: SimulatorSettings  # of its simulator, without mesh and device
+    material: MaterialSettings  # of its body, before identification
+    mesh: Mesh  # rest shape
+    # identified values by name, see `learning.parameters`
     parameters: Mapping[str, float] = field(default_factory=dict)
+    # standard deviations and correlations of the parameters, if identification estimated them
     uncertainty: Mapping[str, Any] | None = None
-    payload_at: PlaceSettings | None = None
-    markers: MarkerSettings | None = None
-    labels: tuple[str, ...] = ()
-    sets: tuple[tuple[int, ...], ...] = ()
-    bound: torch.Tensor | None = None
-    placement: Mapping[str, Any] | None = None
+    payload_at: PlaceSettings | None = None  # the vertices that a payload hangs on; None for none
+    markers: MarkerSettings | None = None  # settings of the markers; None if every vertex is observed
+    labels: tuple[str, ...] = ()  # of the M markers
+    sets: tuple[tuple[int, ...], ...] = ()  # groups of markers, by their numbers
+    bound: torch.Tensor | None = None  # (M, 3) positions of the markers on the undeformed body [m]
+    placement: Mapping[str, Any] | None = None  # identified positions of the markers, in the form of `Placement.plain`
+    # the network, with its input range and the frame of its forces; None for a simulator alone
     learned: Learned | None = None
-    filters: tuple[float, ...] = ()
-    sees_payload: bool = False
+    filters: tuple[float, ...] = ()  # time constants of the filtered inputs that the network takes [s]
+    sees_payload: bool = False  # whether the network takes the payload
+    # (15,) which of the numbers of `frames.base_movement` the network takes; None for none
     told_of_base: tuple[bool, ...] | None = None
+    # by input, the least and the largest value of each part in the experiment's trials
     seen: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
-    intervals: Intervals | None = None
-    level: float = LEVEL
-    errors_mm: Mapping[str, Any] = field(default_factory=dict)
+    intervals: Intervals | None = None  # half-widths of the markers' prediction intervals, at `level`
+    level: float = LEVEL  # nominal coverage of the intervals
+    errors_mm: Mapping[str, Any] = field(default_factory=dict)  # of the model in the test trials, as in errors.json
 
     def simulator(self, device: torch.device, on_failure: str) -> Simulator:
         """Builds the simulator."""

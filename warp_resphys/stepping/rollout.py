@@ -1,9 +1,9 @@
 """The roll-out of everything that moves step by step.
 
 A stepper is a function (state, inputs of a step) -> next state: the ``step`` of a simulator, a corrected simulator, a
-robot, a scene or a reduced model. All that a step depends on is in the state and the inputs, so that a roll-out is
-differentiable, and continues from any of its states. Where a step depends on its number, as with windows that begin
-anew, its inputs are that number.
+robot, a scene, a reduced model or a world. All that a step depends on is in the state and the inputs, so that a
+roll-out is differentiable, and continues from any of its states. Where a step depends on its number, as with windows
+that begin anew, its inputs are that number.
 """
 
 from collections.abc import Callable, Iterable, Iterator

@@ -13,25 +13,15 @@ JUMPS: Final = "jumps of the whole body"
 
 @dataclass(frozen=True)
 class Correction:
-    """The result of a frame of M markers.
+    """The result of a frame of M markers."""
 
-    Attributes:
-        seen: (M,) markers in the frame.
-        refused: (M,) markers that were left out, since they jumped.
-        moved: (M,) markers that have moved on the body, to where they are looked for from now on.
-        restarted: whether the body has moved to where markers stayed, so that its state was unknown.
-        off: (M,) distances from where the corrected simulator expected them [m], NaN where not seen.
-        free: (M, 3) offsets from the simulator that sees no markers [m], NaN where not seen.
-        worse: whether these have been much smaller for a while, so that it went on from there.
-    """
-
-    seen: BoolArray
-    refused: BoolArray
-    moved: BoolArray
-    restarted: bool
-    off: FloatArray
-    free: FloatArray
-    worse: bool
+    seen: BoolArray  # (M,) markers in the frame
+    refused: BoolArray  # (M,) markers that were left out, since they jumped
+    moved: BoolArray  # (M,) markers that have moved on the body, to where they are looked for from now on
+    restarted: bool  # whether the body has moved to where markers stayed, so that its state was unknown
+    off: FloatArray  # (M,) distances from where the corrected simulator expected them [m], NaN where not seen
+    free: FloatArray  # (M, 3) offsets from the simulator that sees no markers [m], NaN where not seen
+    worse: bool  # whether these have been much smaller for a while, so that it went on from there
 
     def faults(self, labels: Sequence[str]) -> list[str]:
         """Returns what was wrong with the markers, whose names are empty where all vertices are observed."""
@@ -44,25 +34,16 @@ class Correction:
 
 @dataclass(frozen=True, kw_only=True)
 class Belief:
-    """Estimate of a robot's state after a step, with its covariance.
+    """Estimate of a robot's state after a step, with its covariance."""
 
-    Attributes:
-        parameters: (P,) refined values.
-        bias: (r,) shift of the equilibrium.
-        places: (M, 3) markers from where they are bound [m].
-        covariance: (n, n) of the errors of z, w, b, parameters and places.
-        since: (M,) for how long markers have been left out [s].
-        left: (M, 3) what was left of the distance of markers when they were last believed [m]; NaN for never.
-        squares: (2,) mean squared distances of markers from where they were expected, and from the simulator without
-            markers, over the last frames [m^2].
-        shaken: factor of the variance that a step adds, by which past frames would have been as far off as expected.
-    """
-
-    parameters: FloatArray
-    bias: FloatArray
-    places: FloatArray
-    covariance: FloatArray
-    since: FloatArray
-    left: FloatArray
+    parameters: FloatArray  # (P,) refined values
+    bias: FloatArray  # (r,) shift of the equilibrium
+    places: FloatArray  # (M, 3) markers from where they are bound [m]
+    covariance: FloatArray  # (n, n) of the errors of z, w, b, parameters and places
+    since: FloatArray  # (M,) for how long markers have been left out [s]
+    left: FloatArray  # (M, 3) what was left of the distance of markers when they were last believed [m]; NaN for never
+    # (2,) mean squared distances of markers from where they were expected, and from the simulator without markers, over
+    # the last frames [m^2]
     squares: FloatArray
+    # factor of the variance that a step adds, by which past frames would have been as far off as expected
     shaken: float = 1.0

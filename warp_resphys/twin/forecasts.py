@@ -37,19 +37,12 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Forecast:
-    """A robot in the T steps to come, under constant commands.
+    """A robot in the T steps to come, under constant commands."""
 
-    Attributes:
-        times: (T + 1,) from the last step on [s].
-        markers: (T + 1, M, 3) [m].
-        deviations: (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions.
-        state: at the end, one environment.
-    """
-
-    times: FloatArray
-    markers: FloatArray
-    deviations: FloatArray
-    state: State
+    times: FloatArray  # (T + 1,) from the last step on [s]
+    markers: FloatArray  # (T + 1, M, 3) [m]
+    deviations: FloatArray  # (M, 3) of the coordinates at the end [m], scaled by the errors of past predictions
+    state: State  # at the end, one environment
 
 
 @dataclass(frozen=True)

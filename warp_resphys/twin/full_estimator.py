@@ -39,21 +39,13 @@ _SEEN_STEP: Final = 1e-4  # of differences of markers, over the size of the body
 
 @dataclass(frozen=True, kw_only=True)
 class FullBelief(Belief):
-    """Estimate of the state of a full simulator.
+    """Estimate of the state of a full simulator."""
 
-    Attributes:
-        state: of 2 + P environments: the estimate, the P with another parameter, and the one without markers.
-        transition: (2 r, 3 r) of the errors (z, w) by (z, w, b) in a step.
-        turn: number of the column of it that is renewed next.
-        pause: steps between two renewals: few while they change the transition.
-        wait: steps until the next one.
-    """
-
-    state: State
-    transition: FloatArray
-    turn: int = 0
-    pause: int = 1
-    wait: int = 0
+    state: State  # of 2 + P environments: the estimate, the P with another parameter, and the one without markers
+    transition: FloatArray  # (2 r, 3 r) of the errors (z, w) by (z, w, b) in a step
+    turn: int = 0  # number of the column of it that is renewed next
+    pause: int = 1  # steps between two renewals: few while they change the transition
+    wait: int = 0  # steps until the next one
 
 
 class FullEstimator(TwinEstimator[FullBelief]):

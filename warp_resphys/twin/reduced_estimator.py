@@ -24,13 +24,9 @@ _SLOWEST = 1.0  # least frequency of a coordinate, for the scale of its errors [
 
 @dataclass(frozen=True, kw_only=True)
 class ReducedBelief(Belief):
-    """Estimate of the state of a reduced model.
+    """Estimate of the state of a reduced model."""
 
-    Attributes:
-        state: of two models: the estimate, and the one without markers.
-    """
-
-    state: ReducedState
+    state: ReducedState  # of two models: the estimate, and the one without markers
 
 
 class ReducedEstimator(TwinEstimator[ReducedBelief]):

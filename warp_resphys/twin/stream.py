@@ -31,18 +31,13 @@ _FIRST: Final = 20  # frames whose median is registered
 
 @dataclass(frozen=True)
 class Packet:
-    """Markers and commands at a time.
+    """Markers and commands at a time."""
 
-    Attributes:
-        time: [s].
-        markers: positions (3,) [m] by name, NaN where a marker is not seen; empty without a frame.
-        inputs: commands by name, in SI units.
-        plan: times [s] and commands to come; None leaves the last plan.
-    """
-
-    time: float
+    time: float  # [s]
+    # positions (3,) [m] by name, NaN where a marker is not seen; empty without a frame
     markers: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Mapping[str, Any] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)  # commands by name, in SI units
+    # times [s] and commands to come; None leaves the last plan
     plan: Sequence[tuple[float, Mapping[str, Any]]] | None = None
 
     @classmethod

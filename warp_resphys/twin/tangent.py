@@ -29,27 +29,16 @@ _SLOWEST: Final = 1.0  # least frequency of a mode, for the scale of its errors 
 
 @dataclass(frozen=True)
 class StepTangent:
-    """A step in coordinates z, their rates w, and a force that shifts their equilibrium by b, all (r,).
+    """A step in coordinates z, their rates w, and a force that shifts their equilibrium by b, all (r,)."""
 
-    Attributes:
-        shapes: (r, N, 3) of the vibrations, orthonormal in the mass.
-        pull: (r, N, 3) forces that shift the equilibrium by one unit of each coordinate [N].
-        frequencies: (r,) [rad/s].
-        transition: (2 r, 3 r) of (z, w) after a step by (z, w, b) before it, at rest.
-        size: root mean square displacement of the body per unit of a coordinate [m].
-        amounts: (3 r,) of z, w and b in the differences.
-        duals: (3 F, r) from the free vertices to the coordinates.
-        free: (F,) numbers of the free vertices.
-    """
-
-    shapes: torch.Tensor
-    pull: torch.Tensor
-    frequencies: FloatArray
-    transition: FloatArray
-    size: float
-    amounts: FloatArray
-    duals: FloatArray
-    free: torch.Tensor
+    shapes: torch.Tensor  # (r, N, 3) of the vibrations, orthonormal in the mass
+    pull: torch.Tensor  # (r, N, 3) forces that shift the equilibrium by one unit of each coordinate [N]
+    frequencies: FloatArray  # (r,) [rad/s]
+    transition: FloatArray  # (2 r, 3 r) of (z, w) after a step by (z, w, b) before it, at rest
+    size: float  # root mean square displacement of the body per unit of a coordinate [m]
+    amounts: FloatArray  # (3 r,) of z, w and b in the differences
+    duals: FloatArray  # (3 F, r) from the free vertices to the coordinates
+    free: torch.Tensor  # (F,) numbers of the free vertices
 
     @classmethod
     def of(cls, robot: Robot, state: State, inputs: Mapping[str, Given], modes: int) -> "StepTangent":

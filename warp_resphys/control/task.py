@@ -60,21 +60,13 @@ _LETTERS: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Path:
-    """A plane curve.
+    """A plane curve."""
 
-    Attributes:
-        name: ``circle``, ``eight`` or a capital letter.
-        size: of its larger side [m].
-        centre: (3,) of its bounding box [m].
-        right: (3,) the direction of its width.
-        up: (3,) the direction of its height; made perpendicular to ``right``.
-    """
-
-    name: str
-    size: float
-    centre: Sequence[float]
-    right: Sequence[float] = (1.0, 0.0, 0.0)
-    up: Sequence[float] = (0.0, 1.0, 0.0)
+    name: str  # ``circle``, ``eight`` or a capital letter
+    size: float  # of its larger side [m]
+    centre: Sequence[float]  # (3,) of its bounding box [m]
+    right: Sequence[float] = (1.0, 0.0, 0.0)  # (3,) the direction of its width
+    up: Sequence[float] = (0.0, 1.0, 0.0)  # (3,) the direction of its height; made perpendicular to ``right``
 
     @property
     def points(self) -> FloatArray:

@@ -44,24 +44,15 @@ class World(ABC, Generic[S]):
     """B bodies that take commands and have markers; a stepper (`stepping.rollout`).
 
     Bodies begin in ``rest``; those that begin again do so by ``world.rest.where(chosen, state)``.
-
-    Attributes:
-        count: B.
-        time_step: h [s].
-        input: name of the commanded input.
-        parts: number n of its values.
-        noise: standard deviation of observed markers [m]; None if the caller chooses it.
-        travel: (3,) way by which commands may move a body as a whole [m].
-        rest: state of the bodies at rest without inputs.
     """
 
-    rest: S
-    count: int
-    time_step: float
-    input: str
-    parts: int
-    noise: float | None = None
-    travel: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rest: S  # state of the bodies at rest without inputs
+    count: int  # B
+    time_step: float  # h [s]
+    input: str  # name of the commanded input
+    parts: int  # number n of its values
+    noise: float | None = None  # standard deviation of observed markers [m]; None if the caller chooses it
+    travel: tuple[float, float, float] = (0.0, 0.0, 0.0)  # (3,) way by which commands may move a body as a whole [m]
 
     @abstractmethod
     def step(self, state: S, commands: FloatArray) -> S:

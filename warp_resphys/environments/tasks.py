@@ -43,15 +43,10 @@ class Reach:
 
 
 class RobotTask(ABC):
-    """A task of B robots, with a goal for each.
+    """A task of B robots, with a goal for each."""
 
-    Attributes:
-        size: scale of observed positions [m].
-        width: number of observed values of the task.
-    """
-
-    size: float
-    width: int
+    size: float  # scale of observed positions [m]
+    width: int  # number of observed values of the task
 
     @abstractmethod
     def begin(self, row: int, random: np.random.Generator) -> None:

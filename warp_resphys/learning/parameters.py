@@ -161,9 +161,9 @@ def _by_part(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> di
             continue
         constant, part = of_parts[name]
         if constant not in by_part:
-            own = parameters[constant] if constant in parameters else simulator.tensor(simulator.constants[constant])
-            own = own[:, None] if constant in parameters else simulator.parameters[constant].shaped(own)
-            by_part[constant] = list(own.expand(len(value), simulator.counts[constant]).unbind(1))
+            common = parameters[constant] if constant in parameters else simulator.tensor(simulator.constants[constant])
+            common = common[:, None] if constant in parameters else simulator.parameters[constant].shaped(common)
+            by_part[constant] = list(common.expand(len(value), simulator.counts[constant]).unbind(1))
         by_part[constant][part] = value
     return {name: torch.stack(columns, 1) for name, columns in by_part.items()}
 

@@ -112,9 +112,9 @@ def _bounds_of_owners(ranges: Mapping[str, Bounds], dataset: Trials, names: Sequ
     """Bounds of all parameters, and of the values of trials and sessions."""
     owners = {"session": list(dict.fromkeys(map(dataset.session, names))), "trial": [*names]}
     return {
-        own: limits
+        full: limits
         for name, limits in ranges.items()
-        for own in ([own_name(name, owner) for owner in owners[limits.per]] if limits.per in owners else [name])
+        for full in ([own_name(name, owner) for owner in owners[limits.per]] if limits.per in owners else [name])
     }
 
 
@@ -127,8 +127,10 @@ def _guess(name: str, bounds: Bounds, known: Mapping[str, float]) -> float:
 def _joined(rounds: Sequence[Identification], guess: Mapping[str, float], accuracy: Accuracy | None) -> Identification:
     """The result of the last round with the history of all, and the expected places in a new session."""
     history = [[*records] for records in rounds[0].history]  # of the starts, of which the best continues
-    best = min((records for records in history if records), key=lambda own: min(one["loss"] for one in own))
-    best.extend(record for own in rounds[1:] for record in own.history[0])
+    best = min(
+        (records for records in history if records), key=lambda records: min(record["loss"] for record in records)
+    )
+    best.extend(record for later in rounds[1:] for record in later.history[0])
     found = replace(rounds[-1], history=history, first_guess=guess)
     if found.placement is None or accuracy is None or not (sessions := found.placement.get("sessions")):
         return found
@@ -142,28 +144,28 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
 
     Other trials have the mean of the prior, and its deviation as their uncertainty, before `_with_first_frames`.
     """
-    held = {name: one.prior for name, one in ranges.items() if one.per in ("session", "trial") and one.prior}
-    if not held:
+    priors = {name: one.prior for name, one in ranges.items() if one.per in ("session", "trial") and one.prior}
+    if not priors:
         return found
     names = [*found.parameters]
     common = [name for name in names if not split_name(name)[1]]
-    own = {name: value for name, value in found.parameters.items() if split_name(name)[1]}
-    parameters = {name: found.parameters[name] for name in common} | {name: p.mean for name, p in held.items()}
-    found = replace(found, parameters=parameters, own=own)
+    of_trials = {name: value for name, value in found.parameters.items() if split_name(name)[1]}
+    parameters = {name: found.parameters[name] for name in common} | {name: p.mean for name, p in priors.items()}
+    found = replace(found, parameters=parameters, own=of_trials)
     if (uncertainty := found.uncertainty) is None:
         return found
     rows = [names.index(name) for name in common]
-    correlation = np.eye(len(common) + len(held))
+    correlation = np.eye(len(common) + len(priors))
     correlation[: len(rows), : len(rows)] = np.array(uncertainty.correlation)[np.ix_(rows, rows)]
     changed = replace(
         uncertainty,
-        deviation={n: uncertainty.deviation[n] for n in common} | {n: p.deviation for n, p in held.items()},
+        deviation={n: uncertainty.deviation[n] for n in common} | {n: p.deviation for n, p in priors.items()},
         correlation=correlation.tolist(),
-        poorest={n: uncertainty.poorest[n] for n in common} | dict.fromkeys(held, 0.0),
-        ranges={n: uncertainty.ranges[n] for n in common} | {n: ranges[n].upper - ranges[n].lower for n in held},
+        poorest={n: uncertainty.poorest[n] for n in common} | dict.fromkeys(priors, 0.0),
+        ranges={n: uncertainty.ranges[n] for n in common} | {n: ranges[n].upper - ranges[n].lower for n in priors},
         left_out={},  # A trial that is left out has no values of its own.
     )
-    return replace(found, uncertainty=changed, own_deviation={name: uncertainty.deviation[name] for name in own})
+    return replace(found, uncertainty=changed, own_deviation={name: uncertainty.deviation[name] for name in of_trials})
 
 
 def _with_first_frames(
@@ -182,7 +184,7 @@ def _with_first_frames(
     wanted = {name: limits for name, limits in ranges.items() if limits.per == "trial"}
     for name in (name for name in names if wanted and motions.dataset.begin_of(name) in RESTING):
         bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
-        guess = {own: _guess(own, limits, known) for own, limits in bounds.items()}
+        guess = {full: _guess(full, limits, known) for full, limits in bounds.items()}
         try:
             replays = motions.replays(simulator, [name], found)
             misfit = _misfit(motions, replays, bounds, motions.release.window, known=known)

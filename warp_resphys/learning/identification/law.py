@@ -105,20 +105,18 @@ class _Columns:
 
     def __init__(self, train: WeakForm, held_out: WeakForm | None) -> None:
         self._forms = [train] if held_out is None else [train, held_out]
+        self._columns = [np.zeros((len(form.target), 0)) for form in self._forms]
         self.candidates: list[Candidate] = []
-        self._blocks: list[list[FloatArray]] = [[] for _ in self._forms]
-        self._normal: list[NormalEquations] = []
 
     def add(self, candidates: Sequence[Candidate]) -> list[int]:
         """Adds columns; returns their indices."""
-        if not candidates:
-            return []
-        for blocks, form in zip(self._blocks, self._forms, strict=True):
-            blocks.append(form.columns(candidates))
-        pairs = zip(self._blocks, self._forms, strict=True)
-        self._normal = [NormalEquations.of(np.concatenate(blocks, axis=1), form.target) for blocks, form in pairs]
         first = len(self.candidates)
         self.candidates += candidates
+        if candidates:
+            pairs = zip(self._columns, self._forms, strict=True)
+            self._columns = [np.concatenate([old, form.columns(candidates)], axis=1) for old, form in pairs]
+            pairs = zip(self._columns, self._forms, strict=True)
+            self._normal = [NormalEquations.of(columns, form.target) for columns, form in pairs]
         return list(range(first, len(self.candidates)))
 
     def fit(self, indices: Sequence[int]) -> tuple[FloatArray, float]:
@@ -228,12 +226,11 @@ def _constants(candidates: Sequence[Candidate], coefficients: FloatArray) -> dic
         value for name, value in constants.items() if name.startswith("ogden")
     )
     strong = [branch for branch in branches if branch[0] > _LEAST * shear]
-    for number, (modulus, time) in enumerate(strong, 1):
-        constants |= {f"prony_modulus_{number}": modulus, f"prony_time_{number}": time}
+    constants |= branches_of([modulus for modulus, _ in strong], [time for _, time in strong])
     pulling = [family for family in families if family["fibre_tension_1"] > _LEAST * shear]
     for number, family in enumerate(pulling, 1):
-        own = {f"{name[:-1]}{number}": value for name, value in family.items()}
-        constants |= {f"fibre_{name}_{number}": value for name, value in _FIBRE.items()} | own
+        constants |= {f"fibre_{name}_{number}": value for name, value in _FIBRE.items()}
+        constants |= {f"{name[:-1]}{number}": value for name, value in family.items()}
     return constants
 
 

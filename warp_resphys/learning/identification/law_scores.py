@@ -32,7 +32,7 @@ class Score:
         """Root mean square over the amplitude, over all trials; infinite if one failed."""
         if not self.frames:
             return math.inf
-        square = fmean(float(own.mean()) for own in self.frames)
+        square = fmean(float(of_trial.mean()) for of_trial in self.frames)
         return math.sqrt(square) if math.isfinite(square) else math.inf
 
     def beats(self, other: "Score") -> bool:
@@ -43,7 +43,7 @@ class Score:
         """
         if not math.isfinite(self.error) or self.error <= _CLEARLY * other.error:
             return self.error < other.error
-        less = [theirs - own for own, theirs in zip(self.frames, other.frames, strict=True)]
+        less = [theirs - ours for ours, theirs in zip(self.frames, other.frames, strict=True)]
         means = np.array([d.mean() for d in less])
         if max(len(d) for d in less) > 1:
             variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 
 from ...data.rigid_bodies import independent
 from ...data.trials import evenly
@@ -134,8 +135,8 @@ class _LawSearch:
     def names(self, whole: bool) -> tuple[str, ...]:
         """Names of the trials of a search: all of the training, or those that a law is identified from at first."""
         split = whole or self.validation or self.checked == self.train
-        own = self.train if split else tuple(name for name in self.train if name not in self.checked)
-        return own if self.settings.trials is None else tuple(evenly(own, self.settings.trials))
+        names = self.train if split else tuple(name for name in self.train if name not in self.checked)
+        return names if self.settings.trials is None else tuple(evenly(names, self.settings.trials))
 
     @property
     def early(self) -> float | None:
@@ -172,8 +173,8 @@ class _LawSearch:
     @cached_property
     def others(self) -> dict[str, float]:
         """Identified parameters beside the law: density and damping by mass, and those of other parts."""
-        own = {*self.base.materials[""].quantities} - {*_OF_MASS}
-        return {name: float(value) for name, value in self.identified.parameters.items() if name not in own}
+        material = {*self.base.materials[""].quantities} - {*_OF_MASS}
+        return {name: float(value) for name, value in self.identified.parameters.items() if name not in material}
 
     def run(self) -> IdentifiedLaw:
         """Identifies a law."""
@@ -184,7 +185,7 @@ class _LawSearch:
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
             refined = self._from_markers()
-            classes, scores = [own.law for own in refined], [own.score.error for own in refined]
+            classes, scores = [tried.law for tried in refined], [tried.score.error for tried in refined]
             best = refined[-1]
         if not self.validation:
             again = self._refine(best.law, whole=True)
@@ -199,7 +200,7 @@ class _LawSearch:
             deviation={n: deviation[old] for n, old in best.names.items() if old in deviation},
             at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
             loss=best.found.loss,
-            classes=[{**asdict(own), "validation": x} for own, x in zip(classes, scores, strict=True)],
+            classes=[{**asdict(tried), "validation": x} for tried, x in zip(classes, scores, strict=True)],
             stretches=stretches_in(
                 self.motions, trials, self.simulator(best.law.constants), best.others, self.identified
             ),
@@ -265,7 +266,7 @@ class _LawSearch:
         simulator, guess = self.simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         for names in (self.train, self.validation):
-            motions = [self._motion(simulator, own) for own in self.motions.dataset.batches(names)]
+            motions = [self._motion(simulator, batch) for batch in self.motions.dataset.batches(names)]
             forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
@@ -273,7 +274,7 @@ class _LawSearch:
     def _kept_classes(self, kept: Checkpoint) -> list[LawClass]:
         """Returns the classes of the weak form, which an earlier run may have fitted."""
         fitted = kept.once("classes", lambda: [asdict(law) for law in self._from_states()])
-        return [LawClass(**{**law, "groups": tuple(law["groups"])}) for law in fitted]
+        return TypeAdapter(list[LawClass]).validate_python(fitted)
 
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         replay = self.motions.replay(simulator, names)
@@ -283,7 +284,7 @@ class _LawSearch:
 
     def _enlarged(self, best: _Refined, classes: Sequence[LawClass]) -> _Refined:
         """Returns the best refined law of larger classes that balance the forces clearly better."""
-        residual = min(own.residual for own in classes if own.refined_groups == best.law.refined_groups)
+        residual = min(law.residual for law in classes if law.refined_groups == best.law.refined_groups)
         for law in classes:
             if law.refined_groups > best.law.refined_groups and law.residual < _BALANCED * residual:
                 larger = self._refine(law)
@@ -298,8 +299,8 @@ class _LawSearch:
         a class that lacks a group makes up for it with others, from where the group no longer helps.
         """
         guess, wanted = dict(self.guess), self.settings
-        own = {name: value for name, value in guess.items() if name.startswith("prony")}
-        known = [value for name, value in own.items() if name.startswith("prony_time")]
+        creep = {name: value for name, value in guess.items() if name.startswith("prony")}
+        known = [value for name, value in creep.items() if name.startswith("prony_time")]
         shortest, longest = wanted.relaxation_times
         middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
         times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
@@ -316,7 +317,7 @@ class _LawSearch:
         for name in groups:
             left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
             if name == "branches":
-                left |= own
+                left |= creep
             if name == "elastic":  # They may have been all that resists shear.
                 left["c10"] = max(left["c10"], guess["c10"])
             smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
@@ -342,8 +343,8 @@ class _LawSearch:
 
         def begin(before: Identification | None) -> tuple[Simulator, dict[str, float]]:
             first = {} if before is None else dict(before.parameters)
-            own = guess | {name: value for name, value in first.items() if name in guess}
-            return self.simulator(own), first | own
+            constants = guess | {name: value for name, value in first.items() if name in guess}
+            return self.simulator(constants), first | constants
 
         key = " ".join([*law.groups, *(["whole"] if whole else [])])
         limits = (self.seconds,) if whole else (self.seconds, self.settings.seconds, self.early)

@@ -83,7 +83,7 @@ class BoundedMisfit(ABC):
 
     @property
     def has_priors(self) -> bool:
-        """Whether something is held by prior knowledge."""
+        """Whether there is prior knowledge."""
         return bool(self._priors)
 
     def to_unit(self, values: Mapping[str, float]) -> FloatArray:
@@ -121,8 +121,8 @@ class BoundedMisfit(ABC):
         linearised = self.linearise(unit, derivatives=False) if self.has_priors else None
         if linearised is None:
             return 1.0
-        seen = sum(own.seen for own in linearised.trials)
-        squares = [np.square(own.rows).sum() * redundancy(own.rows) for own in linearised.trials]
+        seen = sum(trial.seen for trial in linearised.trials)
+        squares = [np.square(trial.rows).sum() * redundancy(trial.rows) for trial in linearised.trials]
         self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
         return self.prior_weight / before if before else math.inf
 

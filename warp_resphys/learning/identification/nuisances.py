@@ -83,7 +83,7 @@ class NuisanceFit:
             common = accuracy.directions(replays[0][0].trials.observed)
             shares = torch.eye(len(names)).to(common) * accuracy.between_sessions
             for name, share in zip((None, *names), (torch.zeros(len(names)), *shares), strict=True):
-                self._moves[name] = torch.cat([common, *(own * common for own in share)], 1)
+                self._moves[name] = torch.cat([common, *(part * common for part in share)], 1)
             self._moves.setdefault(replays[0][0].trials.session, common)
             self._places = self._moves[None].shape[1]
         self._late, count = list[slice | None](), self._places
@@ -115,8 +115,8 @@ class NuisanceFit:
             if late is not None:
                 solution[late] = start.delay / self._delay
         if self.is_empty or not prior_weight:
-            return [self._errors(n, own, solution) for n, own in enumerate(series)], Nuisances()
-        first = [own[:1].detach() for own in series]
+            return [self._errors(n, points, solution) for n, points in enumerate(series)], Nuisances()
+        first = [points[:1].detach() for points in series]
         with torch.no_grad():
             for _ in range(_TURNS if self._accuracy is not None and self._accuracy.turn else 1):
                 solution = self._improved(first, solution, prior_weight, self._places)
@@ -124,7 +124,7 @@ class NuisanceFit:
                 solution = self._on_grid(first, solution, prior_weight)
                 for _ in range(_STEPS):
                     solution = self._improved(first, solution, prior_weight, self._count)
-            columns = [own.flatten(1, 3).double().cpu().numpy() for _, own in self._linearised(first, solution)]
+            columns = [by.flatten(1, 3).double().cpu().numpy() for _, by in self._linearised(first, solution)]
         placed = {name: self._placement(name, solution) for name in self._moves}
         sessions = dict.fromkeys(replay.trials.session for replay, _ in self._replays if placed)
         fitted = Nuisances(
@@ -132,9 +132,9 @@ class NuisanceFit:
             rows=math.sqrt(prior_weight) * solution.double().cpu().numpy(),
             sessions={session: placed[session] for session in sessions},
             common=placed.get(None),
-            moves={name: own.double().cpu().numpy() for name, own in self._moves.items() if name is not None},
+            moves={name: by.double().cpu().numpy() for name, by in self._moves.items() if name is not None},
         )
-        return [self._errors(n, own, solution) for n, own in enumerate(series)], fitted
+        return [self._errors(n, points, solution) for n, points in enumerate(series)], fitted
 
     def _placement(self, session: str | None, solution: torch.Tensor) -> Placement:
         moved = self._moves[session] @ solution[: self._places]
@@ -168,9 +168,9 @@ class NuisanceFit:
             errors = self._errors(number, points, solution)[0]
             columns = errors.new_zeros(*errors.shape, self._count)
             if self._accuracy is not None:
-                own = self._placement(replay.trials.session, solution)
-                placed = own.places(self._points(number, points, solution)[0])
-                slopes = by_placement(own, *placed) * replay.trials.seen[..., None, None]
+                placement = self._placement(replay.trials.session, solution)
+                placed = placement.places(self._points(number, points, solution)[0])
+                slopes = by_placement(placement, *placed) * replay.trials.seen[..., None, None]
                 columns[..., : self._places] = slopes @ self._moves[replay.trials.session]
             if late is not None:
                 step, rows = _DIFFERENCE * float(replay.trials.times[0, 1]), torch.arange(len(errors))

@@ -66,8 +66,8 @@ class Identification(Identified):
 
     def plain(self) -> dict[str, Any]:
         """Returns the identification as JSON data."""
-        own = ("own", "own_deviation")
-        return {key: value for key, value in asdict(self).items() if value or key not in own}
+        of_trials = ("own", "own_deviation")
+        return {key: value for key, value in asdict(self).items() if value or key not in of_trials}
 
     @staticmethod
     def from_plain(plain: Mapping[str, Any]) -> "Identification":

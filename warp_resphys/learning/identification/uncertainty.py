@@ -61,18 +61,18 @@ class LinearMisfit:
     @property
     def loss(self) -> float:
         """Sum of the squares."""
-        return float(sum(np.square(own.rows).sum() for own in self.trials) + np.square(self.prior).sum())
+        return float(sum(np.square(trial.rows).sum() for trial in self.trials) + np.square(self.prior).sum())
 
     @property
     def gradient(self) -> FloatArray:
         """(P,) gradient of the loss."""
-        parts = [own.slopes.T @ own.rows.ravel() for own in self.trials]
+        parts = [trial.slopes.T @ trial.rows.ravel() for trial in self.trials]
         return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior))
 
     @property
     def gauss_newton(self) -> FloatArray:
         """(P, P) Gauss-Newton matrix of the loss."""
-        parts = [own.slopes.T @ own.slopes for own in self.trials]
+        parts = [trial.slopes.T @ trial.slopes for trial in self.trials]
         return np.asarray(2.0 * (np.sum(parts, axis=0) + self.prior_slopes.T @ self.prior_slopes))
 
     def _follow(self, values: Sequence[FloatArray], prior: FloatArray | float = 0.0) -> FloatArray:
@@ -82,17 +82,17 @@ class LinearMisfit:
             values: (T C, ...) by trial.
             prior: (K, ...) weighted residuals of the priors of places and delays.
         """
-        normal = np.sum([own.columns.T @ own.columns for own in self.trials], axis=0)
-        right = np.sum([own.columns.T @ of for own, of in zip(self.trials, values, strict=True)], axis=0)
+        normal = np.sum([trial.columns.T @ trial.columns for trial in self.trials], axis=0)
+        right = np.sum([trial.columns.T @ of for trial, of in zip(self.trials, values, strict=True)], axis=0)
         right = right + math.sqrt(self.prior_weight) * prior
         return np.asarray(-np.linalg.solve(normal + self.prior_weight * np.eye(len(normal)), right))
 
     def eliminated(self) -> "LinearMisfit":
         """Returns the misfit in which places and delays follow the parameters (Kaufman, BIT 15 (1975) 49)."""
-        follow = self._follow([own.slopes for own in self.trials])
+        follow = self._follow([trial.slopes for trial in self.trials])
         further = math.sqrt(self.prior_weight) * follow
         return LinearMisfit(
-            [own._replace(slopes=own.slopes + own.columns @ follow) for own in self.trials],
+            [trial._replace(slopes=trial.slopes + trial.columns @ follow) for trial in self.trials],
             np.concatenate([self.prior, self.nuisances.rows]),
             np.concatenate([self.prior_slopes, further]),
             self.prior_weight,
@@ -102,7 +102,7 @@ class LinearMisfit:
         """(3 M + 6,) change of a session's placement with a step (P,) of the parameters; None if places are exact."""
         if self.nuisances.common is None:
             return None
-        moved = self._follow([own.rows.ravel() + own.slopes @ step for own in self.trials], self.nuisances.rows)
+        moved = self._follow([trial.rows.ravel() + trial.slopes @ step for trial in self.trials], self.nuisances.rows)
         moves = self.nuisances.moves[session]
         return [float(value) for value in moves @ moved[: moves.shape[1]]]
 
@@ -139,10 +139,12 @@ def uncertainty_of(linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: Flo
         unit: (P,) the minimum, in fractions of the ranges.
     """
     trials, prior = linear.trials, linear.prior_slopes
-    free = 1.0 - min(len(unit) / sum(own.seen for own in trials), 0.5)
-    scatter = [np.square(own.rows).sum() / (own.seen * free) * _scatter(own.rows, own.slopes) for own in trials]
+    free = 1.0 - min(len(unit) / sum(trial.seen for trial in trials), 0.5)
+    scatter = [
+        np.square(trial.rows).sum() / (trial.seen * free) * _scatter(trial.rows, trial.slopes) for trial in trials
+    ]
     scatter.append(linear.prior_weight * prior.T @ prior)
-    curvature = np.sum([own.slopes.T @ own.slopes for own in trials], axis=0) + prior.T @ prior
+    curvature = np.sum([trial.slopes.T @ trial.slopes for trial in trials], axis=0) + prior.T @ prior
     values, vectors = np.linalg.eigh(curvature)
     known = values > 1e-12 * max(values[-1], 1e-300)  # The data say nothing about the other directions.
     inverse = vectors[:, known] / values[known] @ vectors[:, known].T
@@ -202,8 +204,8 @@ def left_out(system: LinearMisfit, bounds: Mapping[str, Bounds], unit: FloatArra
     result: dict[str, LeftOut] = {}
     for number, out in enumerate(system.trials if len(system.trials) > 1 else ()):
         others = replace(system, trials=[*system.trials[:number], *system.trials[number + 1 :]])
-        linear, seen = others.eliminated(), sum(own.seen for own in others.trials)
-        variance = sum(float(np.square(own.rows).sum()) for own in others.trials) / seen
+        linear, seen = others.eliminated(), sum(trial.seen for trial in others.trials)
+        variance = sum(float(np.square(trial.rows).sum()) for trial in others.trials) / seen
         curvature = 0.5 * linear.gauss_newton + _UNIFORM * variance * np.eye(len(unit))
         step = np.asarray(-0.5 * np.linalg.lstsq(curvature, linear.gradient)[0], dtype=np.float64)
         uncertainty = uncertainty_of(linear, bounds, unit)

@@ -106,8 +106,8 @@ class WeakForm:
         names = set().union(*candidates)
         values = {name: [c.get(name, self._zero.get(name, 0.0)) for c in candidates] for name in names}
         spread = {
-            name: motion.q.new_tensor(own).repeat_interleave(batch)[:, None]
-            for name, own in {**{k: [x] * count for k, x in self._zero.items()}, **values}.items()
+            name: motion.q.new_tensor(series).repeat_interleave(batch)[:, None]
+            for name, series in {**{k: [x] * count for k, x in self._zero.items()}, **values}.items()
         }
         constants = simulator.prepare(spread)
         carries = True

@@ -14,7 +14,7 @@ from warp_resphys.experiment.experiment import MODELS
 from warp_resphys.fem.bodies import MASS_MODES
 from warp_resphys.fem.integration_points import VOLUME_INTEGRATIONS
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.networks import ACTIVATIONS
+from warp_resphys.learning.residuals.networks import ACTIVATIONS
 from warp_resphys.settings.body import PhysicsSettings, SimulatorSettings
 from warp_resphys.settings.control import Model
 from warp_resphys.settings.editor_schema import editor_schema

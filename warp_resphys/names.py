@@ -32,11 +32,11 @@ from .io.errors import MeshError as MeshError
 from .io.errors import ResphysError as ResphysError
 from .io.errors import ResphysWarning as ResphysWarning
 from .learning.evaluation import evaluate as evaluate
-from .learning.fitting import fit_force as fit_force
 from .learning.identification.identification import identify as identify
 from .learning.identification.law_search import identify_law as identify_law
 from .learning.observed_motions import ObservedMotions as ObservedMotions
-from .learning.reconstruction import reconstruct as reconstruct
+from .learning.residuals.fitting import fit_force as fit_force
+from .learning.residuals.reconstruction import reconstruct as reconstruct
 from .mesh.boxes import box_hexahedra as box_hexahedra
 from .mesh.boxes import box_tetrahedra as box_tetrahedra
 from .mesh.readers import read_mesh as read_mesh

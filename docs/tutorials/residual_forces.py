@@ -25,9 +25,9 @@ import warp as wp
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import MarkerMap
-from warp_resphys.learning.correction import CorrectedSimulator, known_positions
-from warp_resphys.learning.networks import ResidualForce, build_model
-from warp_resphys.learning.reconstruction import make_reconstructor
+from warp_resphys.learning.residuals.correction import CorrectedSimulator, known_positions
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
+from warp_resphys.learning.residuals.reconstruction import make_reconstructor
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.stepping.rollout import rollout
 

@@ -14,8 +14,8 @@ from warp_resphys.control.polynomials import Polynomial, powers
 from warp_resphys.control.reduced_force import Evaluator
 from warp_resphys.control.task import Path
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.correction import Range
-from warp_resphys.learning.networks import ResidualForce, build_model
+from warp_resphys.learning.residuals.correction import Range
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.settings.control import LimitsOfInputs
 from warp_resphys.settings.learning import NetworkSettings
 

@@ -9,8 +9,8 @@ import torch
 from warp_resphys.control.polynomials import Polynomial, SquaredPolynomial, best_order, powers
 from warp_resphys.control.reduced_force import ReducedForce
 from warp_resphys.control.reduced_model import ReducedModel
-from warp_resphys.learning.correction import Range
-from warp_resphys.learning.networks import ResidualForce, build_model
+from warp_resphys.learning.residuals.correction import Range
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
 

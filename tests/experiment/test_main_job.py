@@ -40,7 +40,7 @@ from warp_resphys.io.progress import Progress
 from warp_resphys.io.resuming import fingerprint, package_versions
 from warp_resphys.io.safe_files import read_checkpoint, read_hdf5
 from warp_resphys.learning.baselines import BASELINES
-from warp_resphys.learning.reconstruction import LBFGSB
+from warp_resphys.learning.residuals.reconstruction import LBFGSB
 
 LEARNED_FILES = (("", "safetensors"), ("training_", "json"))
 

@@ -23,7 +23,7 @@ from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.resuming import Stage, fingerprint
 from warp_resphys.io.safe_files import read_checkpoint, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.networks import OwnNetwork
+from warp_resphys.learning.residuals.networks import OwnNetwork
 from warp_resphys.robot.description import describe
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.studies.gradient_check import check_gradients

@@ -23,10 +23,10 @@ from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.resuming import StageContext, run_stages
 from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning import fitting
-from warp_resphys.learning.correction import force_frames
 from warp_resphys.learning.error_tables import ComparedModels
 from warp_resphys.learning.observed_motions import ObservedMotions
+from warp_resphys.learning.residuals import fitting
+from warp_resphys.learning.residuals.correction import force_frames
 from warp_resphys.settings.stage_keys import StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED)

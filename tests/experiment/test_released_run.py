@@ -16,7 +16,7 @@ from warp_resphys.io.resuming import StageContext, StageInterrupted, run_stages
 from warp_resphys.io.safe_files import read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification import search
-from warp_resphys.learning.networks import NextState, ResidualForce, restore
+from warp_resphys.learning.residuals.networks import NextState, ResidualForce, restore
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.pipeline import learning_stages
 from warp_resphys.report.error_section import mesh_text

@@ -6,14 +6,14 @@ import torch
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.learning.correction import (
+from warp_resphys.learning.residuals.correction import (
     DIVERGENCE_DISTANCE,
     CorrectedSimulator,
     LearnedPredictor,
     equilibrium_under_feedback,
     known_positions,
 )
-from warp_resphys.learning.networks import NextState, build_model
+from warp_resphys.learning.residuals.networks import NextState, build_model
 from warp_resphys.settings.learning import NetworkSettings
 from warp_resphys.stepping.rollout import rollout
 

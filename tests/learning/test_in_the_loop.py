@@ -11,10 +11,10 @@ from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, selec
 from warp_resphys.data.markers import WHOLE_STATE, bind_markers
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
-from warp_resphys.learning.networks import ResidualForce, build_model
 from warp_resphys.learning.observed_motions import at_steps
 from warp_resphys.learning.replay import Replay, Start, Windows
+from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.stepping.inputs import Inputs

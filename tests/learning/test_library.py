@@ -12,13 +12,13 @@ from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Checkpoint, Parts
 from warp_resphys.io.resuming import StageContext
 from warp_resphys.learning.evaluation import evaluate
-from warp_resphys.learning.fitting import Fitting, fit_force
 from warp_resphys.learning.identification.identification import identify
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy
-from warp_resphys.learning.reconstruction import reconstruct
+from warp_resphys.learning.residuals.fitting import Fitting, fit_force
+from warp_resphys.learning.residuals.reconstruction import reconstruct
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))

@@ -10,9 +10,9 @@ from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
-from warp_resphys.learning.correction import LearnedPredictor, Range
-from warp_resphys.learning.networks import NextState, ResidualForce, SkipMLP, build_model, restore
+from warp_resphys.learning.residuals.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
+from warp_resphys.learning.residuals.correction import LearnedPredictor, Range
+from warp_resphys.learning.residuals.networks import NextState, ResidualForce, SkipMLP, build_model, restore
 from warp_resphys.settings.learning import NetworkSettings
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}

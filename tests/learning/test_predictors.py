@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from warp_resphys import State
-from warp_resphys.learning.correction import Learned, LearnedPredictor, Range
-from warp_resphys.learning.networks import ResidualForce, build_model
+from warp_resphys.learning.residuals.correction import Learned, LearnedPredictor, Range
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.settings.learning import NetworkSettings
 
 SAMPLES, VERTICES = 30, 8

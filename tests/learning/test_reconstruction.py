@@ -10,7 +10,7 @@ from warp_resphys.data.markers import KINDS, WHOLE_STATE, MarkerMap, bind_marker
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.reconstruction import make_reconstructor
+from warp_resphys.learning.residuals.reconstruction import make_reconstructor
 from warp_resphys.stepping.inputs import Inputs
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")

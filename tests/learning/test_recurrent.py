@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.correction import LearnedPredictor
-from warp_resphys.learning.networks import ResidualForce, build_model
-from warp_resphys.learning.training import Samples, SequenceTrainer
+from warp_resphys.learning.residuals.correction import LearnedPredictor
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
+from warp_resphys.learning.residuals.training import Samples, SequenceTrainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 from warp_resphys.stepping.state import State
 

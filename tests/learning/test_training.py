@@ -6,8 +6,8 @@ import torch
 
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.networks import ResidualForce, build_model
-from warp_resphys.learning.training import Samples, Trainer
+from warp_resphys.learning.residuals.networks import ResidualForce, build_model
+from warp_resphys.learning.residuals.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 NETWORK = NetworkSettings(kind="nodal", blocks=2, layers=1, width=16, activation="normalised_elu")

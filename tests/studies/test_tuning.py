@@ -13,7 +13,7 @@ from optuna.trial import TrialState
 from support.command_line import outcome, refusal, settings_of
 from support.main_job import IN_RUN, TINY, run, run_without_report
 from warp_resphys.io.safe_files import read_checkpoint
-from warp_resphys.learning.training import Trainer
+from warp_resphys.learning.residuals.training import Trainer
 from warp_resphys.studies.tuning import TunedRun, _checked
 
 SPACE = "tune.space.network={width: [8, 16], blocks: {low: 1, high: 2}}"

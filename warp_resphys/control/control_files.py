@@ -12,7 +12,7 @@ from ..experiment.files import DRIVEN
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.safe_files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
-from ..learning.correction import Learned
+from ..learning.residuals.correction import Learned
 from .linear_model import LinearModel
 from .polynomials import Polynomial, SquaredPolynomial
 from .reduced_force import ReducedForce

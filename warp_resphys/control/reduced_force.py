@@ -15,8 +15,8 @@ from torch import nn
 
 from ..data.input_response import with_means
 from ..io.arrays import BoolArray, FloatArray
-from ..learning.correction import Range
-from ..learning.networks import SkipMLP, StateMap
+from ..learning.residuals.correction import Range
+from ..learning.residuals.networks import SkipMLP, StateMap
 from .polynomials import Monomials, Polynomial
 
 Array = NDArray[Any]

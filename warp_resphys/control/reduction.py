@@ -17,7 +17,7 @@ from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, DataFileError
 from ..io.progress import Progress
 from ..io.safe_files import to_plain
-from ..learning.coders import Coder
+from ..learning.residuals.coders import Coder
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..stepping.state import State

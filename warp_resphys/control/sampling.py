@@ -14,7 +14,7 @@ from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from ..learning.correction import Learned
+from ..learning.residuals.correction import Learned
 from ..robot.actuation import RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings

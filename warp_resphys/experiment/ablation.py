@@ -16,7 +16,7 @@ from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.progress import show
 from ..io.resuming import Stage, StageContext, package_versions, resources_used
 from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5, read_json, write_json
-from ..learning.reconstruction import follow, make_reconstructor
+from ..learning.residuals.reconstruction import follow, make_reconstructor
 from ..mesh.volume_mesh import surface_vertices
 from ..settings.run import RunSettings
 from ..settings.stage_keys import SIMULATOR, StageSettings

@@ -20,9 +20,9 @@ from ..energies.convex_material import ConvexMaterial
 from ..energies.tendons import OFFSETS, Tendons
 from ..fem.bodies import Body
 from ..io.errors import InputError, naming
-from ..learning.networks import core_factory
 from ..learning.parameters import MASS_FACTOR, command_of, identifiable_parameters, parameters_of_parts
-from ..learning.reconstruction import make_reconstructor
+from ..learning.residuals.networks import core_factory
+from ..learning.residuals.reconstruction import make_reconstructor
 from ..mesh.selection import select_vertices
 from ..mesh.volume_mesh import surface_vertices
 from ..settings.body import MaterialSettings

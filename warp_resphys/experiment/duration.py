@@ -17,7 +17,7 @@ from ..data.trials import evenly
 from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
-from ..learning.reconstruction import make_reconstructor
+from ..learning.residuals.reconstruction import make_reconstructor
 from ..report.wording import duration_text
 from ..settings.stage_keys import StageSettings
 from .experiment import MODELS, SIMFREE, Experiment

@@ -16,12 +16,12 @@ from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
 from ..io.safe_files import read_array, read_hdf5, read_json
 from ..learning.comparison import Model
-from ..learning.correction import Learned
 from ..learning.identification.search import Identification
-from ..learning.networks import NextState, ResidualForce, StateMap
 from ..learning.observed_motions import ObservedMotions
 from ..learning.parameters import split_name
-from ..learning.reconstruction import ReconstructedTrials
+from ..learning.residuals.correction import Learned
+from ..learning.residuals.networks import NextState, ResidualForce, StateMap
+from ..learning.residuals.reconstruction import ReconstructedTrials
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.run_keys import models_of
 from ..settings.stage_keys import StageSettings

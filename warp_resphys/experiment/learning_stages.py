@@ -11,11 +11,11 @@ from ..io.fan_out import ALONE, Workers
 from ..io.parts import Checkpoint, Parts
 from ..io.resuming import StageContext, package_versions
 from ..io.safe_files import atomic_hdf5, create, resume_checkpoint, write_checkpoint, write_json
-from ..learning import reconstruction
 from ..learning.comparison import Comparison
-from ..learning.fitting import Fitting, Snapshot, fit
 from ..learning.identification import identification, law_search
 from ..learning.placement import Accuracy
+from ..learning.residuals import reconstruction
+from ..learning.residuals.fitting import Fitting, Snapshot, fit
 from ..settings.stage_keys import StageSettings
 from .build import choose_device
 from .experiment import LAW, MODELS, SIMFREE, Experiment

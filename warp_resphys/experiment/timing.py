@@ -9,8 +9,8 @@ from ..dynamics.simulator import Simulator
 from ..io.progress import Progress
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
-from ..learning.correction import Learned
 from ..learning.evaluation import TrialRollout
+from ..learning.residuals.correction import Learned
 from ..settings.stage_keys import StageSettings
 from .experiment import Experiment
 from .files import TIMES

@@ -1,7 +1,6 @@
 """Identification of parameters, reconstruction of residual forces, and networks that predict these forces."""
 
 from .evaluation import evaluate as evaluate
-from .fitting import fit_force as fit_force
 from .identification.identification import identify as identify
 from .identification.law_search import identify_law as identify_law
 from .identification.search import Identification as Identification
@@ -9,4 +8,5 @@ from .identification.search import search_parameters as search_parameters
 from .observed_motions import ObservedMotions as ObservedMotions
 from .parameters import Bounds as Bounds
 from .parameters import Prior as Prior
-from .reconstruction import reconstruct as reconstruct
+from .residuals.fitting import fit_force as fit_force
+from .residuals.reconstruction import reconstruct as reconstruct

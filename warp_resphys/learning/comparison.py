@@ -12,13 +12,13 @@ import numpy as np
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.parts import Parts, TrialPart
-from .correction import Learned
 from .error_tables import ComparedModels, amplitudes, counted
 from .evaluation import rollout_parts
 from .identification.identification import Identification
 from .identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
 from .intervals import LEVEL, Intervals, coverage, predicted_trials, rest_places
 from .observed_motions import ObservedMotions
+from .residuals.correction import Learned
 from .without_physics import without_physics
 
 _FILM_FRAMES: Final = 256  # maximum

@@ -21,8 +21,8 @@ from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
-from .correction import equilibrium_under_feedback
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
+from .residuals.correction import equilibrium_under_feedback
 from .trial_batch import TrialBatch
 
 log = logging.getLogger(__name__)

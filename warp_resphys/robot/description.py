@@ -23,10 +23,10 @@ from ..io.errors import DataFileError, InputError, listed, number_of
 from ..io.resuming import finished_record, planned
 from ..io.safe_files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
-from ..learning.correction import Learned, Range
 from ..learning.intervals import LEVEL, Intervals
-from ..learning.networks import NextState, restore
 from ..learning.placement import PlacedMarkers, Placement
+from ..learning.residuals.correction import Learned, Range
+from ..learning.residuals.networks import NextState, restore
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings

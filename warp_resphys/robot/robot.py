@@ -17,16 +17,16 @@ from ..dynamics.simulator import Simulator
 from ..dynamics.trajectory import Motion
 from ..energies.materials import MASS_DAMPING
 from ..io.errors import ConvergenceError, InputError
-from ..learning.correction import (
+from ..learning.evaluation import POSE_STEPS
+from ..learning.parameters import check_names, constants_of, identifiable_parameters
+from ..learning.residuals.correction import (
     DIVERGENCE_DISTANCE,
     CorrectedSimulator,
     LearnedPredictor,
     equilibrium_under_feedback,
     force_frames,
 )
-from ..learning.evaluation import POSE_STEPS
-from ..learning.networks import NextState
-from ..learning.parameters import check_names, constants_of, identifiable_parameters
+from ..learning.residuals.networks import NextState
 from ..mesh.volume_mesh import Mesh
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs

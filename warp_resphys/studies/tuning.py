@@ -27,7 +27,7 @@ from ..io.errors import DataFileError, InputError, listed, naming
 from ..io.progress import show
 from ..io.resuming import StageInterrupted, run_stages
 from ..io.settings import Count, Natural, Settings, Word, parse, setting
-from ..learning.fitting import run_epochs
+from ..learning.residuals.fitting import run_epochs
 from ..pipeline import acquire, learning_stages, prepare
 from ..report.page import PageTable
 from ..report.wording import number_text

@@ -12,7 +12,7 @@ from ..control.reduced_model import ReducedState
 from ..control.reduction import reduced_of
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
-from ..learning.correction import DIVERGENCE_DISTANCE
+from ..learning.residuals.correction import DIVERGENCE_DISTANCE
 from ..robot.actuation import Given, InputReader
 from ..robot.robot import Robot
 from ..stepping.state import State

@@ -12,10 +12,10 @@ import torch
 from torch import nn
 from typing_extensions import override
 
-from ..dynamics.modes import RestStiffness
-from ..io.classes import ClassSettings
-from ..io.errors import InputError
-from ..settings.learning import NetworkSettings
+from ...dynamics.modes import RestStiffness
+from ...io.classes import ClassSettings
+from ...io.errors import InputError
+from ...settings.learning import NetworkSettings
 from .coders import Coder, actuation_coder, displacement_coder, empty_coder, nodal_coder, pod_coder
 
 _ARCHITECTURE = ("blocks", "layers", "width", "activation")

@@ -25,19 +25,19 @@ import torch
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
-from ..dynamics.modes import vibration_modes
-from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import ConvergenceError, InputError
-from ..io.parts import Arrays, Parts, Report, TrialPart, cut
-from ..linalg.least_squares import minimise
-from ..linalg.threads import threads_for
-from ..settings.learning import ReconstructionSettings
-from ..stepping.inputs import Inputs
-from ..stepping.rollout import states
-from ..stepping.state import State
-from .metrics import mean_distance
-from .observed_motions import Identified, ObservedMotions
+from ...data.markers import WHOLE_STATE, Markers, Observation, WholeState
+from ...dynamics.modes import vibration_modes
+from ...dynamics.simulator import Constants, Simulator
+from ...io.errors import ConvergenceError, InputError
+from ...io.parts import Arrays, Parts, Report, TrialPart, cut
+from ...linalg.least_squares import minimise
+from ...linalg.threads import threads_for
+from ...settings.learning import ReconstructionSettings
+from ...stepping.inputs import Inputs
+from ...stepping.rollout import states
+from ...stepping.state import State
+from ..metrics import mean_distance
+from ..observed_motions import Identified, ObservedMotions
 from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, StepProblem
 
 log = logging.getLogger(__name__)

@@ -10,8 +10,8 @@ from typing import Any, Generic
 import torch
 from typing_extensions import override
 
-from ..io.errors import InputError
-from ..settings.learning import EpochSettings, TrainerSettings
+from ...io.errors import InputError
+from ...settings.learning import EpochSettings, TrainerSettings
 from .networks import Model, StateMap
 
 

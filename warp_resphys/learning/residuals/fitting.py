@@ -12,18 +12,18 @@ from typing import Any
 
 import torch
 
-from ..data.trials import STATIC
-from ..dynamics.modes import RestStiffness
-from ..dynamics.simulator import Simulator
-from ..io.progress import Progress
-from ..settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
+from ...data.trials import STATIC
+from ...dynamics.modes import RestStiffness
+from ...dynamics.simulator import Simulator
+from ...io.progress import Progress
+from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
+from ..evaluation import rollout_error
+from ..observed_motions import Identified, ObservedMotions
+from ..replay import Replay, Start, Windows
 from .correction import Learned, Range, force_frames
-from .evaluation import rollout_error
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model
-from .observed_motions import Identified, ObservedMotions
 from .reconstruction import ReconstructedTrials
-from .replay import Replay, Start, Windows
 from .training import EpochTrainer, Samples, SequenceTrainer, Trainer
 
 log = logging.getLogger(__name__)

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..dynamics.frames import BaseFrame, VertexFrames
-from ..io.errors import ConvergenceError
-from ..settings.learning import InTheLoopSettings
+from ...dynamics.frames import BaseFrame, VertexFrames
+from ...io.errors import ConvergenceError
+from ...settings.learning import InTheLoopSettings
+from ..replay import Replay, Start, Windows
 from .correction import LearnedPredictor
 from .networks import OwnNetwork, ResidualForce
-from .replay import Replay, Start, Windows
 from .training import EpochTrainer
 
 _EVALUATIONS = 12  # of the loss, at most, in one epoch

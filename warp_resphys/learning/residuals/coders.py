@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
-from ..dynamics.modes import RestStiffness
-from ..io.errors import InputError
+from ...dynamics.modes import RestStiffness
+from ...io.errors import InputError
 
 # Modes and coordinates that vary less than this fraction of the largest are not amplified to unit deviation.
 _DEVIATION_FLOOR = 3e-3

@@ -8,14 +8,14 @@ from typing import ClassVar
 import torch
 from typing_extensions import override
 
-from ..data.markers import WHOLE_STATE, Observation
-from ..dynamics.linearisation import Linearisation
-from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import ConvergenceError, InputError
-from ..linalg.conjugate_gradients import LinearMap, conjugate_gradients
-from ..linalg.least_squares import Move, Point, Problem, ridge
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
+from ...data.markers import WHOLE_STATE, Observation
+from ...dynamics.linearisation import Linearisation
+from ...dynamics.simulator import Constants, Simulator
+from ...io.errors import ConvergenceError, InputError
+from ...linalg.conjugate_gradients import LinearMap, conjugate_gradients
+from ...linalg.least_squares import Move, Point, Problem, ridge
+from ...stepping.inputs import Inputs
+from ...stepping.state import State
 
 _SHORT = 0.1  # of the tolerance: length of a step of Gauss-Newton that needs no check
 

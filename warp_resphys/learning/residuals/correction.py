@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import torch
 
-from ..dynamics.frames import BaseFrame, VertexFrames
-from ..dynamics.simulator import Constants, Simulator
-from ..io.errors import ConvergenceError
-from ..io.safe_files import read_checkpoint, write_checkpoint
-from ..stepping.inputs import Inputs
-from ..stepping.state import State
+from ...dynamics.frames import BaseFrame, VertexFrames
+from ...dynamics.simulator import Constants, Simulator
+from ...io.errors import ConvergenceError
+from ...io.safe_files import read_checkpoint, write_checkpoint
+from ...stepping.inputs import Inputs
+from ...stepping.state import State
 from .networks import NextState, ResidualForce, StateMap, restore
 
 COROTATED: Final = "corotated"

@@ -1,0 +1,1 @@
+"""Residual forces: their reconstruction, the networks that predict them, and simulators corrected by them."""

@@ -28,24 +28,10 @@ _LEAST_FRAMES = 2  # of a recording
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 Place = tuple[str, str, int]  # label, axis and column of a coordinate
-
-
-@dataclass(frozen=True)
-class Turn:
-    """Columns with the rotations of rigid bodies, and their convention.
-
-    Attributes:
-        axes: names of k columns of a rigid body.
-        quaternions: function of numbers (T, k) that returns quaternions (T, 4), w first.
-    """
-
-    axes: tuple[str, ...]
-    quaternions: Callable[[FloatArray], FloatArray]
-
-    @classmethod
-    def of(cls, axes: Sequence[str], rotations: Callable[[FloatArray], Rotation]) -> "Turn":
-        """Returns the form of numbers (T, k) for which a function returns T rotations."""
-        return cls(tuple(axes), lambda numbers: quaternions(numbers, rotations))
+# Names of the k columns with the rotation of a rigid body, and a function of their numbers (T, k) that returns
+# quaternions (T, 4), w first
+Turn = tuple[Sequence[str], Callable[[FloatArray], FloatArray]]
+QUATERNION: Turn = (("qw", "qx", "qy", "qz"), np.asarray)
 
 
 def quaternions(numbers: FloatArray, rotations: Callable[[FloatArray], Rotation]) -> FloatArray:
@@ -55,9 +41,6 @@ def quaternions(numbers: FloatArray, rotations: Callable[[FloatArray], Rotation]
     if seen.any():
         result[seen] = rotations(numbers[seen]).as_quat()[:, [3, 0, 1, 2]]
     return result
-
-
-QUATERNION = Turn(("qw", "qx", "qy", "qz"), lambda columns: columns)
 
 
 @dataclass(frozen=True)
@@ -114,7 +97,7 @@ class Layout:
         turns = np.full((*positions.shape[:2], 4), np.nan)
         for marker, columns in turned.items():
             try:
-                turns[frames, marker] = self.turn.quaternions(values[:, columns])
+                turns[frames, marker] = self.turn[1](values[:, columns])
             except ValueError as error:
                 raise DataFileError(f"{path}: {markers[marker]} has a row that is no rotation ({error}).") from error
         timed = self.seconds is not None
@@ -139,19 +122,19 @@ class Layout:
         labels = list(dict.fromkeys(label for label, axis in columns if axis in AXES))
         axes = {axis for _, axis in columns if axis in AXES}
         optional = {*AXES} - axes if self.planar and len(axes) == 2 else set()
-        bodies = dict.fromkeys(label for label, axis in columns if axis in self.turn.axes)
+        bodies = dict.fromkeys(label for label, axis in columns if axis in self.turn[0])
         wanted = [(label, axis) for label in labels for axis in AXES if axis not in optional]
-        wanted += [(label, axis) for label in bodies for axis in (*AXES, *self.turn.axes)]
+        wanted += [(label, axis) for label in bodies for axis in (*AXES, *self.turn[0])]
         for label, axis in wanted:
             if (label, axis) not in columns:
                 what, lacks = ("marker", "")
                 if label in bodies:
-                    what, lacks = "rigid body", f" ({', '.join((*AXES, *self.turn.axes))})"
+                    what, lacks = "rigid body", f" ({', '.join((*AXES, *self.turn[0]))})"
                 raise DataFileError(
                     f"{path}: {what} {label} has no column '{label}.{axis}'; export it again with all{lacks}."
                 )
         chosen = [columns.get((label, axis), -1) for label in labels for axis in AXES]
-        return labels, chosen, {labels.index(body): [columns[body, axis] for axis in self.turn.axes] for body in bodies}
+        return labels, chosen, {labels.index(body): [columns[body, axis] for axis in self.turn[0]] for body in bodies}
 
     def _numbers(self, rows: Rows, columns: Sequence[int], path: Path) -> tuple[FloatArray, list[int]]:
         """Returns columns (T, C) of the rows of numbers, NaN for empty cells, and the line numbers of the rows."""

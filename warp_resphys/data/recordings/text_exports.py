@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from itertools import pairwise, takewhile
 from pathlib import Path
 
@@ -54,11 +55,7 @@ _VICON_AXES = {"tx": "x", "ty": "y", "tz": "z"} | {axis: axis for axis in (*AXES
 
 
 def read_text_export(path: Path, table: TableSettings | None = None) -> Recording:
-    """Reads a table, or an export of Qualisys, Motive or Vicon, which its first line shows.
-
-    Args:
-        path: of the file.
-        table: description of the file, in place of its first line.
+    """Reads a table, as described or with a header, or an export of Qualisys, Motive or Vicon, by its first line.
 
     Raises:
         DataFileError: The file is missing, empty or not text, has an unknown layout, or a cell or row is invalid.
@@ -281,7 +278,7 @@ def _read_qualisys(rows: Rows, path: Path) -> Recording:
     unique = [f"{label} #{place}" if labels.count(label) > 1 else label for place, label in enumerate(labels, start=1)]
     places = [(unique[axes[: column + 1].count("x") - 1], axis, column) for column, axis in enumerate(axes)]
     rate, clock = number("".join(keys.get("FREQUENCY", [])[:1])), 0 if leading else None
-    turn = Turn(tuple(axis for axis in (*_MATRIX, *_ANGLES) if axis in axes), _quaternions_of_qualisys)
+    turn = [axis for axis in (*_MATRIX, *_ANGLES) if axis in axes], _quaternions_of_qualisys
     layout = Layout(first, len(axes), places[len(leading) :], "mm", clock, rate=rate, turn=turn)
     recording = hide_zeros(replace(layout.read(rows, path), labels=tuple(labels)))
     return replace(recording, start=number(data[0][1]) or 0.0) if len(leading) == 2 else recording
@@ -327,9 +324,10 @@ def _read_motive(rows: Rows, path: Path) -> Recording:
             places[kind].append((name, f"q{axis}" if part == "Rotation" else axis, column))
     turn = QUATERNION
     if sorted(order) == ["X", "Y", "Z"]:  # angles about the axes of the body, in degrees
-        turn = Turn.of([f"q{axis.lower()}" for axis in order], lambda a: Rotation.from_euler(order, a, degrees=True))
+        rotations = partial(Rotation.from_euler, order, degrees=True)
+        turn = [f"q{axis.lower()}" for axis in order], partial(quaternions, rotations=rotations)
     known = {(name, axis) for name, axis, _ in places["Rigid Body"]}
-    whole = {name for name, _ in known if {(name, axis) for axis in ("x", *turn.axes)} <= known}
+    whole = {name for name, _ in known if {(name, axis) for axis in ("x", *turn[0])} <= known}
     if left := {name for name, _ in known} - whole:
         log.warning(
             "%s: rigid bodies without a position and a quaternion are not read (%s): let Motive export both.",
@@ -373,9 +371,9 @@ def _read_vicon(rows: Rows, path: Path) -> Recording:
             f"{listed(sorted(map(str, rates)))} Hz): export it from Vicon with its section 'Trajectories' or 'Objects'."
         )
     scale = np.pi / 180.0 if "deg" in {units.get(column) for _, axis, column in places if axis == "rx"} else 1.0
-    turn = Turn.of(("rx", "ry", "rz"), lambda vectors: Rotation.from_rotvec(scale * vectors))
+    turn: Turn = ("rx", "ry", "rz"), partial(quaternions, rotations=lambda v: Rotation.from_rotvec(scale * v))
     if any(axis == "rw" for _, axis, _ in places):
-        turn = replace(QUATERNION, axes=("rw", "rx", "ry", "rz"))
+        turn = ("rw", "rx", "ry", "rz"), QUATERNION[1]
     first = sections[0][0]
     filled = [*rows[:first], *(cells + [""] * (width - len(cells)) for cells in table.values())]  # empty: occlusions
     return Layout(first, width, places, lengths.pop(), 0, rate=rates.pop(), turn=turn).read(filled, path)

@@ -13,7 +13,7 @@ from ..io.arrays import FloatArray
 from ..learning.baselines import BASELINES
 from . import figures
 from .body_picture import MeshSummary, mesh_picture
-from .data import Driven, RunReport, TrialResults, best_and_worst, shown_markers
+from .data import Driven, RunReport, TrialResults, best_and_worst, shown_markers, spread
 from .page import Block, Canvas, Drawn, Part
 from .wording import TONES, mm_text, unbroken
 
@@ -76,7 +76,7 @@ def input_sequences(driven: Driven, trials: TrialResults) -> dict[str, FloatArra
     others = [name for name in values if name not in test and name not in driven.scaled][:1]
     highest = sorted(driven.scaled, key=lambda name: float(values[name].max()))[-1:]
     many = _SEQUENCES - len(others) - len(highest)
-    picked = [test[at] for at in np.unique(np.linspace(0, len(test) - 1, many).round().astype(int))] if test else []
+    picked = [test[at] for at in spread(np.arange(len(test)), many)]
     titles = {name: f"{name}, a trial of the training" for name in others}
     titles |= {name: f"{name}, a test trial" for name in picked}
     titles |= {name: f"{name}, a test trial at higher {driven.quantity.words}" for name in highest}

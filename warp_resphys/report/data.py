@@ -248,6 +248,13 @@ def at_times(positions: FloatArray, frames: FloatArray, times: FloatArray) -> Fl
     return between
 
 
+def spread(values: IntArray, most: int) -> IntArray:
+    """Returns the values (N,), or some of them that are spread evenly, the first and the last one among them."""
+    return (
+        values[np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))] if len(values) > most else values
+    )
+
+
 def shown_markers(target: FloatArray) -> IntArray:
     """Returns the indices of the markers (T, M, 3) of a trial that were seen in a frame; NaN where one was not."""
     return np.flatnonzero(np.isfinite(target).all(axis=2).any(axis=0))

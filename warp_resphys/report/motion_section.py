@@ -23,7 +23,7 @@ from ..io.arrays import FloatArray
 from ..learning.metrics import mean_distance
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from . import figures
-from .data import Film, RunReport, at_times, shown_markers
+from .data import Film, RunReport, at_times, shown_markers, spread
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
 from .motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
 from .page import Block, Canvas, Drawn, Part, ViewInSpace
@@ -54,7 +54,7 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
         row = trials.worst
         film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
         points = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
-        points = points[np.unique(np.linspace(0, len(points) - 1, _MOST_POINTS).round().astype(int))]
+        points = spread(points, _MOST_POINTS)
     if film is None or film.trial not in trials.names or not shown_models(film.positions):
         return None
     row = trials.names.index(film.trial)
@@ -124,8 +124,7 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     motion = motion_of(data, every_model=True)
     if motion is None:
         return []
-    if (count := len(motion.times)) > _MOST_FRAMES:
-        motion = motion.at(np.unique(np.linspace(0, count - 1, _MOST_FRAMES).round().astype(int)))
+    motion = motion.at(spread(np.arange(len(motion.times)), _MOST_FRAMES))
     compared, against = ("markers", "the measured ones") if data.sees_markers else ("vertices", "the target")
     caption = (
         f"The trial {name} in space: drag to turn, with Shift to move, pinch or scroll to zoom; arrow keys turn, plus "

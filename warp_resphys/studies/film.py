@@ -18,7 +18,7 @@ from ..io.resuming import finished_record
 from ..io.safe_files import read_json
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..learning.baselines import BASELINES
-from ..report.data import at_times
+from ..report.data import at_times, spread
 from ..report.layers import RenderScene
 from ..report.motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs
 from ..report.render import DrawingError, write_film
@@ -142,5 +142,4 @@ def _shown(robot: Robot, count: int) -> np.ndarray:
         return np.arange(count)
     body = robot.simulator.body
     _, away = hangs(body.mesh, body.fixed_vertices, np.asarray(robot.simulator.gravity))
-    tip = np.flatnonzero(away >= _AT_THE_TIP * away.max())
-    return np.asarray(tip[np.unique(np.linspace(0, len(tip) - 1, _MOST_MARKERS).round().astype(int))])
+    return spread(np.flatnonzero(away >= _AT_THE_TIP * away.max()), _MOST_MARKERS)

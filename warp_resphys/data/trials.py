@@ -247,19 +247,19 @@ class Trials:
         """
         rows = self.rows(names)
         static = self.begins[rows[0]] == STATIC
-        given = {key: torch.from_numpy(self._during(key, rows, time_step)) for key in self.inputs}
+        acting = {key: torch.from_numpy(self._during(key, rows, time_step)) for key in self.inputs}
         if any(self.payload):
             hung = payload_inputs(body, payload_at, self.payload[rows])
-            given |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
+            acting |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
         if static:
-            return Inputs(**given), Inputs(**{key: given[key][-1] for key in self.inputs})  # under the last values
+            return Inputs(**acting), Inputs(**{key: acting[key][-1] for key in self.inputs})  # under the last values
         moved = self.contact_at(names, body, time_step)
-        given |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
+        acting |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
         if (poses := self.base_at(names, time_step)) is not None:
             fixed = torch.from_numpy(np.asarray(body.mesh.vertices[body.fixed_vertices], dtype=np.float64))
-            given["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
+            acting["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
         before = self.resting if self.begins[rows[0]] == UNDER_INPUTS else {}
-        return Inputs(**given), Inputs(**{key: torch.from_numpy(values[rows]) for key, values in before.items()})
+        return Inputs(**acting), Inputs(**{key: torch.from_numpy(values[rows]) for key, values in before.items()})
 
 
 def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArray) -> dict[str, FloatArray]:

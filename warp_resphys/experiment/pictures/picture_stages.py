@@ -183,7 +183,7 @@ class _Plan:
                 result[name] = configured_parameters(pose.simulator, [parameter])[parameter]
         return result
 
-    def given(self, poses: Sequence[SeenPose]) -> Values:
+    def clamp_turns(self, poses: Sequence[SeenPose]) -> Values:
         """The turns of second clamps, where they are not identified."""
         turns = {pose.name: math.radians(self.data.poses[pose.name].clamp_turn) for pose in poses}
         if CLAMP_TURN in self.settings.identify.parameters:
@@ -207,7 +207,7 @@ class _Plan:
             return pose
         if known and name in self._cameras:
             return pose.before(self._cameras[name])
-        guess = {**self.guess(self.bounds([pose], lambda name, per: True), [pose]), **self.given([pose]), **known}
+        guess = {**self.guess(self.bounds([pose], lambda name, per: True), [pose]), **self.clamp_turns([pose]), **known}
         shape = pose.shape(values_of(pose, guess), near)
         return pose.before({lens: self._best_camera(pose, lens, shape, guess) for lens in pose.lenses})
 
@@ -238,13 +238,13 @@ class _Plan:
         known = dict(identified) if model == "sysid" else {}
         pose = self.pose(name, known, model != MODELS[0], near)
         bounds = self.bounds([pose], lambda name, per: name in _PLACED and (model != "sysid" or per == "trial"))
-        given = {**self.given([pose]), **known}
+        fixed = {**self.clamp_turns([pose]), **known}
         fitted = {key: known[key] for key in bounds if key in known}
         if bounds and not fitted:
             wanted, guess = self.settings.identify, self.guess(bounds, [pose])
-            misfit = PictureMisfit([pose], bounds, given, [near])
+            misfit = PictureMisfit([pose], bounds, fixed, [near])
             fitted = dict(search_parameters(misfit, [guess], wanted.max_evaluations, wanted.tolerance).parameters)
-        values = {**given, **fitted}
+        values = {**fixed, **fitted}
         shared = values_of(pose, values)
         return pose, values, (shared, pose.shape(shared, near))
 
@@ -260,7 +260,7 @@ def identify_pictures(context: StageContext) -> None:
     plan = _Plan(settings, context.run_dir)
     poses = [plan.pose(name, {}) for name in settings.data.train]
     bounds = plan.bounds(poses, lambda name, per: True)
-    misfit = PictureMisfit(poses, bounds, plan.given(poses))
+    misfit = PictureMisfit(poses, bounds, plan.clamp_turns(poses))
     guess, most = plan.guess(bounds, poses), wanted.max_evaluations
     with shown(context.name, wanted.starts * most) as report:
         starts = first_points(misfit, guess, wanted.starts, wanted.candidates, settings.seed)

@@ -126,7 +126,7 @@ def test_a_law_is_identified_from_observed_motions_and_simulates_on():
         motions = ObservedMotions.of(robot, robot.rollout(start, 30).q, start)
     simulator = Simulator(body, Corotated(150e3, 0.45, density=1070.0), time_step=0.01)
     settings = LawSettings(terms=["c01", "c20"], branches=0, families=0, trials=None)
-    law = identify_law(simulator, motions, train=motions.dataset.names[:3], validation=["motion 3"], settings=settings)
+    law = identify_law(simulator, motions, train=motions.trials.names[:3], validation=["motion 3"], settings=settings)
     assert law.accepted
     assert law.groups == ("elastic", "viscosity")
     assert {name: law.constants[name] for name in truth} == pytest.approx(truth, rel=0.05)

@@ -77,7 +77,7 @@ def test_trials_have_their_values_sessions_their_marker_places_and_finished_sear
     seen = torch.stack([MARKERS(positions) for positions in q])
     seen[:, 1, 0] += torch.tensor([0.0, 1e-3, 0.0])
     motions = ObservedMotions.of(wrong, seen, inputs=wr.Inputs(tendon_tension=logged), observation=MARKERS)
-    motions = replace(motions, dataset=replace(motions.dataset, sessions=("monday", "friday", "monday")))
+    motions = replace(motions, dataset=replace(motions.trials, sessions=("monday", "friday", "monday")))
     ranges = {
         "youngs_modulus": Bounds(1e5, 1e6),
         "tendon_tension_factor": Bounds(0.5, 2.0, False, Prior(1.0, 0.3), "trial"),
@@ -118,7 +118,7 @@ def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     force = fit_force(wrong, seen, found, network=network, trainer=TrainerSettings(epochs=60))
     unseen = let_go(robot, 0.09, known_start=True)
     corrected, uncorrected = evaluate(wrong, unseen, force), evaluate(wrong, unseen)
-    at_rest = (torch.from_numpy(unseen.dataset.observed[0]) - wrong.rest_positions).norm(dim=-1).mean(-1)
+    at_rest = (torch.from_numpy(unseen.trials.observed[0]) - wrong.rest_positions).norm(dim=-1).mean(-1)
     assert corrected.shape == (STEPS + 1, 1)
     assert corrected[0, 0] == 0.0
     assert float(corrected.mean()) < 0.2 * float(uncorrected.mean())
@@ -179,7 +179,7 @@ def test_workers_training_through_the_simulator_and_recurrent_networks_are_for_f
 def test_forces_from_markers_bring_the_markers_there(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.1, markers=MARKERS)
-    seen.dataset.observed[0, 5, 1] = np.nan
+    seen.trials.observed[0, 5, 1] = np.nan
     found = reconstruct(wrong, seen)
     (forces,) = (torch.from_numpy(array).double() for array in found.of(found.names, "force"))
     replayed = evaluate(wrong, seen, lambda state, step: forces[:, step + 1])

@@ -98,7 +98,7 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage == "mesh_check":
         return (1.0 + settings.mesh_check**3) * CHECKED_SECONDS / settings.time_step, 0.0, 0.0
     if stage == "time":  # three rows, one trial at a time, which takes twice as long
-        return 6.0 * steps_of(experiment, "simulation", experiment.dataset.moving(settings.groups["1"])), 0.0, 0.0
+        return 6.0 * steps_of(experiment, "simulation", experiment.trials.moving(settings.groups["1"])), 0.0, 0.0
     if stage == "identify":
         wanted = settings.identify
         names = train if wanted.trials is None else tuple(evenly(train, wanted.trials))
@@ -113,8 +113,8 @@ def steps_of(experiment: Experiment, model: str, names: Sequence[str], longest: 
     """Returns the number of steps of a model's simulator in trials, the longest of those that begin alike; 1 a pose."""
     settings, kind = experiment.settings, MODELS[model][0]
     time_step, total = experiment.settings_of("simulation" if kind == "law" else kind).time_step, 0.0
-    for batch in experiment.dataset.batches(names):
-        limits = [experiment.dataset.seconds(batch), settings.trial_seconds, longest]
+    for batch in experiment.trials.batches(names):
+        limits = [experiment.trials.seconds(batch), settings.trial_seconds, longest]
         seconds = min(limit for limit in limits if limit is not None)
         total += len(batch) * max(math.ceil(seconds / time_step - 1e-6), 1)
     return total
@@ -123,7 +123,7 @@ def steps_of(experiment: Experiment, model: str, names: Sequence[str], longest: 
 def pace_of(experiment: Experiment, reconstructed: bool) -> float:
     """Returns the time of a step of one of several trials, or of the reconstruction of its forces [s]."""
     settings = experiment.settings
-    names = experiment.dataset.batches(settings.split.train)[0][: min(settings.batch or _MOST_TRIALS, _MOST_TRIALS)]
+    names = experiment.trials.batches(settings.split.train)[0][: min(settings.batch or _MOST_TRIALS, _MOST_TRIALS)]
     replay = experiment.motions.replay(experiment.simulator("simulation"), names)
     simulator, (constants, inputs, resting) = replay.simulator, replay.prepare()
     if replay.is_static:

@@ -66,7 +66,7 @@ class Experiment:
     on_failure: str = "raise"
 
     @cached_property
-    def dataset(self) -> Trials:
+    def trials(self) -> Trials:
         """All trials, including those with scaled inputs if the stage tests them."""
         shared = self.folder / self.settings.shared
         dataset = Trials.read(shared / DATASET)
@@ -100,7 +100,7 @@ class Experiment:
     def settings_of(self, kind: str) -> SimulatorSettings:
         """Settings of a simulator of some kind, see `simulator`."""
         settings, identified = self.settings, self.settings.identify
-        own: dict[str, Any] = {"gravity": tuple(self.dataset.gravity.tolist())}
+        own: dict[str, Any] = {"gravity": tuple(self.trials.gravity.tolist())}
         if kind == "published":
             published = settings.published
             assert published is not None
@@ -128,7 +128,7 @@ class Experiment:
     @cached_property
     def motions(self) -> ObservedMotions:
         """The trials with their observation: M markers, or all vertices."""
-        settings, dataset = self.settings, self.dataset
+        settings, dataset = self.settings, self.trials
         observe: Observation = WHOLE_STATE
         if dataset.bound is not None:
             markers = settings.markers

@@ -51,7 +51,7 @@ def identify(context: StageContext) -> None:
             *(experiment.simulator(MODELS[model][0]), experiment.motions, parameters, wanted.first_guess),
             names=names,
             held_out=[name for name in settings.split.names if name not in names],
-            accuracy=_accuracy(settings, experiment.dataset) if model == "sysid" else None,
+            accuracy=_accuracy(settings, experiment.trials) if model == "sysid" else None,
             seconds=min(filter(None, (settings.trial_seconds, wanted.seconds)), default=None),
             starts=wanted.starts,
             candidates=wanted.candidates,
@@ -176,7 +176,7 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, the observed points of every model's roll-outs of the test trials, and errors.json."""
     settings: StageSettings = context.settings
     experiment, parts = Experiment(settings, context.run_dir, "count"), Parts.of(context, workers, settings.batch)
-    found = experiment.reconstructed("resphys") if experiment.dataset.bound is None and not settings.with_law else None
+    found = experiment.reconstructed("resphys") if experiment.trials.bound is None and not settings.with_law else None
     compared = Comparison(
         {name: experiment.model(name) for name in experiment.models},
         experiment.motions,

@@ -41,8 +41,8 @@ def check_mesh(context: StageContext) -> None:
         if len(meshes[0].vertices) == len(meshes[1].vertices):
             raise InputError("its cells are given, and quadratic already; compare it with a finer one.")
         content |= {"cells": [len(mesh.cells) for mesh in meshes], "vertices": [len(m.vertices) for m in meshes]}
-        sizes = amplitudes(experiments[0].dataset, settings.groups["1"])
-        moving = experiments[0].dataset.moving([*sizes])
+        sizes = amplitudes(experiments[0].trials, settings.groups["1"])
+        moving = experiments[0].trials.moving([*sizes])
         names = [max(moving, key=sizes.__getitem__)] if moving else [*sizes][:_CHECKED_POSES]
         shown, observed = list[FloatArray](), np.empty(0)
         with Progress(context.name, 2, "meshes") as progress, torch.no_grad():
@@ -51,7 +51,7 @@ def check_mesh(context: StageContext) -> None:
                     experiment.model_simulator(model), names, experiment.identified(model)
                 )
                 if moving:
-                    seconds = first_change(experiment.dataset, names[0]) + CHECKED_SECONDS
+                    seconds = first_change(experiment.trials, names[0]) + CHECKED_SECONDS
                     replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
                 points = (
                     replay(
@@ -60,8 +60,8 @@ def check_mesh(context: StageContext) -> None:
                     .cpu()
                     .numpy()
                 )
-                shown.append(as_markers(points, experiment.dataset.labels))
-                observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.dataset.labels)
+                shown.append(as_markers(points, experiment.trials.labels))
+                observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.trials.labels)
                 progress.advance()
         where = np.where(np.isfinite(observed), shown[1], np.nan)
         pairs = ((shown[0], observed), (shown[1], observed), (shown[0], where))

@@ -27,7 +27,7 @@ def time_models(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    names = experiment.dataset.moving(settings.groups["1"])
+    names = experiment.trials.moving(settings.groups["1"])
     simulator = experiment.model_simulator("resphys")
     learned = experiment.learned("resphys")
     replays = {name: experiment.motions.replay(simulator, [name], experiment.identified("resphys")) for name in names}

@@ -67,13 +67,13 @@ class Comparison:
     @cached_property
     def filmed(self) -> str:
         """Name of the tested trial with the largest motion, whose vertices are kept."""
-        sizes = amplitudes(self.motions.dataset, self.groups["1"])
+        sizes = amplitudes(self.motions.trials, self.groups["1"])
         return max(sizes, key=sizes.__getitem__)
 
     @cached_property
     def film_steps(self) -> IntArray:
         """Steps of the inputs at which vertices are kept."""
-        dataset = self.motions.dataset
+        dataset = self.motions.trials
         steps = int(dataset.seconds([self.filmed]) / dataset.time_step + 1e-6)
         return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
 
@@ -98,7 +98,7 @@ class Comparison:
         order = [own for part in parts for own in part.names]
         rows = [order.index(own) for own in self.names]
         if name == "observed":
-            return self.parts.joined(parts, name, self.motions.dataset.observed.shape[1])[rows]
+            return self.parts.joined(parts, name, self.motions.trials.observed.shape[1])[rows]
         return np.concatenate([self.parts.read(part, name) for part in parts])[rows]
 
     @cached_property
@@ -114,7 +114,7 @@ class Comparison:
         """(F, N, 3) vertices of the filmed trial at `film_steps` [m]."""
         parts = self._rolled_out[0][model]
         bodies = next(self.parts.read(part, "film") for part in parts if self.filmed in part.names)
-        substeps = round(self.motions.dataset.time_step / self.models[model].simulator.time_step)
+        substeps = round(self.motions.trials.time_step / self.models[model].simulator.time_step)
         return np.asarray(bodies[np.minimum(substeps * self.film_steps, len(bodies) - 1)])
 
     @cached_property
@@ -130,7 +130,7 @@ class Comparison:
         """
         made: dict[int, Mapping[str, Sensitivity]] = {}
         found: dict[str, Mapping[str, Sensitivity]] = {}
-        for name, model in self.models.items() if self.motions.dataset.bound is not None else ():
+        for name, model in self.models.items() if self.motions.trials.bound is not None else ():
             replaced = model.learned is not None and model.learned.replaces_simulator
             if replaced or not model.has_intervals or (uncertain and model.identified.uncertainty is None):
                 continue
@@ -141,7 +141,7 @@ class Comparison:
         return found
 
     def _spreads(self, names: Sequence[str], linear: Linear, left_out: bool = False) -> dict[str, FloatArray]:
-        dataset, models = self.motions.dataset, self.models
+        dataset, models = self.motions.trials, self.models
         spreads = {m: parameter_spread(dataset, names, models[m].identified, x, left_out) for m, x in linear.items()}
         return {model: spread for model, spread in spreads.items() if spread is not None}
 
@@ -170,7 +170,7 @@ class Comparison:
         observed = dict(zip(names, counted(self.motions, self.train, names), strict=True))
         for model, own in self._linear.items():
             predicted = dict(zip(names, self.simulated[model][: len(names)], strict=True))
-            fits[model] = free_fits(self.motions.dataset, observed, predicted, own)
+            fits[model] = free_fits(self.motions.trials, observed, predicted, own)
         return {"free_fits": fits} if any(fits.values()) else {}
 
     def _intervals(self) -> dict[str, Any]:
@@ -179,7 +179,7 @@ class Comparison:
         Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`). The
         intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
         """
-        motions, dataset, test = self.motions, self.motions.dataset, self.groups["1"]
+        motions, dataset, test = self.motions, self.motions.trials, self.groups["1"]
         names = [*chain(*dataset.batches(self.calibration))]
         observed, target = dataset.observed[dataset.rows(names)], counted(motions, self.train, test)
         rest = rest_places(dataset)

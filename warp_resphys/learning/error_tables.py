@@ -39,7 +39,7 @@ class ComparedModels:
 
     def errors(self) -> dict[str, Any]:
         """Returns all tables, as in errors.json."""
-        dataset, names = self.motions.dataset, self.groups["1"]
+        dataset, names = self.motions.trials, self.groups["1"]
         every, count = [name for group in self.groups.values() for name in group], len(names)
         points = counted(self.motions, self.train, every)
         observed = as_markers(points, dataset.labels)
@@ -75,7 +75,7 @@ class ComparedModels:
         """Entry ``horizons``: errors of the first seconds, by duration and model; empty without any."""
         found = {}
         for seconds in self.horizons:
-            frames = slice(round(seconds / self.motions.dataset.time_step) + 1)
+            frames = slice(round(seconds / self.motions.trials.time_step) + 1)
             errors = {m: _errors(x[:, frames], observed[:, frames], [0] * len(observed)) for m, x in test.items()}
             found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
         return {"horizons": found} if found else {}
@@ -83,7 +83,7 @@ class ComparedModels:
     def _by_phase(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
         """Entry ``phases``: errors by phase of the inputs and model; empty without inputs."""
         names = self.groups["1"]
-        at, seen = phases_of(self.motions.dataset, names), np.isfinite(observed[: len(names)]).all(-1).any(-1)
+        at, seen = phases_of(self.motions.trials, names), np.isfinite(observed[: len(names)]).all(-1).any(-1)
         frames = {phase: (at == phase) & seen for phase in PHASES}
         found = {
             phase: {
@@ -97,7 +97,7 @@ class ComparedModels:
 
     def _by_scale(self, models: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
         """Entries of trials that left the training range, and of scaled inputs."""
-        dataset, count, content = self.motions.dataset, len(self.groups["1"]), dict[str, Any]()
+        dataset, count, content = self.motions.trials, len(self.groups["1"]), dict[str, Any]()
         at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(self.groups)}
         ranges = {
             scale: {m: _range(steps[rows], self.groups[scale], dataset.time_step) for m, steps in self.left.items()}
@@ -117,7 +117,7 @@ class ComparedModels:
 
 def counted(motions: ObservedMotions, train: Sequence[str], names: Sequence[str]) -> FloatArray:
     """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training."""
-    observed = motions.dataset.observed[motions.dataset.rows(names)]
+    observed = motions.trials.observed[motions.trials.rows(names)]
     for row, name in enumerate(names):
         if name in train:
             observed[row, : motions.learned_steps(observed.shape[1] - 1) + 1] = np.nan

@@ -54,7 +54,7 @@ def evaluate(
         InputError: an input that the body does not take.
         ConvergenceError: no initial equilibrium.
     """
-    dataset, parts = motions.dataset, parts or Parts("evaluate")
+    dataset, parts = motions.trials, parts or Parts("evaluate")
     names = dataset.names if names is None else names
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
@@ -89,9 +89,9 @@ def rollout_parts(
         label: first part of the names of the files.
     """
     used, parts = replace(simulator, solver=replace(simulator.settings, on_failure="count")), list[TrialPart]()
-    for number, whole in enumerate(motions.dataset.batches(names)):
-        steps = math.ceil(motions.dataset.seconds(whole) / simulator.time_step)
-        if not motions.dataset.moving(whole) and isinstance(force, Learned) and force.replaces_simulator:
+    for number, whole in enumerate(motions.trials.batches(names)):
+        steps = math.ceil(motions.trials.seconds(whole) / simulator.time_step)
+        if not motions.trials.moving(whole) and isinstance(force, Learned) and force.replaces_simulator:
             steps = POSE_STEPS
         for first, some in cut(whole, batch):
             work = partial(roll_out, used, motions, some, force, Identified.of(parameters), filmed)
@@ -176,7 +176,7 @@ class TrialRollout:
         self.start = motions.start(self.replay, identified) if start is None else start
         self._constants, self._inputs, self._resting = self.replay.prepare(self._values)
         self._first: State | None = None  # of motions, whatever the network
-        substeps = round(motions.dataset.time_step / simulator.time_step)
+        substeps = round(motions.trials.time_step / simulator.time_step)
         self.steps = -(-self.replay.steps(self.start) // substeps) * substeps
         if self.replay.is_static:
             self.steps = POSE_STEPS if data_driven else 0
@@ -243,7 +243,7 @@ class TrialRollout:
                 series.append(self.points(state))
         if not series:
             return [np.full(1, np.nan) for _ in observed]
-        first = first_frame(motions.dataset, self.replay.trials.names)
+        first = first_frame(motions.trials, self.replay.trials.names)
         pairs = zip(self.at_frames(series)[:, first:], observed[:, first:].cpu().numpy(), strict=True)
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
@@ -269,7 +269,7 @@ def rollout_error(
 
     def error(learned: Learned) -> float:
         if not runs:  # The starts of the trials are estimated once, at the first call.
-            batches = motions.dataset.batches(names)
+            batches = motions.trials.batches(names)
             runs.extend(TrialRollout(simulator, motions, batch, identified, data_driven) for batch in batches)
         rows = [row for run in runs for row in run.errors(learned)]
         mean = summarise(rows)["mean"]

@@ -61,7 +61,7 @@ class ObservedMotions:
     """Trials of one body with an observation, as simulators replay them.
 
     Attributes:
-        dataset: the trials.
+        trials: of all names.
         observe: observation of the body, M points: markers, all vertices, or another sensor.
         release: how the start of a motion is estimated.
         payload_at: vertices that carry the payloads of the trials; None if there are none.
@@ -69,7 +69,7 @@ class ObservedMotions:
         train_fraction: share of every trial, from its beginning, that is learned from.
     """
 
-    dataset: Trials
+    trials: Trials
     observe: Observation = WHOLE_STATE
     release: ReleaseSettings = field(default_factory=ReleaseSettings)
     payload_at: PlaceSettings | None = None
@@ -137,21 +137,21 @@ class ObservedMotions:
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the observed points, which are numbers where they have none."""
-        return self.dataset.labels or tuple(map(str, range(self.dataset.observed.shape[2])))
+        return self.trials.labels or tuple(map(str, range(self.trials.observed.shape[2])))
 
-    def trials(self, names: Sequence[str], simulator: Simulator) -> TrialBatch:
+    def batch(self, names: Sequence[str], simulator: Simulator) -> TrialBatch:
         """Trials that begin in the same way, on the device of a simulator, with inputs at its steps."""
-        batch = TrialBatch.of(self.dataset, names, simulator.body, self.payload_at, simulator.time_step)
+        batch = TrialBatch.of(self.trials, names, simulator.body, self.payload_at, simulator.time_step)
         return batch.to(simulator.rest_positions)
 
     def replay(self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None) -> Replay:
-        """Replay of trials of one batch of the dataset, with the markers where they were identified."""
+        """Replay of trials of one batch, with the markers where they were identified."""
         observe, placement = self.observe, None if identified is None else identified.placement
         if placement is not None:
             assert isinstance(observe, Markers)
-            placed = placement_of(placement, self.labels, self.dataset.session(names[0]))
+            placed = placement_of(placement, self.labels, self.trials.session(names[0]))
             observe = PlacedMarkers.of(observe, placed).to(simulator.rest_positions)
-        return Replay(simulator, observe, self.trials(names, simulator))
+        return Replay(simulator, observe, self.batch(names, simulator))
 
     def start(self, replay: Replay, identified: Identified | None = None) -> Start:
         """Estimates how the trials of a replay begin.
@@ -164,13 +164,13 @@ class ObservedMotions:
             ConvergenceError: a body cannot be held, or a step of the simulation fails.
         """
         simulator, trials = replay.simulator, replay.trials
-        begins = self.dataset.begin_of(trials.names[0])
+        begins = self.trials.begin_of(trials.names[0])
         if begins == GIVEN:
-            rows, initial = self.dataset.rows(trials.names), self.dataset.initial
+            rows, initial = self.trials.rows(trials.names), self.trials.initial
             if initial is not None:
                 q, v = (simulator.tensor(initial[rows, at]) for at in (0, 1))
             else:
-                q, velocity = trials.observed[:, 0], self.dataset.velocity
+                q, velocity = trials.observed[:, 0], self.trials.velocity
                 v = torch.zeros_like(q) if velocity is None else q.new_tensor(velocity[rows, 0])
             return Start(State(q, v), q.new_zeros(len(q)))
         known = {} if identified is None else identified.values(simulator)
@@ -189,8 +189,8 @@ class ObservedMotions:
     def replays(
         self, simulator: Simulator, names: Sequence[str] | None = None, identified: Identified | None = None
     ) -> list[tuple[Replay, Start]]:
-        """Replays of any trials, one for each batch of the dataset, each with its start."""
-        batches = self.dataset.batches(self.dataset.names if names is None else names)
+        """Replays of any trials, one for each batch, each with its start."""
+        batches = self.trials.batches(self.trials.names if names is None else names)
         replays = [self.replay(simulator, batch, identified) for batch in batches]
         return [(replay, self.start(replay, identified)) for replay in replays]
 
@@ -200,10 +200,10 @@ class ObservedMotions:
         Only the part of each trial that is used for training is returned.
         """
         simulator, trials = replay.simulator, replay.trials
-        if self.dataset.smoothed is not None and self.dataset.begin_of(trials.names[0]) in RESTING:
-            smoothed = simulator.tensor(self.dataset.smoothed[self.dataset.rows(trials.names)])
+        if self.trials.smoothed is not None and self.trials.begin_of(trials.names[0]) in RESTING:
+            smoothed = simulator.tensor(self.trials.smoothed[self.trials.rows(trials.names)])
             targets = later(smoothed, start.delay, simulator.time_step)
-        elif self.dataset.begin_of(trials.names[0]) in (GIVEN, STATIC) or not self.dataset.labels:
+        elif self.trials.begin_of(trials.names[0]) in (GIVEN, STATIC) or not self.trials.labels:
             targets = trials.observed
         else:
             targets = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
@@ -215,23 +215,23 @@ class ObservedMotions:
 
     def base(self, names: Sequence[str], simulator: Simulator) -> BaseFrame | None:
         """Frame of the base to which the body is fixed in trials; None if the base stands still."""
-        poses = self.dataset.base_at(names, simulator.time_step)
+        poses = self.trials.base_at(names, simulator.time_step)
         return None if poses is None else BaseFrame(poses.to(simulator.rest_positions), simulator.time_step)
 
     def _base_movement(self, names: Sequence[str], simulator: Simulator) -> torch.Tensor | None:
         """(K, R, A) motion of the base during each step as network inputs; None if the base stands still."""
-        poses, mask = self.dataset.base_at(names, simulator.time_step), self.base_movement_mask(simulator)
+        poses, mask = self.trials.base_at(names, simulator.time_step), self.base_movement_mask(simulator)
         if poses is None or mask is None:
             return None
-        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.trials.gravity))
         return movement[..., mask].to(simulator.rest_positions)
 
     def base_movement_mask(self, simulator: Simulator) -> torch.Tensor | None:
         """(15,) bool, components of `base_movement` that vary and are network inputs; None if the base stands still."""
-        poses = self.dataset.base_at(self.dataset.names, simulator.time_step)
+        poses = self.trials.base_at(self.trials.names, simulator.time_step)
         if poses is None:
             return None
-        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.dataset.gravity))
+        movement = base_movement(poses, simulator.time_step, torch.from_numpy(self.trials.gravity))
         return movement.flatten(0, 1).std(0) > _STANDS_STILL
 
     def conditions(
@@ -252,8 +252,8 @@ class ObservedMotions:
         _, inputs, resting = replay.prepare(parameters)
         constant = list[torch.Tensor]()
         if self.payload_at is not None and (payload or self.actuation.sees_payload):
-            rows = self.dataset.rows(replay.trials.names)
-            constant.append(replay.trials.times.new_tensor(self.dataset.payload[rows])[:, None])
+            rows = self.trials.rows(replay.trials.names)
+            constant.append(replay.trials.times.new_tensor(self.trials.payload[rows])[:, None])
         filters = self.actuation.filter_time_constants
         acting = resting if replay.is_static else inputs
         driven = {name: values for name, values in acting.actuation.items() if name != PAYLOAD.name}

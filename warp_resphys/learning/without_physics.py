@@ -43,7 +43,7 @@ def without_physics(
         By model: the observed points (R, T, M, 3) [m], the settings in words, and of models that cannot predict all
         trials, the reason.
     """
-    dataset = motions.dataset
+    dataset = motions.trials
     shape = (len(names), *dataset.observed.shape[1:])
     values: dict[str, FloatArray] = {}
     settings: dict[str, str] = {}
@@ -93,7 +93,7 @@ def _kind(begins: str) -> str:
 
 def _on_time(motions: ObservedMotions, names: Sequence[str], predicted: FloatArray) -> FloatArray:
     """(R, T, M, 3) predicted motions with the delay that the first frames of each trial show [m]."""
-    dataset, settings = motions.dataset, motions.release
+    dataset, settings = motions.trials, motions.release
     rows = dataset.rows(names)
     shown: BoolArray = np.asarray(np.isfinite(predicted).all(axis=(2, 3)))
     last = np.maximum.accumulate(np.where(shown, np.arange(shown.shape[1]), 0), axis=1)  # held after the prediction

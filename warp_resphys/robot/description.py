@@ -245,7 +245,7 @@ def describe(folder: Path, model: str) -> Description:
         raise InputError(f"the model is {model!r}: {folder} has {listed(models)}.")
     kind, _ = experiment.sources(model)
     kind = "simulation" if kind == "identified" and settings.identify is None else kind
-    simulator, dataset = experiment.simulator(kind), experiment.dataset
+    simulator, dataset = experiment.simulator(kind), experiment.trials
     identified = experiment.identification(model)
     errors = read_if_there(folder / ERRORS)
     intervals = errors.get("intervals", {"level": LEVEL, "models": {}})

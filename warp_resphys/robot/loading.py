@@ -99,10 +99,7 @@ def trial_names(robot: Robot) -> tuple[str, ...]:
     Raises:
         InputError: the robot was loaded from a file.
     """
-    return (
-        *(first := held_out_names(robot)),
-        *(name for name in _experiment(robot).dataset.names if name not in first),
-    )
+    return (*(first := held_out_names(robot)), *(name for name in _experiment(robot).trials.names if name not in first))
 
 
 def held_out_names(robot: Robot, moving: bool = False) -> tuple[str, ...]:
@@ -117,7 +114,7 @@ def held_out_names(robot: Robot, moving: bool = False) -> tuple[str, ...]:
     """
     experiment = _experiment(robot)
     names = experiment.settings.split.test
-    return experiment.dataset.moving(names) if moving else names
+    return experiment.trials.moving(names) if moving else names
 
 
 def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
@@ -128,7 +125,7 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
         ConvergenceError: the simulator cannot reach the initial state.
     """
     experiment = _experiment(robot)
-    names = experiment.dataset.names
+    names = experiment.trials.names
     if name not in names:
         raise InputError(f"the trial is {name!r}: {robot.folder} has {listed(names)}.")
     simulator, model = experiment.model_simulator(robot.description.model), robot.description.model
@@ -139,11 +136,11 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
         constants, _, resting = replay.prepare(identified.values(simulator))
         inputs = {key: value.to(simulator.rest_positions) for key, value in replay.trials.inputs.actuation.items()}
         inputs = _commands(experiment, robot, name, inputs)
-        load = float(experiment.dataset.payload[experiment.dataset.rows([name])[0]])
+        load = float(experiment.trials.payload[experiment.trials.rows([name])[0]])
         if load:
             inputs[PAYLOAD.name] = simulator.tensor([load])
-        base = experiment.dataset.base_at([name], simulator.time_step)
-        if experiment.dataset.begin_of(name) == STATIC:
+        base = experiment.trials.base_at([name], simulator.time_step)
+        if experiment.trials.begin_of(name) == STATIC:
             inputs = {key: value[-1] if value.ndim == 3 else value for key, value in inputs.items()}
             begun, steps = robot.settle(1, **inputs), 0
         else:
@@ -167,7 +164,7 @@ def _commands(
 ) -> dict[str, torch.Tensor]:
     """Commands under which the robot does what it did under those of a trial with a zero or factor of its own."""
     values, commands = experiment.parameters(robot.description.model), dict(inputs)
-    owners = (name, experiment.dataset.session(name))
+    owners = (name, experiment.trials.session(name))
     for key, given in inputs.items():
         zero, factor = (values.get(f"{key}_{word}") for word in ("zero", "factor"))
         own_zero, own_factor = (

@@ -70,9 +70,9 @@ def identify(
         InputError: an unknown parameter, an empty range, or a motion in which nothing moves.
         ConvergenceError: the simulation fails at every start.
     """
-    trials = motions.dataset.names if names is None else tuple(names)
+    trials = motions.trials.names if names is None else tuple(names)
     ranges = {name: Bounds.of(limits) for name, limits in parameters.items()}
-    bounds, replays = _bounds_of_owners(ranges, motions.dataset, trials), motions.replays(simulator, trials)
+    bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
     known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds]), **(first_guess or {})}
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}
     seconds, many = _learned(motions, replays, seconds), 4 * starts if candidates is None else candidates
@@ -97,7 +97,7 @@ def _misfit(
     known: Mapping[str, float] | None = None,
 ) -> Misfit:
     """Misfit to motions, whose inputs may be late."""
-    shares = independent(motions.dataset.labels)
+    shares = independent(motions.trials.labels)
     return Misfit(replays, bounds, seconds, accuracy, known, motions.release.delay, shares)
 
 
@@ -182,7 +182,7 @@ def _with_first_frames(
     """
     known, values, deviations = {**found.parameters, **found.own}, dict(found.own), dict(found.own_deviation)
     wanted = {name: limits for name, limits in ranges.items() if limits.per == "trial"}
-    for name in (name for name in names if wanted and motions.dataset.begin_of(name) in RESTING):
+    for name in (name for name in names if wanted and motions.trials.begin_of(name) in RESTING):
         bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
         guess = {full: _guess(full, limits, known) for full, limits in bounds.items()}
         try:

@@ -101,7 +101,7 @@ def stretches_in(
     """
     mesh = simulator.body.mesh
     if motions.sees_states:
-        bodies = [motions.dataset.observed[motions.dataset.rows(names)]]
+        bodies = [motions.trials.observed[motions.trials.rows(names)]]
     else:
         values = {name: simulator.tensor([value]) for name, value in parameters.items()}
         with torch.no_grad():

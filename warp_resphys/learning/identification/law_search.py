@@ -92,9 +92,9 @@ def identify_law(
         ConvergenceError: the simulation fails at every start.
     """
     ranges = {name: Bounds.of(limits) for name, limits in (parameters or {}).items()}
-    names = motions.dataset.names if train is None else tuple(train)
+    names = motions.trials.names if train is None else tuple(train)
     if motions.train_fraction < 1.0:
-        learned = motions.train_fraction * float(motions.dataset.times.max())
+        learned = motions.train_fraction * float(motions.trials.times.max())
         seconds = min(learned, seconds or math.inf)
     options = (settings or LawSettings(), seconds, kept)
     search = _LawSearch(simulator, motions, ranges, identified or Identified(), names, tuple(validation), *options)
@@ -141,7 +141,7 @@ class _LawSearch:
     @property
     def early(self) -> float | None:
         """Duration from which a law is identified before it is tested on the same trials [s]; None with others."""
-        longest = self.seconds or float(self.motions.dataset.times.max())
+        longest = self.seconds or float(self.motions.trials.times.max())
         return _EARLY * longest if self.checked == self.train and longest > 0.0 else None
 
     @cached_property
@@ -266,7 +266,7 @@ class _LawSearch:
         simulator, guess = self.simulator(zero), self.guess
         stiff = {"c10": guess["c10"], "bulk_1": min(guess["bulk_1"], 100.0 * guess["c10"])}
         for names in (self.train, self.validation):
-            motions = [self._motion(simulator, batch) for batch in self.motions.dataset.batches(names)]
+            motions = [self._motion(simulator, batch) for batch in self.motions.trials.batches(names)]
             forms.append(WeakForm(simulator, motions, zero, stiff, _STRIDE) if motions else None)
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
@@ -374,7 +374,7 @@ class _LawSearch:
             limits: durations of these that are used [s]; the smallest counts.
         """
         seconds = min((limit for limit in limits if limit is not None), default=None)
-        wanted, shares = self.settings, independent(self.motions.dataset.labels)
+        wanted, shares = self.settings, independent(self.motions.trials.labels)
 
         def prepared(before: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
             simulator, guess = begin(before)

@@ -115,7 +115,7 @@ def refined_searches(
         kept: see `identify`.
         key: of the searches in `kept`.
     """
-    results, again = list[Identification](), _MOST_AGAIN if RELEASED in map(motions.dataset.begin_of, names) else 0
+    results, again = list[Identification](), _MOST_AGAIN if RELEASED in map(motions.trials.begin_of, names) else 0
     for number in range(1 + again):
         ends = partial(_ends, number == again, results[-1].loss if results else None)
 

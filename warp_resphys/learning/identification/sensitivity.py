@@ -75,13 +75,13 @@ def sensitivities(
         batch: largest number of trials that are simulated together; None for all.
     """
     simulator, found, moved = exact(simulator), dict[str, Sensitivity](), dict[str, float]()
-    for name, word in _responses(motions.dataset).items():
-        inputs = motions.dataset.inputs[name.removesuffix(f"_{word}")]
+    for name, word in _responses(motions.trials).items():
+        inputs = motions.trials.inputs[name.removesuffix(f"_{word}")]
         moved = {name: 1.0 if word == "factor" else float(np.abs(inputs).max())} | moved
     moved |= identified.deviation
     moved = {name: _DIFFERENCE * size for name, size in moved.items()}
     with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
-        for _, some in (part for whole in motions.dataset.batches(names) for part in cut(whole, batch)):
+        for _, some in (part for whole in motions.trials.batches(names) for part in cut(whole, batch)):
             try:
                 found |= _of_batch(simulator, motions, some, identified, moved)
             except ConvergenceError as error:
@@ -98,7 +98,7 @@ def _of_batch(
     moved: Mapping[str, float],
 ) -> dict[str, Sensitivity]:
     """Derivatives of trials of one of `Trials.batches`, from steps of parameters."""
-    observe, trials = motions.observe, motions.dataset
+    observe, trials = motions.observe, motions.trials
     replay, placement = motions.replay(simulator, names, identified), None
     start = motions.start(replay, identified)
     if isinstance(observe, Markers) and not isinstance(observe, ViewedMarkers):

@@ -70,7 +70,7 @@ def fit_force(
     Raises:
         InputError: sizes that do not fit the motions.
     """
-    names = motions.dataset.names
+    names = motions.trials.names
     train = [name for name in names if name not in validation] if train is None else train
     fitting = Fitting(
         simulator, motions, reconstructed, tuple(train), tuple(validation), Identified.of(parameters), **more
@@ -119,7 +119,7 @@ class Fitting:
         forces are corotated, or the displacement and velocity at the end of the step. Steps without any visible marker
         are left out.
         """
-        samples = Samples.joined([self._samples(batch) for batch in self.motions.dataset.batches(names)])
+        samples = Samples.joined([self._samples(batch) for batch in self.motions.trials.batches(names)])
         frames = None if self.data_driven else force_frames(self.simulator, self.force_frame)
         if frames is None:
             return samples
@@ -135,7 +135,7 @@ class Fitting:
             q, v = (torch.stack(field, 1).to(q) for field in zip(*inside, strict=True))
             forces = enumerate(force.unbind(1))  # The force of a frame belongs to the previous step.
             force = torch.stack([base.force_inside(f.to(like), k - 1) for k, f in forces], 1).to(force)
-        if self.motions.dataset.begin_of(names[0]) == STATIC:
+        if self.motions.trials.begin_of(names[0]) == STATIC:
             q, v, force, seen = q[:, 1:2].expand(-1, 2, -1, -1), torch.zeros_like(v[:, :2]), force[:, :2], seen[:, :1]
         steps, whole = q.shape[1] - 1, bool(seen.all())
 
@@ -158,7 +158,7 @@ class Fitting:
 
         States are the reconstructed ones; those of the trials themselves, with zero forces, if `simulated` and known.
         """
-        dataset = self.motions.dataset
+        dataset = self.motions.trials
         if simulated and dataset.velocity is not None:
             rows = dataset.rows(names)
             q, v = (torch.as_tensor(field[rows], device=self.device) for field in (dataset.observed, dataset.velocity))
@@ -171,7 +171,7 @@ class Fitting:
     def new_network(self, train: Samples, settings: TrainingSettings) -> StateMap:
         """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
         rest, network = self.simulator.rest_positions.to(train.q.device), settings.network
-        if not self.motions.dataset.moving(self.train):
+        if not self.motions.trials.moving(self.train):
             network = self._limited(network, len(train.q))
         torch.manual_seed(settings.seed)
         by_displacement = not self.data_driven and network.kind == "reduced" and network.force_basis == "displacement"

@@ -333,8 +333,8 @@ def reconstruct(
         settings or ReconstructionSettings(),
         list[TrialPart](),
     )
-    for number, whole in enumerate(motions.dataset.batches(names or motions.dataset.names)):
-        frames = motions.learned_steps(int(motions.dataset.seconds(whole) / used.time_step + 1e-6)) + 1
+    for number, whole in enumerate(motions.trials.batches(names or motions.trials.names)):
+        frames = motions.learned_steps(int(motions.trials.seconds(whole) / used.time_step + 1e-6)) + 1
         for first, batch in cut(whole, parts.batch):
             work = partial(_reconstructed, used, motions, batch, known, wanted)
             cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
@@ -374,5 +374,5 @@ def _reconstructed(
     series = {"q": [state.q for state in reached], "v": [state.v for state in reached], "force": forces}
     arrays = {name: torch.stack(values, 1).cpu().numpy() for name, values in series.items()}
     arrays["error"] = mean_distance(points, observed.cpu().numpy())
-    dtype = "float64" if motions.dataset.bound is None else "float32"
+    dtype = "float64" if motions.trials.bound is None else "float32"
     return {name: (values.astype(dtype), UNITS[name]) for name, values in arrays.items()}

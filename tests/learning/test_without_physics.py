@@ -36,7 +36,7 @@ def experiment(levels, begins, learned, **changes):
         "inputs": {"pressure": pressure},
     }
     dataset = Trials(**given | changes)
-    return SimpleNamespace(dataset=dataset, train=learned, motions=ObservedMotions(dataset))
+    return SimpleNamespace(trials=dataset, train=learned, motions=ObservedMotions(dataset))
 
 
 def predicted(fake, names, **options):

@@ -41,7 +41,8 @@ PAYLOAD = Quantity(
 
 def thread_pull(elongation: torch.Tensor, toe: float) -> torch.Tensor:
     """Returns the force of a thread of stiffness one [m], as the kernels have it (`kernels.axial.thread_pull`)."""
-    return torch.where(elongation > toe, elongation - 0.5 * toe, 0.5 * elongation.clamp_min(0.0) ** 2 / toe)
+    tightening = elongation.clamp(0.0, toe)
+    return tightening * (elongation - 0.5 * tightening) / toe
 
 
 @dataclass(frozen=True)

@@ -96,6 +96,8 @@ class TendonLines:
         )
         self.part, self._nodes = (torch.as_tensor(array, device=like.device) for array in (part, points.nodes))
         self._toe = toe
+        self._by_part = self.one_hot.mT.contiguous()
+        self._straight = self._rest[..., 0].norm(dim=-1)  # lengths at rest without offsets
 
     def lines(self, positions: torch.Tensor, route: torch.Tensor) -> torch.Tensor:
         """Returns the vectors (B, P, 3) along the segments [m] at positions (B, N, 3), for c (1 or B, T, 3)."""
@@ -115,8 +117,12 @@ class TendonLines:
 
     def slack(self, lengths: torch.Tensor, values: Values) -> torch.Tensor:
         """Returns the elongations (B, T) of the springs [m]."""
-        rest = self._along(self._rest, value_of(values, ROUTE)).norm(dim=-1)
+        rest = self._straight if self.columns == 1 else self._along(self._rest, value_of(values, ROUTE)).norm(dim=-1)
         return (lengths - rest) @ self.one_hot + value_of(values, CONTRACTION.name)
+
+    def at_segments(self, values: torch.Tensor) -> torch.Tensor:
+        """Returns the values (1 or B, T) of tendons at their segments, (1 or B, P)."""
+        return values @ self._by_part  # with a cheaper derivative than an index
 
     def actuated(self, lengths: torch.Tensor, values: Values) -> torch.Tensor:
         """Returns the tensions (B, T) before the first guides, of actuators and springs [N]."""
@@ -131,13 +137,13 @@ class TendonLines:
             values: tension, contraction and stiffness (B, T), ``tendon_route`` (B, T, 3), and with friction its
                 bristle length and `STEP_VALUES`.
         """
-        tension = self.actuated(lengths, values)[:, self.part]
+        tension = self.at_segments(self.actuated(lengths, values))
         if STEP_VALUES[0] not in values:
             return tension
         hold, drop, rise, before = (value_of(values, name) for name in STEP_VALUES)
         slide = lengths @ self.beyond - before
         most = torch.where(slide < 0.0, -drop, rise)
-        friction = most + (hold - most) * torch.exp(-slide.abs() / value_of(values, BRISTLE.name)[:, self.part])
+        friction = most + (hold - most) * torch.exp(-slide.abs() / self.at_segments(value_of(values, BRISTLE.name)))
         return tension + friction @ self.beyond.mT
 
 
@@ -180,7 +186,7 @@ class BoundTendons(BoundEnergy):
         half = (0.5 * (chord + _STRAIGHT**2).sqrt()).clamp_max(1.0 - 4.0 * torch.finfo(q.dtype).eps)
         turn = torch.nn.functional.pad(2.0 * (half.asin() - np.arcsin(0.5 * _STRAIGHT)), (1, 0))
         turns = turn.index_fill(1, self._first, 0.0) + self._entry
-        return value_of(values, FRICTION.name)[:, self._lines.part] * turns, lengths
+        return self._lines.at_segments(value_of(values, FRICTION.name)) * turns, lengths
 
     def _stick(
         self, begin: torch.Tensor, segments: torch.Tensor, decay: torch.Tensor
@@ -233,7 +239,7 @@ class BoundTendons(BoundEnergy):
         """Returns friction that does not change with the slide, which makes both bounds equal to it."""
         (decay, lengths), lines = self._geometry(q, values), self._lines
         fall = decay @ lines.beyond.mT
-        before = lines.actuated(lengths, values)[:, lines.part] * torch.exp(decay - fall)  # pulled from slack
+        before = lines.at_segments(lines.actuated(lengths, values)) * torch.exp(decay - fall)  # pulled from slack
         friction = before * torch.expm1(-decay)
         return dict(zip(STEP_VALUES, (friction, -friction, friction, lengths @ lines.beyond), strict=True))
 

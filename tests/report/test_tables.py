@@ -242,6 +242,8 @@ def test_trials_out_of_range_are_counted_where_they_belong():
         "SimFree": [("none of 3", "")] * 3,
         "ResPhys": [("2 of 3", "after 1.00 s (a)"), ("none of 3", ""), ("1 of 3", "after 0.25 s (d)")],
     }
+    at_once = {"range": {"simfree": {"first_s": dict.fromkeys("abcd", 0.0)}}, "errors_mm": {}}
+    assert range_table(at_once, "abcd").rows[0].cells == [Cell("4 of 4", "from the start (a, b and 2 more)")]
     assert range_table({}, ["a"]) is None
 
 

@@ -128,7 +128,9 @@ def range_table(metrics: Mapping[str, Any], trials: Sequence[str]) -> PageTable 
     def cell(first: Mapping[str, float]) -> Cell:
         earliest = min(first, key=lambda trial: first[trial], default="")
         when = f"after {first[earliest]:.2f} s ({earliest})" if earliest and first[earliest] else ""
-        when = f"from the start ({', '.join(first)})" if first and not any(first.values()) else when
+        if first and not any(first.values()):
+            more = f" and {len(first) - 2} more" if len(first) > 2 else ""
+            when = f"from the start ({', '.join([*first][:2])}{more})"
         return Cell(f"{len(first) or 'none'} of {len(trials)}", unbroken(when))
 
     models = [model for model in MODELS if model in metrics.get("range", {})]

@@ -103,13 +103,9 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
 
 
-@pytest.mark.parametrize(
-    ("bounds", "sentence"), [({}, "nothing to identify"), ({"stiffness": Bounds(0.0, 1.0)}, "no parameter 'stiffness'")]
-)
-def test_unknown_parameters_are_refused(bounds, sentence):
-    replay, release = replay_of(simulator(), TRUTH, frames=3)
-    with pytest.raises(InputError, match=sentence):
-        Misfit([(replay, release)], bounds)
+def test_nothing_to_identify_is_refused():
+    with pytest.raises(InputError, match="nothing to identify"):
+        Misfit([replay_of(simulator(), TRUTH, frames=3)], {})
 
 
 def test_a_motion_that_stands_still_is_refused():
@@ -120,15 +116,19 @@ def test_a_motion_that_stands_still_is_refused():
         Misfit([(Replay(replay.simulator, MARKERS, motions), release)], RANGES)
 
 
-@pytest.mark.parametrize(("low", "high", "log"), [(1.0, 1.0, False), (0.0, 1.0, True), (0.0, np.inf, False)])
-def test_bounds_leave_a_range(low, high, log):
-    with pytest.raises(InputError):
-        Bounds(low, high, log)
-
-
-def test_values_of_trials_need_a_prior():
-    with pytest.raises(InputError, match="per is trial, but there is no prior"):
-        Bounds(0.0, 1.0, per="trial")
+@pytest.mark.parametrize(
+    ("limits", "sentence"),
+    [
+        ({"lower": 1.0, "upper": 1.0}, "leave no range"),
+        ({"lower": 0.0, "upper": np.inf}, "leave no range"),
+        ({"lower": 0.0, "upper": 1.0, "logarithmic": True}, "its lower bound must be positive"),
+        ({"lower": 0.0, "upper": 1.0, "prior": Prior(2.0, 1.0)}, "the prior has the mean 2, outside of the range"),
+        ({"lower": 0.0, "upper": 1.0, "per": "trial"}, "per is trial, but there is no prior"),
+    ],
+)
+def test_bounds_leave_a_range_and_values_of_trials_have_a_prior(limits, sentence):
+    with pytest.raises(InputError, match=sentence):
+        Bounds(**limits)
 
 
 @pytest.mark.parametrize("bounds", [Bounds(1e5, 1e6, logarithmic=True), Bounds(-1.0, 3.0)])

@@ -49,7 +49,7 @@ from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
 from .settings.body import TargetSettings
 from .settings.control import ControlSettings
-from .settings.motions import Split, Trial
+from .settings.performed import Split, Trial
 from .settings.run import RunSettings
 from .settings.stage_keys import BATCH, FIGURES, IMPORTED, LEARNING, NETWORKS, PLAYED, SIMULATOR, StageSettings
 

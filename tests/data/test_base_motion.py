@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from warp_resphys.data.base_motion import at_times, check_steps, followed, poses_of, prescribed, rigid, since_first
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.settings import parse
-from warp_resphys.settings.motions import MotionSettings
+from warp_resphys.settings.performed import MotionSettings
 
 TIMES = np.linspace(0.0, 2.0, 201)
 SWING = parse(

@@ -10,7 +10,7 @@ from warp_resphys import Body, box_hexahedra
 from warp_resphys.data.base_motion import prescribed, rigid
 from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
 from warp_resphys.io.settings import parse
-from warp_resphys.settings.motions import MotionSettings
+from warp_resphys.settings.performed import MotionSettings
 
 
 def deformed(body, stretch):

@@ -31,7 +31,7 @@ from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings
-from warp_resphys.settings.motions import MotionSettings
+from warp_resphys.settings.performed import MotionSettings
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
 from warp_resphys.twin.twin import Twin

@@ -20,7 +20,7 @@ from warp_resphys.learning.identification.sensitivity import sensitivities
 from warp_resphys.learning.replay import exact
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.robot.loading import load
-from warp_resphys.settings.motions import MotionSettings
+from warp_resphys.settings.performed import MotionSettings
 from warp_resphys.stepping.inputs import Inputs
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.splits import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
 from warp_resphys.io.settings import parse
-from warp_resphys.settings.motions import Split
+from warp_resphys.settings.performed import Split
 from warp_resphys.settings.run import RunSettings
 
 REAL = ("experiment=beam_real", "data.folder=recordings")

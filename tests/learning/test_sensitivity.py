@@ -12,7 +12,7 @@ import pytest
 from warp_resphys.data.rigid_bodies import arms
 from warp_resphys.learning.identification.search import Identification
 from warp_resphys.learning.identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread
-from warp_resphys.settings.motions import CORNERS
+from warp_resphys.settings.performed import CORNERS
 
 RANDOM = np.random.default_rng(0)
 MARKERS = 2

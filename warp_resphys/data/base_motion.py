@@ -18,7 +18,7 @@ from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.text import read_rows
-from ..settings.motions import MotionSettings
+from ..settings.performed import MotionSettings
 from .registration import RigidTransform, kabsch
 
 LARGEST_STEP = 0.2  # of the size of a body

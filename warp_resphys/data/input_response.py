@@ -17,7 +17,7 @@ import torch
 
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
-from ..settings.motions import WaveSettings
+from ..settings.performed import WaveSettings
 from ..settings.played import SequenceSettings
 from ..stepping.quantity import Quantity
 

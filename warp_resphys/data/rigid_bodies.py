@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, did_you_mean, listed
-from ..settings.motions import CORNERS
+from ..settings.performed import CORNERS
 from .recordings.recording import ARM, Recording
 from .registration import RigidTransform, fit
 

@@ -40,7 +40,7 @@ class Trials:
     Attributes:
         names: names of the trials.
         labels: labels of the M tracked markers; empty if every vertex is observed.
-        begins: how each trial begins, see `settings.motions.Begins`; held bodies are ``released`` here.
+        begins: how each trial begins, see `settings.performed.Begins`; held bodies are ``released`` here.
         times: (R, T) times of the frames [s]; trials that end early repeat their last time.
         observed: (R, T, M, 3) observed positions [m], NaN where a marker was not seen.
         held: (R, M, 3) positions before time zero [m], NaN for markers that a trial does not have.

@@ -28,7 +28,7 @@ from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
 from ..mesh.selection import select_vertices
-from ..settings.motions import Trial
+from ..settings.performed import Trial
 from ..settings.played import PlaySettings
 from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs

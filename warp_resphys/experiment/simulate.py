@@ -33,7 +33,7 @@ from ..mesh.volume_mesh import Mesh
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.data_kinds import MovingBase, ReadingSettings, ReleaseFromTwist, SimulatedData
 from ..settings.mesh import PlaceSettings
-from ..settings.motions import HeldSettings, MotionSettings, Trial
+from ..settings.performed import HeldSettings, MotionSettings, Trial
 from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import states

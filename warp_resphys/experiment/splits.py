@@ -9,7 +9,7 @@ import numpy as np
 from ..data.trials import evenly
 from ..io.errors import DataFileError, InputError
 from ..settings.data_kinds import RecordedData, ReleaseFromLoad, SimulatedData
-from ..settings.motions import Split, Trial, TrialSettings
+from ..settings.performed import Split, Trial, TrialSettings
 from ..settings.played import LaboratorySettings
 from ..settings.run import RunSettings
 

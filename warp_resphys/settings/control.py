@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field
 
 from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Some, Vector, Word, setting
 from .mesh import Direction
-from .motions import different
+from .performed import different
 
 Model = Literal["published", "simulation", "sysid_elastic", "sysid", "law", "simfree", "resphys_uncorrected", "resphys"]
 Models = Annotated[Some[Model], AfterValidator(different)]

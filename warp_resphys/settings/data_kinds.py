@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Word, setting
 from .mesh import Direction, LengthUnit, PlaceSettings
-from .motions import (
+from .performed import (
     Axis,
     BaseMotion,
     Begins,

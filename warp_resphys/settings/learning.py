@@ -20,7 +20,7 @@ from ..io.settings import (
     without_null,
 )
 from .body import Integrator
-from .motions import different, rising
+from .performed import different, rising
 
 Size = Annotated[int, Field(ge=1, le=16_384)]
 Term = Annotated[

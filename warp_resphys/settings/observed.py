@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 from ..io.classes import ClassSettings
 from ..io.settings import Many, Positive, Settings, Vector, Word, setting
 from .mesh import PlaceSettings
-from .motions import CORNERS, Axis, Labels, different
+from .performed import CORNERS, Axis, Labels, different
 
 
 class RigidBodySettings(Settings):

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
 from .mesh import LengthUnit, PlaceSettings
-from .motions import LimitSettings, MotionSettings, different
+from .performed import LimitSettings, MotionSettings, different
 
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 _Rows = Annotated[Many[Vector], Field(min_length=3, max_length=3)]

@@ -23,8 +23,8 @@ from .learning import (
     TrainingSettings,
 )
 from .mesh import PlaceSettings
-from .motions import MotionSettings, by_file
 from .observed import BindingSettings, MarkerSettings
+from .performed import MotionSettings, by_file
 from .pictures import PictureData
 from .played import LaboratorySettings, ShapeSettings
 

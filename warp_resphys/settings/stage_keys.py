@@ -17,8 +17,8 @@ from .control import ControlSettings, FigureSettings
 from .data_kinds import ReadingSettings
 from .learning import AblationSettings, IdentifySettings, LawSettings, TrainingSettings
 from .mesh import PlaceSettings
-from .motions import Split, Trial
 from .observed import BindingSettings
+from .performed import Split, Trial
 from .played import LaboratorySettings, PlaySettings
 from .run import RunSettings
 

@@ -17,7 +17,7 @@ from ..io.resuming import finished_record
 from ..io.safe_files import read_json, write_json
 from ..io.settings import Count, Natural, Settings, Some, Word, setting
 from ..report.page import PageTable
-from ..settings.motions import Labels, different
+from ..settings.performed import Labels, different
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at

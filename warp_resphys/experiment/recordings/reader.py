@@ -20,7 +20,7 @@ from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed
 from ...io.resuming import StageContext
 from ...settings.data_kinds import ReadingSettings
-from ...settings.motions import Trial
+from ...settings.performed import Trial
 from ...settings.stage_keys import StageSettings
 from ...stepping.inputs import Inputs
 from ..actuators import drive_of

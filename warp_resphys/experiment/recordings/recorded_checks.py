@@ -13,8 +13,8 @@ from ...fem.bodies import Body
 from ...io.errors import InputError, listed, naming, number_of
 from ...mesh.selection import select_vertices
 from ...settings.data_kinds import RecordedData
-from ...settings.motions import Trial
 from ...settings.observed import MarkerSettings
+from ...settings.performed import Trial
 from ...settings.run import RunSettings
 from ..actuators import Drive, drive_of
 from ..build import build_material, marker_view_of, mounted_on

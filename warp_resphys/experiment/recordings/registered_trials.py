@@ -19,7 +19,7 @@ from ...data.trials import SLACK, STATIC, UNDER_INPUTS
 from ...io.arrays import BoolArray, FloatArray
 from ...io.errors import DataFileError, listed
 from ...io.resuming import StageContext
-from ...settings.motions import MotionSettings, Trial
+from ...settings.performed import MotionSettings, Trial
 from ..actuators import Drive
 from .reader import POSE_SECONDS, Reader, central_places
 

@@ -152,12 +152,9 @@ def tangent(
         stiffness = wp.max(stiffness, ZERO)
     u = direction_of(line)
     block = stiffness * (wp.identity(n=3, dtype=wp.float64) - wp.outer(u, u))
-    tangent_out[b, p, 0] = (c[0] * c[0]) * block
-    tangent_out[b, p, 1] = (c[1] * c[0]) * block
-    tangent_out[b, p, 2] = (c[1] * c[1]) * block
-    tangent_out[b, p, 3] = (c[2] * c[0]) * block
-    tangent_out[b, p, 4] = (c[2] * c[1]) * block
-    tangent_out[b, p, 5] = (c[2] * c[2]) * block
+    for i in range(3):
+        for j in range(i + 1):
+            tangent_out[b, p, (i * (i + 1)) / 2 + j] = (c[i] * c[j]) * block
 
 
 @wp.kernel

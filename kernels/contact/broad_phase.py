@@ -36,7 +36,7 @@ class PairKeys:
 
 @wp.func
 def lower(x: wp.vec3d, r: wp.float64) -> wp.vec3:
-    """Returns the corner of a box in float32, rounded outwards."""
+    """Returns the lower corner of a box in float32, rounded outwards; minus that of -x is the upper one."""
     y, e = wp.vec3(x - wp.vec3d(r, r, r)), wp.vec3()
     for i in range(3):
         e[i] = wp.abs(y[i]) * (SAFE - wp.float32(1.0))
@@ -44,27 +44,14 @@ def lower(x: wp.vec3d, r: wp.float64) -> wp.vec3:
 
 
 @wp.func
-def upper(x: wp.vec3d, r: wp.float64) -> wp.vec3:
-    """Returns the opposite corner."""
-    return -lower(-x, r)
-
-
-@wp.func
-def low_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> wp.vec3:
-    """Returns the lower corner of the box of all places where a primitive may be, widened by more."""
-    low = lower(sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more)
+def box(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64):
+    """Returns both corners of the box of all places where a primitive may be, widened by more."""
+    x, r = sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more
+    low, high = lower(x, r), -lower(-x, r)
     for a in range(1, nodes.shape[0]):
-        low = wp.min(low, lower(sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more))
-    return low
-
-
-@wp.func
-def high_corner(sweep: Sweep, b: int, nodes: wp.array[int], more: wp.float64) -> wp.vec3:
-    """Returns the upper corner of that box."""
-    high = upper(sweep.origin[b, nodes[0]], sweep.outer[b, nodes[0]] + more)
-    for a in range(1, nodes.shape[0]):
-        high = wp.max(high, upper(sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more))
-    return high
+        y, s = sweep.origin[b, nodes[a]], sweep.outer[b, nodes[a]] + more
+        low, high = wp.min(low, lower(y, s)), wp.max(high, -lower(-y, s))
+    return low, high
 
 
 @wp.kernel
@@ -78,8 +65,9 @@ def boxes(
     """Computes the boxes of all places where a primitive may be."""
     b, k = wp.tid()
     i = b * nodes.shape[0] + k
-    lower_out[i] = low_corner(sweep, b, nodes[k], NOTHING)
-    upper_out[i] = high_corner(sweep, b, nodes[k], NOTHING)
+    low, high = box(sweep, b, nodes[k], NOTHING)
+    lower_out[i] = low
+    upper_out[i] = high
     group_out[i] = b
 
 
@@ -113,7 +101,7 @@ def close_pairs(
     """Finds pairs of a vertex and a triangle, or of edges, without a vertex in common."""
     b, i = wp.tid()
     vertices = first[i]
-    low, high = low_corner(sweep, b, vertices, sweep.reach), high_corner(sweep, b, vertices, sweep.reach)
+    low, high = box(sweep, b, vertices, sweep.reach)
     query = wp.bvh_query_aabb(hierarchy, low, high, wp.bvh_get_group_root(hierarchy, b))
     hit = wp.int32(0)
     count = second.shape[0]
@@ -151,7 +139,7 @@ def crossings(
     b, e = wp.tid()
     i, j = edges[e, 0], edges[e, 1]
     x, y = sweep.origin[b, i], sweep.origin[b, j]
-    low, high = low_corner(sweep, b, edges[e], NOTHING), high_corner(sweep, b, edges[e], NOTHING)
+    low, high = box(sweep, b, edges[e], NOTHING)
     query = wp.bvh_query_aabb(hierarchy, low, high, wp.bvh_get_group_root(hierarchy, b))
     hit = wp.int32(0)
     while wp.bvh_query_next(query, hit):

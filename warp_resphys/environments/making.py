@@ -173,21 +173,16 @@ def make_vector(
     robot, frames = _loaded(task, run, model, world, device, action_time)
     actions, up = max(round(seconds / action_time), 1), _up(robot)
     shown = None if robot.labels else _spread_vertices(robot)
-    where = robot, Path(run).expanduser(), num_envs, world
-    if task == "grasp":
-        bodies, mapping = _grippers(*where, frames)
-    else:
-        bodies, mapping = _bodies(*where, spread, axis if task == "swing_up" else None, shown, seed, frames)
+    bodies, mapping = _bodies(task, robot, Path(run).expanduser(), num_envs, world, spread, axis, shown, seed, frames)
     rest = bodies.markers(bodies.rest)[0]
+    point = np.eye(3, rest.size, rest.size - 3) if task == "grasp" else _tip(robot, rest, tracked, shown)
     goals: RobotTask
-    if task in ("reach", "follow"):
-        point = _tip(robot, rest, tracked, shown)
+    if task in ("grasp", "swing_up"):
+        goals = _lift(robot, num_envs, up, point @ rest.ravel(), task == "grasp")
+    else:
         reach = _reach(robot, mapping, point, shown, seed) if reach is None else reach
         follows = task == "follow"
         goals = FollowTask(num_envs, actions, reach, action_time) if follows else ReachTask(num_envs, actions, reach)
-    else:
-        point = np.eye(3, rest.size, rest.size - 3) if task == "grasp" else _tip(robot, rest, tracked, shown)
-        goals = _lift(robot, num_envs, up, point @ rest.ravel(), task == "grasp")
     return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
 
 
@@ -216,22 +211,25 @@ def _loaded(
 
 
 def _bodies(
+    task: str,
     robot: Robot,
     run: Path,
     count: int,
     world: str,
     spread: float,
-    axis: Sequence[float] | None,
+    axis: Sequence[float],
     shown: list[int] | None,
     seed: int,
     frames: int,
 ) -> tuple[World[Any], ActionMapping]:
-    """Robots that are driven as in the trials of their run, or whose base moves along an axis, and the map to inputs.
+    """Robots driven as in the trials of their run, by their base along an axis, or as grippers; and the map to inputs.
 
     Worlds begin without inputs.
     """
     bodies: World[Any]
-    if axis is not None:
+    if task == "grasp":
+        return _grippers(robot, run, count, world, frames)
+    if task == "swing_up":
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
         bodies = RobotWorld(robot, BASE, count, spread, along, shown)
         most = np.full(1, _BASE)

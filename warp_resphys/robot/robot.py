@@ -30,7 +30,7 @@ from ..learning.residuals.networks import NextState
 from ..mesh.volume_mesh import Mesh
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
-from ..stepping.rollout import rollout
+from ..stepping.rollout import rollout, states
 from ..stepping.state import State
 from .actuation import Acting, Commands, Given, InputReader, inputs_of
 from .description import Description
@@ -231,9 +231,8 @@ class Robot:
         if self._learned is None:
             return start
         if self.is_data_driven:
-            for _ in range(POSE_STEPS):
-                start = self.step(start, **inputs)
-            return start
+            *_, settled = states(lambda state, _: self.step(state, **inputs), start, range(POSE_STEPS))
+            return settled
         acting, predictor = self._acting(start, inputs)
         assert predictor is not None
         force = cast(Callable[[State], torch.Tensor], partial(predictor, step=0))
@@ -351,20 +350,20 @@ class Robot:
             on_step(number + 1)
             return after
 
-        states = rollout(step, state, range(len(acting)), lambda reached: reached)
-        markers = torch.stack([self.observe(reached) for reached in states])
+        motion = rollout(step, state, range(len(acting)), lambda reached: reached)
+        markers = torch.stack([self.observe(reached) for reached in motion])
         driven = {name: torch.stack([now[name] for now in acting]) for name in inputs if acting}
         return Motion.of(
-            states,
+            motion,
             self.simulator.body,
             self.time_step,
-            obstacles=self.simulator.energies.obstacles(states, self.constants),
+            obstacles=self.simulator.energies.obstacles(motion, self.constants),
             name=f"{self.description.name}, {self.description.model}",
             markers=markers,
             labels=self.labels,
             half_widths=self.half_widths(markers, _since_change(self.time_step, driven, *markers.shape[:2])),
-            left=torch.stack([reached.left for reached in states]),
-            lost=torch.stack([reached.lost for reached in states]),
+            left=torch.stack([reached.left for reached in motion]),
+            lost=torch.stack([reached.lost for reached in motion]),
             inputs=driven,
             units={name: (self.inputs[name].unit, self.inputs[name].parts) for name in self.driven},
         )

@@ -24,7 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
-from benchmarks import gripper, peers, steps, twin
+from benchmarks import gripper, peers, steps, twin_rate
 
 from warp_resphys.commands import USER_ERROR
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
@@ -99,7 +99,7 @@ def command_line() -> argparse.ArgumentParser:
     sizes.add_argument("--linear-solvers", nargs="+", choices=LINEAR_SOLVERS, default=linear)
     sizes.add_argument("--refinements", nargs="+", type=float, default=[1.0, 2.0, 3.0, 4.0, 5.0])
     follow = parts.add_parser("twin", parents=[shared], help="a twin that follows the trials of a run")
-    follow.set_defaults(measure=twin.measure_twin)
+    follow.set_defaults(measure=twin_rate.measure_twin)
     follow.add_argument("run", type=Path)
     follow.add_argument("--model", default="resphys")
     follow.add_argument("--trials", nargs="+", help="of the run (default: all)")

@@ -19,7 +19,7 @@ from warp_resphys import (
     select_vertices,
 )
 from warp_resphys.dynamics import equilibrium, kept_factor
-from warp_resphys.dynamics.corotation import Corotation
+from warp_resphys.dynamics.kept_factor import Corotation
 from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.linalg.pardiso import has_pardiso
 from warp_resphys.mesh.boxes import box_tetrahedra

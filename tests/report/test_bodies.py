@@ -14,10 +14,10 @@ from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.report import body_picture, render
+from warp_resphys.report.body_motions import ComparedMotion
 from warp_resphys.report.body_picture import NOMINAL, MeshSummary, mesh_picture, registration_picture
 from warp_resphys.report.data import Recordings
 from warp_resphys.report.layers import INK, MEASURED
-from warp_resphys.report.motions import ComparedMotion
 
 DOWN = np.array([0.0, 0.0, -9.8])
 

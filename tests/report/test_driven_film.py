@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_resphys.report.motions import DrivenBodies
+from warp_resphys.report.body_motions import DrivenBodies
 from warp_resphys.report.wording import TONES
 
 X, Y, Z = np.eye(3)

@@ -13,10 +13,10 @@ from warp_resphys.data.recordings.marker_quality import quality_table
 from warp_resphys.io.safe_files import write_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM
+from warp_resphys.report.body_motions import instants
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, at_times
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
-from warp_resphys.report.motions import instants
 from warp_resphys.report.page import Cell, PageTable, Row
 from warp_resphys.report.run_page import range_table
 from warp_resphys.report.sections import (

@@ -17,9 +17,9 @@ from warp_resphys.energies import Capsule, Sphere
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.report import render
+from warp_resphys.report.body_motions import ComparedMotion
 from warp_resphys.report.layers import OBSTACLE
 from warp_resphys.report.motion_section import reduced, view_in_space
-from warp_resphys.report.motions import ComparedMotion
 
 RUNS = {"markers": (write_arm_run, arm_settings), "vertices": (write_vertex_run, vertex_settings)}
 

@@ -20,7 +20,7 @@ from ..io.resuming import StageContext, finished_record
 from ..io.safe_files import write_json
 from ..io.settings import parse
 from ..mesh.motion_files import input_columns, write_csv
-from ..report.motions import DrivenBodies
+from ..report.body_motions import DrivenBodies
 from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stage_keys import StageSettings

@@ -13,8 +13,7 @@ from ..energies.term import PairTangents
 from ..linalg.coupling import CouplingSolver
 from ..linalg.linear_solver import Factor, LinearSolver
 from .assembly import BlockPattern, HessianAssembly
-from .corotation import Corotation
-from .kept_factor import KeptFactor
+from .kept_factor import Corotation, KeptFactor
 from .pair_couplings import PairCouplings
 
 

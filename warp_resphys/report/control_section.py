@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from ..io.arrays import FloatArray
 from ..settings.control import ControlSettings
 from . import figures
+from .body_motions import plane_axes
 from .data import FollowedPath, RunReport
-from .motions import plane_axes
 from .page import Canvas, Cell, Items, PageTable, Part, Row, Text
 from .wording import MODELS, NONE, TONES, compared_controllers, controller_name, controller_words, mm_text, number_text
 

@@ -23,9 +23,9 @@ from ..io.arrays import FloatArray
 from ..learning.metrics import mean_distance
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
 from . import figures
+from .body_motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
 from .data import Film, RunReport, at_times, shown_markers, spread
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
-from .motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
 from .page import Block, Canvas, Drawn, Part, ViewInSpace
 from .render import Pixels, draw, write_film
 from .wording import MODELS, TONES, shown_models, unbroken

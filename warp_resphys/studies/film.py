@@ -18,9 +18,9 @@ from ..io.resuming import finished_record
 from ..io.safe_files import read_json
 from ..io.settings import Many, Positive, Settings, Word, setting
 from ..learning.baselines import BASELINES
+from ..report.body_motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs
 from ..report.data import at_times, spread
 from ..report.layers import RenderScene
-from ..report.motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs
 from ..report.render import DrawingError, write_film
 from ..report.wording import MODELS, compared_controllers, shown_models
 from ..robot.loading import load, recorded_trial

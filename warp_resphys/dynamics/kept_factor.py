@@ -30,9 +30,9 @@ _FACTOR: Final = 25  # iterations that take as long as a new factor
 class Corotation:
     """Rotations of a batch since its last factors; none of vertices in symmetry planes.
 
-    The Hessian of a body that has only been rotated is R H R^T, with the rotation R in the block of every vertex. With R of
-    the mean deformation gradient around each vertex, R H^-1 R^T is close to the inverse also where a body bends: fewer
-    iterations need the factor of an earlier state, and it lasts for longer.
+    The Hessian of a body that has only been rotated is R H R^T, with the rotation R in the block of every vertex.
+    With R of the mean deformation gradient around each vertex, R H^-1 R^T is close to the inverse also where a body
+    bends: fewer iterations need the factor of an earlier state, and it lasts for longer.
 
     Args:
         potential: the potential, whose positions are used.

@@ -51,7 +51,7 @@ def test_keys_that_are_left_out_are_those_of_the_simulator():
 
 
 def test_a_law_of_the_material_is_a_model_as_any_other():
-    out = [f"~simulation.{name}" for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping")]
+    out = ["~law", *(f"~simulation.{name}" for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping"))]
     law = "simulation={model:law,c10:40e3,bulk_1:2e6,ogden_m3:5e3,shear_viscosity:20.0}"
     run = settings(*COARSE, *out, law)
     material = build_simulator(run, run.simulation).materials[""]

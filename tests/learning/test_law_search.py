@@ -11,6 +11,7 @@ import torch
 from warp_resphys import Body, Corotated, Inputs, ObservedMotions, Simulator, box_hexahedra, select_vertices
 from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
+from warp_resphys.io.errors import InputError
 from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.identification.law import LawClass, branches_of, strong_names
 from warp_resphys.learning.identification.law_scores import Score
@@ -133,6 +134,12 @@ def test_a_law_is_identified_from_observed_motions_and_simulates_on():
     assert law.constants.get("c20", 0.0) < 200.0
     assert law.validation["law"] < 0.01 * law.validation["below"]
     assert float(evaluate(law.simulator, motions, parameters=law.parameters).mean()) < 1e-5
+
+
+def test_materials_of_regions_have_no_law():
+    regions = SimpleNamespace(materials={"tip": None, "base": None})
+    with pytest.raises(InputError, match="a law describes one material"):
+        identify_law(regions, None)
 
 
 WHOLE = ("elastic", "branches", "fibres")

@@ -296,11 +296,6 @@ def is_shape(name: str) -> bool:
     return unit_of(name) != "Pa" and name not in VISCOSITIES
 
 
-def is_refined(name: str) -> bool:
-    """Whether a constant is identified through the simulator."""
-    return not name.startswith(("fibre_stiffening", "fibre_compression"))
-
-
 def strong_names(constants: Mapping[str, float], shear: float) -> dict[str, str]:
     """Names of constants by their names without terms, branches and families that hardly resist, which are left out.
 

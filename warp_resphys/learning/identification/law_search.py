@@ -23,6 +23,7 @@ from ...dynamics.simulator import Simulator
 from ...energies.catalogue import make_material
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
+from ...io.errors import InputError
 from ...io.parts import Checkpoint
 from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
@@ -36,14 +37,13 @@ from .law import (
     family,
     first_guess,
     fit_classes,
-    is_refined,
     is_shape,
     longest_side,
     strong_names,
 )
 from .law_scores import Score, scores_of, stretches_in
 from .misfit import Misfit
-from .search import Identification, first_points, refined_searches
+from .search import Identification, first_points, once, refined_searches
 from .weak_form import KnownMotion, WeakForm
 
 _OF_MASS: Final = ("density", MASS_DAMPING)
@@ -54,6 +54,7 @@ _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a sma
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
 _MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
 _STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
+_FIXED: Final = ("fibre_stiffening", "fibre_compression")  # constants that are not refined
 _BESIDE: Final = "beside"  # key of the search of parameters beside a known law
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
@@ -89,8 +90,11 @@ def identify_law(
         kept: see `identify`.
 
     Raises:
+        InputError: the simulator has materials of regions.
         ConvergenceError: the simulation fails at every start.
     """
+    if "" not in simulator.materials:
+        raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
     ranges = {name: Bounds.of(limits) for name, limits in (parameters or {}).items()}
     names = motions.trials.names if train is None else tuple(train)
     if motions.train_fraction < 1.0:
@@ -179,7 +183,8 @@ class _LawSearch:
     def run(self) -> IdentifiedLaw:
         """Identifies a law."""
         if self.motions.sees_states:
-            classes = self._from_states() if self.kept is None else self._kept_classes(self.kept)
+            fitted = once(self.kept, "classes", lambda: [asdict(law) for law in self._from_states()])
+            classes = TypeAdapter(list[LawClass]).validate_python(fitted)
             scores = [score.error for score in self.scores([law.constants for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
@@ -271,11 +276,6 @@ class _LawSearch:
         assert forms[0] is not None
         return fit_classes(forms[0], forms[1], wanted.terms, times, wanted.families)
 
-    def _kept_classes(self, kept: Checkpoint) -> list[LawClass]:
-        """Returns the classes of the weak form, which an earlier run may have fitted."""
-        fitted = kept.once("classes", lambda: [asdict(law) for law in self._from_states()])
-        return TypeAdapter(list[LawClass]).validate_python(fitted)
-
     def _motion(self, simulator: Simulator, names: Sequence[str]) -> KnownMotion:
         replay = self.motions.replay(simulator, names)
         _, inputs, _ = replay.prepare({name: simulator.tensor([value]) for name, value in self.others.items()})
@@ -338,8 +338,8 @@ class _LawSearch:
         """
         guess = dict(law.constants)
         guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
-        others = self._bounds_of_others
-        bounds = {name: self._bounds(name, value) for name, value in guess.items() if is_refined(name)} | others
+        others, searched = self._bounds_of_others, [name for name in guess if not name.startswith(_FIXED)]
+        bounds = {name: self._bounds(name, guess[name]) for name in searched} | others
 
         def begin(before: Identification | None) -> tuple[Simulator, dict[str, float]]:
             first = {} if before is None else dict(before.parameters)

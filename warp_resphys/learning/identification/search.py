@@ -125,11 +125,15 @@ def refined_searches(
                 options = (max_evaluations, tolerance, report, ends, motions.labels)
                 return asdict(search_parameters(misfit, starts, *options))
 
-        found = work() if kept is None else kept.once(f"{key} {number}", work)
-        results.append(Identification.from_plain(found))
+        results.append(Identification.from_plain(once(kept, f"{key} {number}", work)))
         if ends(results[-1].loss):
             break
     return results
+
+
+def once(kept: Checkpoint | None, key: str, work: Callable[[], Any]) -> Any:
+    """Returns the JSON data of some work, unless it is kept already."""
+    return work() if kept is None else kept.once(key, work)
 
 
 def _ends(last: bool, before: float | None, after: float) -> bool:

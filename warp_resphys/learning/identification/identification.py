@@ -64,7 +64,7 @@ def identify(
         max_evaluations: of the loss and its gradient, for each start.
         tolerance: relative decrease of the loss below which a search ends.
         seed: of the random candidates.
-        kept: finished searches, whose progress is shown; None: nothing is kept or shown.
+        kept: finished searches, which an interrupted identification goes on from; None: nothing is kept.
 
     Raises:
         InputError: an unknown parameter, an empty range, or a motion in which nothing moves.
@@ -83,7 +83,7 @@ def identify(
         first = (guess, starts, many, seed) if before is None else (before.parameters,)
         return misfit, first_points(misfit, *first)
 
-    rounds = refined_searches(begin, motions, trials, max_evaluations, tolerance, kept)
+    rounds = refined_searches(begin, motions, trials, max_evaluations, tolerance, kept, starts=starts)
     found = _separated(_joined(rounds, guess, accuracy), ranges)
     return _with_first_frames(found, simulator, motions, held_out, ranges, max_evaluations)
 

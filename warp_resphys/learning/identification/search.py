@@ -79,11 +79,8 @@ _PLAIN = TypeAdapter(Identification)
 
 
 @contextmanager
-def shown(title: str, most: int) -> Iterator[Report | None]:
-    """Shows the progress of a search with at most so many evaluations, which the yielded function reports."""
-    if not title:
-        yield None
-        return
+def shown(title: str, most: int) -> Iterator[Report]:
+    """Shows the progress of searches with at most so many evaluations, which the yielded function reports."""
     with Progress(title, most, "evaluations at most") as progress:
 
         def report(start: int, loss: float, values: Mapping[str, float]) -> None:
@@ -101,6 +98,7 @@ def refined_searches(
     tolerance: float,
     kept: Checkpoint | None = None,
     key: str = "",
+    starts: int = 1,
 ) -> list[Identification]:
     """Returns the results of a search, and of those with releases that are estimated again with the last result.
 
@@ -114,20 +112,21 @@ def refined_searches(
         tolerance: see `search_parameters`.
         kept: see `identify`.
         key: of the searches in `kept`.
+        starts: number of starts of the first search.
     """
     results, again = list[Identification](), _MOST_AGAIN if RELEASED in map(motions.trials.begin_of, names) else 0
-    for number in range(1 + again):
-        ends = partial(_ends, number == again, results[-1].loss if results else None)
+    with shown("identify" if kept is None else kept.title, (starts + again) * max_evaluations) as report:
+        for number in range(1 + again):
+            ends = partial(_ends, number == again, results[-1].loss if results else None)
 
-        def work(number: int = number, ends: IsLast = ends) -> dict[str, Any]:
-            misfit, starts = begin(results[-1] if results else None)
-            with shown("" if kept is None else kept.title, len(starts) * max_evaluations) as report:
+            def work(ends: IsLast = ends) -> dict[str, Any]:
+                misfit, points = begin(results[-1] if results else None)
                 options = (max_evaluations, tolerance, report, ends, motions.labels)
-                return asdict(search_parameters(misfit, starts, *options))
+                return asdict(search_parameters(misfit, points, *options))
 
-        results.append(Identification.from_plain(once(kept, f"{key} {number}", work)))
-        if ends(results[-1].loss):
-            break
+            results.append(Identification.from_plain(once(kept, f"{key} {number}", work)))
+            if ends(results[-1].loss):
+                break
     return results
 
 

@@ -77,7 +77,7 @@ def test_trials_have_their_values_sessions_their_marker_places_and_finished_sear
     seen = torch.stack([MARKERS(positions) for positions in q])
     seen[:, 1, 0] += torch.tensor([0.0, 1e-3, 0.0])
     motions = ObservedMotions.of(wrong, seen, inputs=wr.Inputs(tendon_tension=logged), observation=MARKERS)
-    motions = replace(motions, dataset=replace(motions.trials, sessions=("monday", "friday", "monday")))
+    motions = replace(motions, trials=replace(motions.trials, sessions=("monday", "friday", "monday")))
     ranges = {
         "youngs_modulus": Bounds(1e5, 1e6),
         "tendon_tension_factor": Bounds(0.5, 2.0, False, Prior(1.0, 0.3), "trial"),

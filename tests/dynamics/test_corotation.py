@@ -7,21 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Rigid,
-    Simulator,
-    SolverSettings,
-    State,
-    Tendons,
-    box_hexahedra,
-    select_vertices,
-)
+from support.clamped import clamped, noise
+from warp_resphys import Corotated, Rigid, Simulator, SolverSettings, State, Tendons, box_hexahedra
 from warp_resphys.dynamics import equilibrium, kept_factor
 from warp_resphys.dynamics.kept_factor import Corotation
 from warp_resphys.fem.coordinates import SymmetryPlane
-from warp_resphys.linalg.pardiso import has_pardiso
+from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.stepping.inputs import Inputs
@@ -31,21 +22,17 @@ pytestmark = pytest.mark.skipif(not has_pardiso(), reason="needs the package mkl
 BOX = box_hexahedra((0.06, 0.04, 0.04), (4, 3, 3))
 CAP = np.flatnonzero(BOX.vertices[BOX.cells].mean(1)[:, 0] > 0.045)
 BODIES = {
-    "hexahedra": lambda: Body(BOX, select_vertices(BOX, x=0.0)),
-    "tetrahedra": lambda: Body(mesh := box_tetrahedra((0.06, 0.04, 0.04), (4, 3, 3)), select_vertices(mesh, x=0.0)),
-    "rigid part": lambda: Body(
-        Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), select_vertices(BOX, x=0.0), rigid={"cap": Rigid(1200.0)}
-    ),
-    "tendon": lambda: Body(
-        BOX, select_vertices(BOX, x=0.0), energies=[Tendons([[[0.0, 0.01, 0.04], [0.06, 0.01, 0.04]]], 400.0)]
-    ),
-    "symmetry": lambda: Body(BOX, select_vertices(BOX, x=0.0), symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.0)]),
+    "hexahedra": clamped(BOX),
+    "tetrahedra": clamped(box_tetrahedra((0.06, 0.04, 0.04), (4, 3, 3))),
+    "rigid part": clamped(Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), rigid={"cap": Rigid(1200.0)}),
+    "tendon": clamped(BOX, energies=[Tendons([[[0.0, 0.01, 0.04], [0.06, 0.01, 0.04]]], 400.0)]),
+    "symmetry": clamped(BOX, symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.0)]),
 }
 
 
 def simulator(kind, linear_solver, poissons_ratio=0.45, youngs_modulus=264e3, **options):
     solver = SolverSettings(linear_solver=linear_solver, **{"relative_tolerance": 1e-10, **options})
-    return Simulator(BODIES[kind](), Corotated(youngs_modulus, poissons_ratio, density=1070.0), solver=solver)
+    return Simulator(BODIES[kind], Corotated(youngs_modulus, poissons_ratio, density=1070.0), solver=solver)
 
 
 def turned(angle):
@@ -56,7 +43,7 @@ def turned(angle):
 def adjoints(sim, states, monkeypatch):
     """Adjoints of a random gradient at states, one after another, and the factors and iterations that they took."""
     counts = SimpleNamespace(factors=0, iterations=[])
-    factor, iterate = type(sim.workspace(1).linear_solver("pardiso")).direction_factor, kept_factor.conjugate_gradients
+    factor, iterate = PardisoSolver.direction_factor, kept_factor.conjugate_gradients
 
     def counted_factor(*arguments, **options):
         counts.factors += 1
@@ -67,13 +54,13 @@ def adjoints(sim, states, monkeypatch):
         counts.iterations.append(result.iterations)
         return result
 
-    monkeypatch.setattr("warp_resphys.linalg.pardiso.PardisoSolver.direction_factor", counted_factor)
+    monkeypatch.setattr(PardisoSolver, "direction_factor", counted_factor)
     monkeypatch.setattr(kept_factor, "conjugate_gradients", counted)
     own = sim.workspace(1)
     matrix = own.hessian(sim.settings.linear_solver)
     sim.step(sim.rest_state())  # sets the terms of a step
     counts.factors = 0
-    right = torch.randn(1, sim.body.n_vertices, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    right = noise(1, sim.body.n_vertices, 3, seed=1)
     out = []
     for q in states:
         own.potential.positions.copy_(q)
@@ -158,7 +145,8 @@ def test_an_indefinite_hessian_is_solved_by_its_own_factor(monkeypatch):
         flat = sim.rest_state().q * torch.tensor([0.2, 1.0, 1.0], dtype=torch.float64)
         solutions, _ = adjoints(sim, [flat], monkeypatch)
         both.append(solutions[0])
-        assert bool((sim.workspace(1).hessian(name).linear.factor(sim.workspace(1).hessian(name).assembly())).failed)
+        hessian = sim.workspace(1).hessian(name)
+        assert bool(hessian.linear.factor(hessian.assembly()).failed)
     torch.testing.assert_close(*both, rtol=0.0, atol=1e-9 * float(both[1].abs().max()))
 
 

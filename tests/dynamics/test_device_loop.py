@@ -3,21 +3,21 @@
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.energies.potential import IncrementalPotential
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
-FIXED = select_vertices(MESH, x=0.0)
-BODY = Body(MESH, fixed=FIXED)
+BODY = clamped(MESH)
 MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
 
 
-def simulator(name, device, body=BODY, material=MATERIAL, **settings):
+def simulator(name, device, material=MATERIAL, **settings):
     chosen = SolverSettings(name, linear_solver="tiled", **({"relative_tolerance": 1e-9} | settings))
-    return Simulator(body, material, solver=chosen, device=device)
+    return Simulator(BODY, material, solver=chosen, device=device)
 
 
 def bent(s):

@@ -6,24 +6,20 @@ import pytest
 import torch
 
 from support.chambered import chambered
-from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, Tendons, select_vertices
+from support.clamped import clamped, noise
+from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Simulator, Tendons
 from warp_resphys.energies.materials import Gent
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
-CLAMP = select_vertices(MESH, x=0.0)
 TENDON = [[0.0, 0.01, 0.02], [0.05, 0.01, 0.02], [0.1, 0.01, 0.02]]
 FLOOR = HalfSpace(position=(0.0, 0.0, -0.015))
 
 
 def beam(material, *energies, **options):
-    return Simulator(Body(MESH, CLAMP, energies=energies), material, **({"relative_tolerance": 1e-12} | options))
-
-
-def driven(**values):
-    return Inputs(**{name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()})
+    return Simulator(clamped(MESH, energies=energies), material, **({"relative_tolerance": 1e-12} | options))
 
 
 CASES = {
@@ -37,13 +33,13 @@ CASES = {
     ),
     "tendon": (
         lambda: beam(Corotated(2e5, 0.45), Tendons([TENDON], stiffness=100.0)),
-        driven(tendon_tension=[3.0]),
+        Inputs(tendon_tension=3.0),
         "tendon_stiffness",
         100.0,
     ),
     "pressure": (
         lambda: Simulator(chambered("hexahedron"), Corotated(1e5, 0.45), relative_tolerance=1e-12),
-        driven(pressure=[4e3, 2e3]),
+        Inputs(pressure=[4e3, 2e3]),
         "youngs_modulus",
         1e5,
     ),
@@ -54,7 +50,7 @@ CASES = {
 def test_a_step_of_newtons_method_gives_the_derivative_of_an_equilibrium(case):
     make, inputs, name, value = CASES[case]
     simulator = make()
-    weights = torch.randn(simulator.body.n_vertices, 3, generator=torch.Generator().manual_seed(0)).double()
+    weights = noise(simulator.body.n_vertices, 3)
     start = simulator.static_equilibrium(inputs, {name: value}).q
 
     def function(step):
@@ -74,7 +70,7 @@ def test_forces_that_follow_the_pose_are_refused():
     simulator = beam(Corotated(2e5, 0.45), Tendons([TENDON], friction=0.3))
     assert simulator.energies.follow_pose
     with pytest.raises(InputError, match="solve its equilibria"):
-        simulator.linearise_equilibrium(driven(tendon_tension=[3.0]))
+        simulator.linearise_equilibrium(Inputs(tendon_tension=3.0))
 
 
 def test_a_step_near_its_solution_takes_no_iterations_and_has_the_same_result():

@@ -3,13 +3,14 @@
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
-BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+BODY = clamped(MESH)
 MATERIAL = Corotated(1e5, 0.45, density=1000.0)
 
 

@@ -6,31 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    PointMass,
-    Simulator,
-    SolverSettings,
-    State,
-    box_hexahedra,
-    box_tetrahedra,
-    select_vertices,
-)
+from support.clamped import clamped
+from warp_resphys import Body, Corotated, PointMass, Simulator, State, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.integrators import INTEGRATORS
 
 SOFT = Corotated(2e4, 0.3, density=1000.0, mass_damping=1.0, stiffness_damping=3e-3)
 MESH = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
-CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
-TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
+CLAMPED = clamped(MESH)
+TIGHT = {"solver": "newton", "relative_tolerance": 1e-10}
 WEIGHTLESS = (0.0, 0.0, 0.0)
 
 
 def swing(integrator, steps, material=SOFT, duration=0.04, moving=False):
     """Positions and velocities at the end of a large motion that starts smoothly."""
-    simulator = Simulator(CLAMPED, material, duration / steps, integrator=integrator, solver=TIGHT)
+    simulator = Simulator(CLAMPED, material, duration / steps, integrator=integrator, **TIGHT)
     state = simulator.rest_state()
     x = state.q[..., :1] / 0.04
     v = 1.5 * torch.cat([0 * x, x**2, -0.5 * x**2], dim=-1)
@@ -80,9 +71,7 @@ def bdf2_decay(a, n):
 def test_mass_damping_of_a_translation_is_exact(integrator, device):
     h, alpha, steps = 0.02, 5.0, 6
     material = Corotated(1e5, 0.4, density=1000.0, mass_damping=alpha)
-    simulator = Simulator(
-        Body(MESH), material, h, gravity=WEIGHTLESS, integrator=integrator, solver=TIGHT, device=device
-    )
+    simulator = Simulator(Body(MESH), material, h, WEIGHTLESS, integrator, device=device, **TIGHT)
     rest = simulator.rest_state()
     v = simulator.tensor([0.3, -0.2, 0.1]).expand_as(rest.v)
     final = simulator.rollout(State(rest.q, v), steps).final
@@ -92,8 +81,8 @@ def test_mass_damping_of_a_translation_is_exact(integrator, device):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_free_fall(integrator):
-    h, steps, g = 0.01, 10, -9.81
-    simulator = Simulator(Body(MESH), SOFT_UNDAMPED, h, (0, 0, g), integrator=integrator, solver=TIGHT)
+    h, steps, g, undamped = 0.01, 10, -9.81, replace(SOFT, mass_damping=0.0, stiffness_damping=0.0)
+    simulator = Simulator(Body(MESH), undamped, h, (0, 0, g), integrator, **TIGHT)
     final = simulator.rollout(simulator.rest_state(), steps).final
     t = h * steps
     torch.testing.assert_close(final.v[..., 2], torch.full_like(final.v[..., 2], g * t), rtol=1e-8, atol=0.0)
@@ -102,9 +91,6 @@ def test_free_fall(integrator):
     early = {"implicit_euler": g * t * h / 2, "midpoint": 0.0, "bdf2": float(fallen[0]) - g * t**2 / 2}[integrator]
     assert abs(early) <= abs(g * t * h / 2) + 1e-12
     torch.testing.assert_close(fallen, torch.full_like(fallen, g * t**2 / 2 + early), rtol=1e-7, atol=0.0)
-
-
-SOFT_UNDAMPED = replace(SOFT, mass_damping=0.0, stiffness_damping=0.0)
 
 
 def total_momenta(simulator, state):
@@ -116,7 +102,8 @@ def total_momenta(simulator, state):
 def test_midpoint_conserves_momenta_and_rigid_rotations_are_not_damped():
     """A spinning free body: viscosity acts on strain rates, not on rotations."""
     h, omega = 2e-3, 8.0
-    simulator = Simulator(Body(MESH), SOFT_STIFFLY_DAMPED, h, WEIGHTLESS, "midpoint", solver=TIGHT)
+    viscous = replace(SOFT, mass_damping=0.0, stiffness_damping=0.05)
+    simulator = Simulator(Body(MESH), viscous, h, WEIGHTLESS, "midpoint", **TIGHT)
     rest = simulator.rest_state()
     centred = rest.q - torch.tensor([0.02, 0.01, 0.01], dtype=torch.float64)
     axis = torch.tensor([0.0, 0.0, omega], dtype=torch.float64)
@@ -127,20 +114,17 @@ def test_midpoint_conserves_momenta_and_rigid_rotations_are_not_damped():
     torch.testing.assert_close(after[1], before[1], rtol=1e-4, atol=1e-10)
 
 
-SOFT_STIFFLY_DAMPED = replace(SOFT, mass_damping=0.0, stiffness_damping=0.05)
-
-
 def test_point_mass_weighs_and_slows():
     """A body of no weight of its own with a mass on its tip face is a spring: omega^2 = k / m."""
     mesh = box_tetrahedra((0.04, 0.02, 0.02), (2, 1, 1), 2)
     tip, grams = select_vertices(mesh, x=0.04), 0.05
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0), point_masses=[PointMass(grams, tip)])
+    body = clamped(mesh, point_masses=[PointMass(grams, tip)])
     light = Corotated(2e4, 0.3, density=1e-3)
     g, h = 1e-2, 1e-3
-    simulator = Simulator(body, light, h, (0.0, 0.0, -g), "midpoint", solver=TIGHT)
+    simulator = Simulator(body, light, h, (0.0, 0.0, -g), "midpoint", **TIGHT)
     np.testing.assert_allclose(simulator.prepare().mass.sum() - grams, 1e-3 * 1.6e-5, rtol=1e-6)
     sag = -float((simulator.static_equilibrium().q[0] - simulator.rest_positions)[tip, 2].mean())
-    bare = Simulator(Body(mesh, fixed=body.fixed), light, h, WEIGHTLESS, solver=TIGHT)
+    bare = Simulator(clamped(mesh), light, h, WEIGHTLESS, **TIGHT)
     force = torch.zeros_like(bare.rest_state().q)
     force[:, tip, 2] = -grams * g / len(tip)
     pulled = -float((bare.static_equilibrium(Inputs(force)).q[0] - bare.rest_positions)[tip, 2].mean())

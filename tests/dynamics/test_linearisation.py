@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Inputs, Rigid, Simulator, Tendons, select_vertices
+from support.clamped import clamped
+from warp_resphys import Corotated, Inputs, Rigid, Simulator, Tendons
 from warp_resphys.dynamics.energy_set import EnergySet, place_energies
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.fem.coordinates import DeviceCoordinates
@@ -23,7 +24,7 @@ TENDON = Tendons([[[x, 0.01, 0.02] for x in (0.0, 0.01, 0.03, 0.04)]], 400.0, di
 def linearised(rigid):
     """A step of two bent bodies, positions at which to take it, and a direction of the coordinates."""
     mesh = MESH if rigid else BOX
-    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[TENDON], rigid={"cap": Rigid()} if rigid else {})
+    body = clamped(mesh, energies=[TENDON], rigid={"cap": Rigid()} if rigid else {})
     s = Simulator(body, {"beam": Corotated(2e5)} if rigid else Corotated(2e5))
     generator = torch.Generator().manual_seed(0)
     state = s.rest_state(2)
@@ -69,8 +70,7 @@ def test_a_shifted_factor():
 
 def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     mesh = Mesh(BOX.vertices, BOX.cells, {"root": np.array([0]), "tip": np.array([1, 2])})
-    tendon = replace(TENDON, friction=0.2)
-    body = Body(mesh, select_vertices(mesh, x=0.0), energies=[tendon])
+    body = clamped(mesh, energies=[replace(TENDON, friction=0.2)])
     materials = {"root": Corotated(1e5, density=1000.0), "tip": Corotated(2e5, density=500.0)}
     rest = torch.as_tensor(mesh.vertices)
     where = (body, DeviceCoordinates(body.coordinates, rest), rest, INTEGRATORS["bdf2"], 0.01)

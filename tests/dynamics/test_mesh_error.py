@@ -6,18 +6,8 @@ import warnings
 import numpy as np
 import pytest
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Mesh,
-    Scene,
-    Simulator,
-    box_hexahedra,
-    box_tetrahedra,
-    quadratic,
-    select_vertices,
-)
+from support.clamped import clamped
+from warp_resphys import Corotated, Inputs, Mesh, Scene, Simulator, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.io.errors import ResphysWarning
 
 SIZE = (0.1, 0.03, 0.03)
@@ -26,7 +16,7 @@ NUMBER = re.compile(r"deform by (about|at least) (\d+) % (more|less)")
 
 def sag(mesh, material, **options):
     """Mean sag of the mass under its weight [m], and the warnings."""
-    simulator = Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), material, **options)
+    simulator = Simulator(clamped(mesh), material, **options)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         q = simulator.static_equilibrium().q[0].numpy()
@@ -101,9 +91,7 @@ def test_good_meshes_are_not_warned_of(mesh, material):
 
 def test_a_body_of_a_scene_is_named_and_warned_of_once():
     """In the first of its equilibria that shows it, here under a force."""
-    coarse, fine = box_hexahedra(SIZE, (4, 2, 2)), box_hexahedra(SIZE, (12, 4, 4))
-    bodies = {n: Body(mesh, fixed=select_vertices(mesh, x=0.0)) for n, mesh in (("coarse", coarse), ("fine", fine))}
-    scene = Scene(bodies)
+    scene = Scene({n: clamped(box_hexahedra(SIZE, d)) for n, d in (("coarse", (4, 2, 2)), ("fine", (12, 4, 4)))})
     simulator = Simulator(scene, Corotated(264e3, 0.45), gravity=(0.0, 0.0, 0.0))
     force = np.zeros((1, scene.n_vertices, 3))
     force[:, np.isclose(scene.vertices[:, 0], 0.1), 2] = 1e-3

@@ -5,14 +5,15 @@ import pytest
 import scipy.linalg
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra
 from warp_resphys.dynamics.modes import vibration_modes
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
 
 
-def simulator(held=True, **options):
-    return Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0) if held else ()), Corotated(2e5, 0.45), **options)
+def simulator(held=True):
+    return Simulator(clamped(MESH) if held else Body(MESH), Corotated(2e5, 0.45))
 
 
 @pytest.mark.parametrize(("held", "count"), [(True, 1), (True, 8), (False, 5)])

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from support.clamped import clamped, noise
+from warp_resphys import Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics.minimiser import Minimiser
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
 from warp_resphys.energies.catalogue import MATERIALS
@@ -17,13 +18,13 @@ from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
-BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+BODY = clamped(MESH)
 MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
 
 
-def simulator(name="quasi_newton", material=MATERIAL, body=BODY, device="cpu", **settings):
+def simulator(name="quasi_newton", material=MATERIAL, device="cpu", **settings):
     chosen = SolverSettings(name, **({"relative_tolerance": 1e-9} | settings))
-    return Simulator(body, material, solver=chosen, device=device)
+    return Simulator(BODY, material, solver=chosen, device=device)
 
 
 @pytest.mark.parametrize(("model", "start"), [("corotated", "twisted"), ("stable_neo_hookean", "bent")])
@@ -66,8 +67,7 @@ def test_solver_finds_the_minimum_and_reports_it():
     scale = float(balance) + float(torch.linalg.vector_norm(potential.terms.force))
     assert residual / scale == pytest.approx(float(new.report.relative_residual), rel=1e-6, abs=1e-13)
     assert 2 <= int(new.report.iterations) <= 30
-    noise = torch.randn(new.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    potential.positions.copy_(new.q + 1e-5 * noise * potential.free_mask[:, None])
+    potential.positions.copy_(new.q + 1e-5 * noise(*new.q.shape) * potential.free_mask[:, None])
     assert float(potential.evaluate()[0]) > float(energy)
 
 
@@ -91,7 +91,7 @@ def test_failure_carries_the_last_positions_and_the_report(name):
 def pulled_beam():
     """Simulators of the README's beam by settings, nearly incompressible, and its pose under a pull."""
     mesh = box_hexahedra((0.1, 0.03, 0.03), (10, 3, 3))
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
+    body = clamped(mesh)
 
     def make(nu=0.499, **settings):
         return Simulator(body, Corotated(264e3, nu, density=1070.0), **settings)

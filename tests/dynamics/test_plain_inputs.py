@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Scene,
-    Simulator,
-    SurfaceContact,
-    Tendons,
-    box_hexahedra,
-    select_vertices,
-)
+from support.clamped import clamped
+from warp_resphys import Body, Corotated, Inputs, Scene, Simulator, SurfaceContact, Tendons, box_hexahedra
 from warp_resphys.io.errors import InputError
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (4, 1, 1))
@@ -22,8 +13,7 @@ ROUTES = [[[x, 0.01, z] for x in (0.0, 0.05, 0.1)] for z in (0.002, 0.018)]
 
 
 def pulled(dtype=torch.float64):
-    body = Body(MESH, fixed=select_vertices(MESH, x=0.0), energies=[Tendons(ROUTES)])
-    return Simulator(body, Corotated(2e5, 0.45), dtype=dtype)
+    return Simulator(clamped(MESH, energies=[Tendons(ROUTES)]), Corotated(2e5, 0.45), dtype=dtype)
 
 
 @pytest.mark.parametrize(("dtype", "batch"), [(torch.float64, 1), (torch.float32, 3)])

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra
 from warp_resphys.dynamics import statics
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.linalg.choice import make_linear_solver
 from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
-CLAMPED = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+CLAMPED = clamped(MESH)
 RUBBER = Corotated(264e3, 0.45)
 
 
@@ -44,8 +45,7 @@ def test_statics_never_return_a_failure():
 
 def test_an_equilibrium_that_is_far_is_reached_under_growing_loads():
     """Where all of them at once take too many iterations; with a gradient as if they had not."""
-    mesh = box_hexahedra((0.12, 0.02, 0.02), (6, 2, 2))
-    body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
+    body = clamped(box_hexahedra((0.12, 0.02, 0.02), (6, 2, 2)))
     results = []
     for most in (2000, 8):
         modulus = torch.full((1, 1), 5e4, dtype=torch.float64, requires_grad=True)

@@ -5,18 +5,8 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from warp_resphys import (
-    Body,
-    Contact,
-    Corotated,
-    HalfSpace,
-    Inputs,
-    Simulator,
-    State,
-    Tendons,
-    box_hexahedra,
-    select_vertices,
-)
+from support.clamped import clamped
+from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Simulator, State, Tendons, box_hexahedra
 from warp_resphys.energies.contact.barrier import barrier_pressure
 from warp_resphys.io.errors import DerivativeError
 
@@ -27,8 +17,7 @@ TENDON = Tendons([np.linspace([0.0, 0.01, 0.02], [0.1, 0.01, 0.02], 5)], frictio
 
 
 def simulator(*energies):
-    material = Corotated(100e3, 0.4, stiffness_damping=1e-3)
-    return Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0), energies=energies), material)
+    return Simulator(clamped(MESH, energies=energies), Corotated(100e3, 0.4, stiffness_damping=1e-3))
 
 
 def of_modulus(sim, scale):

@@ -5,14 +5,15 @@ import time
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.linalg.threads import in_threads, shards_of
 from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
-BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
+BODY = clamped(MESH)
 SIZE, STEPS = 7, 6
 
 
@@ -31,14 +32,9 @@ def motion():
     sim = simulator()
     generator = torch.Generator().manual_seed(0)
     start = pose(sim, "bent", SIZE)
-    start = State(
-        sim.rest_positions + torch.linspace(0.0, 1.2, SIZE)[:, None, None] * (start.q - sim.rest_positions), start.v
-    )
-    forces = (
-        1e-3
-        * torch.linspace(0.0, 3.0, SIZE)[:, None, None]
-        * torch.randn(STEPS, *start.q.shape, generator=generator, dtype=torch.float64)
-    )
+    growth, rest = torch.linspace(0.0, 1.2, SIZE)[:, None, None], sim.rest_positions
+    start = State(rest + growth * (start.q - rest), start.v)
+    forces = 2.5e-3 * growth * torch.randn(STEPS, *start.q.shape, generator=generator, dtype=torch.float64)
     modulus = 1e5 * (1.0 + torch.rand(SIZE, 1, generator=generator, dtype=torch.float64))
     return start, forces, modulus
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 import warp as wp
 
-from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra
+from support.clamped import clamped
+from warp_resphys import Corotated, Inputs, Simulator, State, box_hexahedra
 from warp_resphys.dynamics.tape import record_rollout
 from warp_resphys.io.errors import InputError
 
@@ -15,10 +16,9 @@ BATCH, STEPS = 2, 3
 
 
 def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator:
-    mesh = box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1))
+    body = clamped(box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1)))
     material = Corotated(1e5, 0.4, density=1000.0, mass_damping=0.5, stiffness_damping=0.001)
-    clamped = np.flatnonzero(mesh.vertices[:, 0] == 0.0)
-    return Simulator(Body(mesh, clamped), material, integrator=integrator, relative_tolerance=1e-11, device=device)
+    return Simulator(body, material, integrator=integrator, relative_tolerance=1e-11, device=device)
 
 
 def array(tensor: torch.Tensor, dtype: type = wp.vec3d) -> wp.array:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Simulator, box_hexahedra, select_vertices
 from warp_resphys.studies.check import MOTIONS, positions
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (6, 2, 2))
@@ -22,8 +23,7 @@ FLOOR = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.002))}, distance=0.00
 
 
 def simulator(*energies):
-    material = Corotated(100e3, 0.45, stiffness_damping=2e-3)
-    return Simulator(Body(MESH, fixed=select_vertices(MESH, x=0.0), energies=energies), material)
+    return Simulator(clamped(MESH, energies=energies), Corotated(100e3, 0.45, stiffness_damping=2e-3))
 
 
 def loss(sim, number, modulus):
@@ -101,7 +101,7 @@ def test_a_forked_process_uses_the_simulator(divisions, monkeypatch):
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     mesh = box_hexahedra((0.1, 0.02, 0.02), divisions)
-    sim = Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)), Corotated(100e3, 0.45))
+    sim = Simulator(clamped(mesh), Corotated(100e3, 0.45))
     batch = 4 if len(mesh.vertices) < 1000 else 1
 
     def motion():

@@ -3,13 +3,11 @@
 import pytest
 import torch
 
+from support.clamped import clamped
 from warp_resphys.dynamics.assembly import HessianAssembly
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.launcher import Launcher
-from warp_resphys.fem.bodies import Body
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.state import State
 
 MESHES = {
@@ -20,13 +18,13 @@ MESHES = {
 
 def evaluated(mesh):
     """Residual, Hessian and its product at a bent pose, and where two steps lead from there."""
-    simulator = Simulator(Body(mesh, fixed=select_vertices(mesh, x=0.0)))
+    simulator = Simulator(clamped(mesh))
     state = simulator.rest_state(2)
     q = state.q.clone()
     q[..., 2] += torch.tensor([3.0, -1.0])[:, None] * q[..., 0].square()
     workspace = simulator.workspace(2)
     potential = workspace.potential
-    end = simulator.rollout(State(q, state.v), 2, Inputs())
+    end = simulator.rollout(State(q, state.v), 2)
     potential.positions.copy_(q)
     potential.evaluate()
     potential.update_tangent()

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Contact, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Contact, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
 from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.energies import Box, Sphere
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)
-SIMULATOR = Simulator(
-    Body(MESH, select_vertices(MESH, x=0.0), energies=[Tendons([[[0.0, 0.01, 0.02], [0.1, 0.01, 0.02]]])])
-)
+SIMULATOR = Simulator(clamped(MESH, energies=[Tendons([[[0.0, 0.01, 0.02], [0.1, 0.01, 0.02]]])]))
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +44,7 @@ BALL = Sphere(position=(0.05, 0.01, -0.05), radius=0.01)
 
 def test_obstacles_are_in_the_series_where_they_are_at_the_end_of_every_step(tmp_path):
     """A plate that rises and turns, and a ball whose place and size are parameters, by environment."""
-    contact = Contact({"ball": BALL, "plate": PLATE})
-    simulator = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=[contact]), time_step=0.01)
+    simulator = Simulator(clamped(MESH, energies=[Contact({"ball": BALL, "plate": PLATE})]), time_step=0.01)
     ways = torch.arange(1, 4, dtype=torch.float64)[:, None, None] * torch.tensor([[0.0, 2e-4], [0.0, 5e-4]])
     inputs = {"obstacle_move_z": ways, "obstacle_rotate_y": -20.0 * ways}
     given = {"obstacle_x": torch.tensor([[0.0, 0.0], [0.02, 0.0]]), "obstacle_growth": torch.tensor([[2e-3], [0.0]])}

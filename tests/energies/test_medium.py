@@ -8,17 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Simulator,
-    SolverSettings,
-    State,
-    box_hexahedra,
-    box_tetrahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.energies.medium import Medium
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.volume_mesh import boundary_faces
@@ -29,16 +19,14 @@ SIZE = (0.04, 0.03, 0.02)
 BOX = box_hexahedra(SIZE, (2, 2, 2))
 MESHES = {"hexahedra": BOX, "tetrahedra10": box_tetrahedra(SIZE, (2, 2, 2), order=2)}
 STIFF = Corotated(1e6, 0.3, density=1000.0)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-9)
 MASS = 1000.0 * math.prod(SIZE)
 ACROSS = 2 * SIZE[0] * SIZE[1]  # the two faces across z
 ALONG = 2 * (SIZE[0] + SIZE[1]) * SIZE[2]
 
 
 def simulator(medium, mesh=BOX, gravity=0.0, fixed=(), step=0.01, material=STIFF, **more):
-    body = Body(mesh, fixed=fixed, energies=(medium,))
-    more = {"solver": TIGHT, **more}
-    return Simulator(body, material, time_step=step, gravity=(0.0, 0.0, -gravity), **more)
+    body, more = Body(mesh, fixed=fixed, energies=(medium,)), {"relative_tolerance": 1e-9, **more}
+    return Simulator(body, material, time_step=step, gravity=(0.0, 0.0, -gravity), solver="newton", **more)
 
 
 def coasting(sim, speed):
@@ -106,9 +94,8 @@ def test_gradients(integrator, start, device):
     mesh = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
     medium = Medium(900.0, linear=30.0, normal=1.2, tangential=0.2, layer=4e-3)
     material = Corotated(1e5, 0.45, mass_damping=0.5, stiffness_damping=2e-3)
-    solver = replace(TIGHT, relative_tolerance=1e-12)
-    sim = simulator(medium, mesh, 9.8, select_vertices(mesh, x=0.0), material=material, solver=solver, device=device)
-    sim = replace(sim, integrator=integrator)
+    more = {"material": material, "integrator": integrator, "device": device, "relative_tolerance": 1e-12}
+    sim = simulator(medium, mesh, 9.8, select_vertices(mesh, x=0.0), **more)
     rows = {row.parameter: row for row in check_gradients(sim, start, steps=3, together=False)}
     assert {"medium_density", "drag_linear", "drag_normal", "drag_tangential", "added_layer"} <= {
         name.partition(",")[0] for name in rows

@@ -8,7 +8,8 @@ import pytest
 import torch
 import warp as wp
 
-from warp_resphys import Body, Corotated, Inputs, Muscles, Simulator, SolverSettings, box_hexahedra, select_vertices
+from support.clamped import clamped, noise
+from warp_resphys import Corotated, Inputs, Muscles, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies import Muscle
 from warp_resphys.energies.pointwise import PointwiseEnergy, at_vertices, between
 from warp_resphys.io.errors import InputError
@@ -83,12 +84,12 @@ class Hills(PointwiseEnergy):
         return (at_vertices(TIP),)
 
 
-def simulator(energy, **options):
-    return Simulator(Body(MESH, fixed=CLAMP, energies=[energy]), MATERIAL, solver=TIGHT, **options)
+def simulator(energy):
+    return Simulator(clamped(MESH, energies=[energy]), MATERIAL, solver=TIGHT)
 
 
-def acting(s, batch=2):
-    return Inputs(**{name: torch.full((batch, 1), value, dtype=torch.float64) for name, value in VALUES.items()})
+def acting():
+    return Inputs(**{name: torch.full((2, 1), value, dtype=torch.float64) for name, value in VALUES.items()})
 
 
 @pytest.mark.parametrize("at", ["rest", "bent"])
@@ -97,9 +98,9 @@ def test_stress_tangent_and_adjoint_equal_hand_written_kernels(at):
     for energy in (FIBRES, Fibre()):
         s = simulator(energy)
         state, stiffness = pose(s, at, 2), torch.full((2, 1), 4e4, dtype=torch.float64, requires_grad=True)
-        inputs = Inputs(**{name: value.requires_grad_() for name, value in acting(s).actuation.items()})
-        here = s.linearise(state, acting(s))
-        x = state.q + 1e-3 * torch.randn(state.q.shape, generator=torch.Generator().manual_seed(0)).double()
+        inputs = Inputs(**{name: value.requires_grad_() for name, value in acting().actuation.items()})
+        here = s.linearise(state, acting())
+        x = state.q + 1e-3 * noise(*state.q.shape)
         residual = here.residual(x)
         here.update(x)
         product = here.product(torch.sin(50.0 * x))

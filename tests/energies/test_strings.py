@@ -8,29 +8,28 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Inputs, PointMass, Simulator, SolverSettings, box_hexahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Corotated, Inputs, PointMass, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies.strings import Strings
 from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 BEAM = box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2))
-CLAMP, TIP = select_vertices(BEAM, x=0.0), select_vertices(BEAM, x=0.1, z=0.03)
+TIP = select_vertices(BEAM, x=0.1, z=0.03)
 SOFT = Corotated(264e3, 0.49, stiffness_damping=0.002)
 RIGID = replace(SOFT, youngs_modulus=1e12, stiffness_damping=0.0)
 TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
 G = 9.81
 
 
-def simulator(length=0.2, compliance=0.0, material=SOFT, mesh=BEAM, tied=TIP, step=0.005, **more):
-    own = {key: more.pop(key) for key in ("toe",) if key in more}
-    body = Body(mesh, fixed=CLAMP, energies=(Strings([tied], length, compliance, **own),))
-    more = {"solver": TIGHT, "gravity": (0.0, 0.0, -G), "time_step": step, **more}
-    return Simulator(body, material, **more)
+def simulator(length=0.2, compliance=0.0, material=SOFT, tied=TIP, step=0.005, toe=1e-5, integrator="implicit_euler"):
+    body = clamped(BEAM, energies=(Strings([tied], length, compliance, toe=toe),))
+    return Simulator(body, material, step, (0.0, 0.0, -G), integrator, TIGHT)
 
 
 def weight(*kilograms):
-    return Inputs(payload=torch.tensor([[mass] for mass in kilograms], dtype=torch.float64))
+    return Inputs(payload=np.array(kilograms)[:, None])
 
 
 def swing(sim, angle, steps, mass=0.05, length=0.2):
@@ -83,7 +82,7 @@ def test_an_equilibrium_stays(integrator, compliance):
     """That of a weight that is part of the body, and steps do not leave it."""
     sim = simulator(compliance=compliance, integrator=integrator)
     start = sim.static_equilibrium(weight(0.05, 0.0))
-    glued = replace(sim, body=Body(BEAM, fixed=CLAMP, point_masses=[PointMass(0.05, TIP)])).static_equilibrium()
+    glued = replace(sim, body=clamped(BEAM, point_masses=[PointMass(0.05, TIP)])).static_equilibrium()
     torch.testing.assert_close(start.q[0], glued.q[0], rtol=0.0, atol=1e-9)
     after = sim.rollout(start, 20, weight(0.05, 0.0))
     torch.testing.assert_close(after.q[-1], start.q, rtol=0.0, atol=1e-8)
@@ -95,7 +94,7 @@ def test_an_equilibrium_stays(integrator, compliance):
 def test_gradients(integrator, start, device):
     """Of weights, lengths and compliances: taut and slack strings, and on the way between."""
     strings = Strings([TIP, select_vertices(BEAM, x=0.05, z=0.0)[:1]], [0.2, 0.1], 1e-2, toe=2e-2)
-    body = Body(BEAM, fixed=CLAMP, energies=(strings,))
+    body = clamped(BEAM, energies=(strings,))
     material = replace(SOFT, mass_damping=0.5)
     solver = replace(TIGHT, relative_tolerance=1e-12)
     sim = Simulator(body, material, time_step=0.01, integrator=integrator, solver=solver, device=device)
@@ -127,10 +126,7 @@ def test_gradients(integrator, start, device):
             lambda: simulator().rollout(simulator().rest_state(), 1, weight(-1.0)),
             "payload is -1: it must be zero or more",
         ),
-        (
-            lambda: Simulator(Body(BEAM, fixed=CLAMP)).step(simulator().step(simulator().rest_state())),
-            "'payload_position'",
-        ),
+        (lambda: Simulator(clamped(BEAM)).step(simulator().step(simulator().rest_state())), "'payload_position'"),
     ],
 )
 def test_what_cannot_hang(make, sentence):

@@ -9,31 +9,18 @@ import torch
 import warp as wp
 
 from support.slopes import check_slopes
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Mesh,
-    Rigid,
-    Scene,
-    Simulator,
-    SolverSettings,
-    State,
-    SurfaceContact,
-    SymmetryPlane,
-    box_hexahedra,
-    box_tetrahedra,
-    select_vertices,
-)
+from warp_resphys import Corotated, Inputs, Scene, Simulator, SolverSettings, State, SurfaceContact, SymmetryPlane
 from warp_resphys.energies import FrictionPair
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.environments.making import ball_mesh
+from warp_resphys.fem.bodies import Body, Rigid
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels.contact import nearest_points
 from warp_resphys.kernels.contact import surface_pairs as kernels
-from warp_resphys.mesh.selection import select_cells
-from warp_resphys.mesh.volume_mesh import join
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.selection import select_cells, select_vertices
+from warp_resphys.mesh.volume_mesh import Mesh, join
 
 CPU = torch.device("cpu")
 SOFT = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45)
@@ -62,26 +49,26 @@ def pairs_of(kind, x, area, degree, parallel):
     return launcher, pairs
 
 
+def launched(kernel, launcher, chosen, pairs, x, stiffness, reach, *out):
+    """Launches a kernel of pairs at positions (C, 4, 3), with outputs and their types."""
+    at, kappa = torch.tensor(x.reshape(1, -1, 3)), torch.tensor([[stiffness]], dtype=torch.float64)
+    inputs = [warp_view(chosen, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
+    views = [warp_view(tensor, kind) for tensor, kind in out]
+    launcher.launch(launcher.record(kernel, (len(x),), [*inputs, warp_view(at, wp.vec3d)], views))
+
+
 def pair_forces(launcher, pairs, x, stiffness, reach):
-    """Energies (C,) and gradients (C, 4, 3) of pairs at positions (C, 4, 3)."""
-    count, at = len(x), torch.tensor(x.reshape(1, -1, 3))
-    force, energy = torch.zeros(count, 4, 3, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
-    near = torch.zeros(count, dtype=torch.int32)
-    kappa = torch.tensor([[stiffness]], dtype=torch.float64)
-    inputs = [warp_view(launcher.active, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
-    out = [warp_view(force, nearest_points.Corners), warp_view(energy, wp.float64), warp_view(near, wp.int32)]
-    launcher.launch(launcher.record(kernels.pair_forces, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
+    """Energies (C,) and gradients (C, 4, 3) of pairs."""
+    force, energy = torch.zeros(len(x), 4, 3, dtype=torch.float64), torch.zeros(len(x), dtype=torch.float64)
+    out = (force, nearest_points.Corners), (energy, wp.float64), (torch.zeros(len(x), dtype=torch.int32), wp.int32)
+    launched(kernels.pair_forces, launcher, launcher.active, pairs, x, stiffness, reach, *out)
     return energy.numpy(), force.numpy()
 
 
 def pair_tangents(launcher, pairs, x, stiffness, reach):
-    """Second derivatives (C, 12, 12) of the energies of pairs at positions (C, 4, 3)."""
-    count, at = len(x), torch.tensor(x.reshape(1, -1, 3))
-    hessian = torch.zeros(count, 12, 12, dtype=torch.float64)
-    chosen, kappa = torch.arange(count, dtype=torch.int32), torch.tensor([[stiffness]], dtype=torch.float64)
-    inputs = [warp_view(chosen, wp.int32), pairs, warp_view(kappa, wp.float64), wp.float64(reach)]
-    out = [warp_view(hessian, wp.float64)]
-    launcher.launch(launcher.record(kernels.pair_tangents, (count,), [*inputs, warp_view(at, wp.vec3d)], out))
+    """Second derivatives (C, 12, 12) of the energies of pairs."""
+    hessian, chosen = torch.zeros(len(x), 12, 12, dtype=torch.float64), torch.arange(len(x), dtype=torch.int32)
+    launched(kernels.pair_tangents, launcher, chosen, pairs, x, stiffness, reach, (hessian, wp.float64))
     return hessian.numpy()
 
 
@@ -136,11 +123,7 @@ def test_energies_of_pairs_are_those_of_ipctk(kind):
 
 def joined():
     """Two blocks, one above the other, with some disorder in three environments."""
-    upper = replace(CUBE, vertices=CUBE.vertices + [0.011, 0.009, 0.0125])
-    meshes = (PLATE, upper)
-    first = len(PLATE.vertices)
-    cells = np.concatenate([PLATE.cells, upper.cells + first])
-    mesh = Mesh(np.concatenate([m.vertices for m in meshes]), cells)
+    mesh = join({"lower": PLATE, "upper": replace(CUBE, vertices=CUBE.vertices + [0.011, 0.009, 0.0125])})
     noise = np.random.default_rng(0).normal(size=(3, *mesh.vertices.shape)) * 3e-4
     return mesh, torch.tensor(mesh.vertices + noise)
 
@@ -163,11 +146,8 @@ def test_pairs_are_all_pairs_within_reach():
     for b in range(3):
         d = torch.zeros(len(nodes), dtype=torch.float64)
         at = x[b, nodes.reshape(-1)][None].contiguous()
-        launcher.launch(
-            launcher.record(
-                nearest_points.distances, (len(nodes),), [every, warp_view(at, wp.vec3d)], [warp_view(d, wp.float64)]
-            )
-        )
+        views = [every, warp_view(at, wp.vec3d)], [warp_view(d, wp.float64)]
+        launcher.launch(launcher.record(nearest_points.distances, (len(nodes),), *views))
         near = {(int(k), *map(int, n)) for k, n in zip(kind[d < reach], nodes[d < reach], strict=True)}
         own = pairs.environment == b
         found = pairs.distances(x)[own] < reach
@@ -404,14 +384,12 @@ def test_refusals():
     with pytest.raises(InputError, match="touch at rest"):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
-    with pytest.raises(
-        InputError, match=r"cross at rest: an edge .* 'plate'.*; deepest is vertex \d+ in '(cube|plate)', by 5 mm"
-    ):
+    words = r"cross at rest: an edge .* 'plate'.*; deepest is vertex \d+ in '(cube|plate)', by 5 mm"
+    with pytest.raises(InputError, match=words):
         Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
-    with pytest.raises(
-        InputError, match=r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate' at rest: move"
-    ):
+    words = r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate' at rest: move"
+    with pytest.raises(InputError, match=words):
         Simulator(Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
     with pytest.raises(InputError, match="mm from itself"):
         Simulator(Body(clip(), energies=[SurfaceContact(distance=0.02)]))

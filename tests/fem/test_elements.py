@@ -25,21 +25,17 @@ def distorted(mesh, amount=0.12):
     return Mesh(mesh.vertices + amount * cell * rng.uniform(-1, 1, mesh.vertices.shape), mesh.cells)
 
 
-def meshes():
-    hexahedra, tetrahedra = box_hexahedra(SIZE, DIVISIONS), box_tetrahedra(SIZE, DIVISIONS)
-    return {
-        "hexahedra": hexahedra,
-        "distorted hexahedra": distorted(hexahedra),
-        "distorted tetrahedra": distorted(tetrahedra),
-        "distorted 10-node tetrahedra": quadratic(distorted(tetrahedra)),
-        "curved 10-node tetrahedra": distorted(quadratic(tetrahedra), 0.03),
-        "distorted 20-node hexahedra": quadratic(distorted(hexahedra), "hexahedron20"),
-        "distorted 27-node hexahedra": quadratic(distorted(hexahedra)),
-        "curved 27-node hexahedra": distorted(quadratic(hexahedra), 0.03),
-    }
-
-
-MESHES = meshes()
+HEXAHEDRA, TETRAHEDRA = box_hexahedra(SIZE, DIVISIONS), box_tetrahedra(SIZE, DIVISIONS)
+MESHES = {
+    "hexahedra": HEXAHEDRA,
+    "distorted hexahedra": distorted(HEXAHEDRA),
+    "distorted tetrahedra": distorted(TETRAHEDRA),
+    "distorted 10-node tetrahedra": quadratic(distorted(TETRAHEDRA)),
+    "curved 10-node tetrahedra": distorted(quadratic(TETRAHEDRA), 0.03),
+    "distorted 20-node hexahedra": quadratic(distorted(HEXAHEDRA), "hexahedron20"),
+    "distorted 27-node hexahedra": quadratic(distorted(HEXAHEDRA)),
+    "curved 27-node hexahedra": distorted(quadratic(HEXAHEDRA), 0.03),
+}
 
 
 @pytest.mark.parametrize("kind", SHAPES)

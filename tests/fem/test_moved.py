@@ -5,19 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.chambered import hollow_box
-from warp_resphys import (
-    Body,
-    Corotated,
-    Fibres,
-    Inputs,
-    Muscles,
-    Pressure,
-    Simulator,
-    SymmetryPlane,
-    Tendons,
-    box_hexahedra,
-    select_vertices,
-)
+from support.clamped import clamped
+from warp_resphys import Corotated, Fibres, Inputs, Muscles, Pressure, Simulator, SymmetryPlane, Tendons, box_hexahedra
 from warp_resphys.energies import Muscle
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh import find_chambers
@@ -25,23 +14,18 @@ from warp_resphys.mesh import find_chambers
 ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 SHIFT = np.array([0.1, -0.2, 0.05])  # m
 BOX = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
-CLAMPED = {"fixed": select_vertices(BOX, x=0.0)}
 HOLLOW = hollow_box("hexahedron")
 CHAMBER = [max(find_chambers(HOLLOW), key=lambda own: len(own.faces))]  # longer than it is wide
 ROUTE = [[0.0, 0.015, 0.01], [0.05, 0.015, 0.012], [0.1, 0.015, 0.01]]
 BODIES = {
     "tendon": (
-        Body(BOX, energies=[Tendons([ROUTE], directions=[[[0.0, 0.0, 1.0]]])], **CLAMPED),
+        clamped(BOX, energies=[Tendons([ROUTE], directions=[[[0.0, 0.0, 1.0]]])]),
         {"tendon_tension": 0.4},
         {"tendon_offset_1": 2e-3},
     ),
-    "muscle": (Body(BOX, energies=[Muscles([Muscle([2, 3], (1.0, 0.5, 0.0))])], **CLAMPED), {"muscle_stress": 2e4}, {}),
+    "muscle": (clamped(BOX, energies=[Muscles([Muscle([2, 3], (1.0, 0.5, 0.0))])]), {"muscle_stress": 2e4}, {}),
     "chamber": (
-        Body(
-            HOLLOW,
-            fixed=select_vertices(HOLLOW, x=0.0),
-            energies=[Pressure(CHAMBER), Fibres(CHAMBER, angles=[20.0], axis=(1.0, 0.2, 0.1), stiffness=1e3)],
-        ),
+        clamped(HOLLOW, energies=[Pressure(CHAMBER), Fibres(CHAMBER, [20.0], axis=(1.0, 0.2, 0.1), stiffness=1e3)]),
         {"pressure": 3e4},
         {},
     ),
@@ -55,9 +39,7 @@ def test_the_motion_moves_with_the_body(name):
     material, ends = Corotated(2e5, 0.4), []
     for own, pull in ((body, gravity), (body.moved(ROTATION, SHIFT), ROTATION @ gravity)):
         simulator = Simulator(own, material, 0.01, tuple(pull), relative_tolerance=1e-11)
-        inputs = Inputs(**{key: simulator.tensor(np.full((1, simulator.counts[key]), v)) for key, v in given.items()})
-        parameters = {key: simulator.tensor([[value]]) for key, value in parameters.items()}
-        ends.append(simulator.rollout(simulator.rest_state(), 5, inputs, parameters).q[-1, 0].numpy())
+        ends.append(simulator.rollout(simulator.rest_state(), 5, Inputs(**given), parameters).q[-1, 0].numpy())
     without = Simulator(body, material, 0.01, tuple(gravity))
     free = without.rollout(without.rest_state(), 5).q[-1, 0].numpy()
     assert np.abs(ends[0] - free).max() > 1e-4  # The actuator does something.
@@ -71,6 +53,5 @@ def test_a_matrix_that_is_no_rotation_is_refused(rotation):
 
 
 def test_a_symmetric_body_stays():
-    plane = SymmetryPlane((0.0, 1.0, 0.0))
     with pytest.raises(InputError, match="symmetry plane"):
-        Body(BOX, symmetry=[plane], **CLAMPED).moved(ROTATION, SHIFT)
+        clamped(BOX, symmetry=[SymmetryPlane((0.0, 1.0, 0.0))]).moved(ROTATION, SHIFT)

@@ -4,21 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import (
-    Body,
-    Corotated,
-    Inputs,
-    Mesh,
-    Rigid,
-    Simulator,
-    StableNeoHookean,
-    box_hexahedra,
-    box_tetrahedra,
-    select_vertices,
-)
+from support.clamped import clamped
+from warp_resphys import Body, Corotated, Inputs, Mesh, Rigid, Scene, Simulator, StableNeoHookean, box_hexahedra
 from warp_resphys.energies import Strings
-from warp_resphys.fem.scene import Scene
 from warp_resphys.io.errors import InputError, MeshError
+from warp_resphys.mesh.boxes import box_tetrahedra
+from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.mesh.volume_mesh import join
 
 SOFT = Corotated(2e5, 0.45)
@@ -26,20 +17,19 @@ SOFT = Corotated(2e5, 0.45)
 
 def finger():
     mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1))
-    return Body(mesh, select_vertices(mesh, x=0.0), energies=[Strings([select_vertices(mesh, x=0.1)], 0.1)])
+    return clamped(mesh, energies=[Strings([select_vertices(mesh, x=0.1)], 0.1)])
 
 
 def ball():
     """A rigid body of other cells, free to fall."""
-    mesh = box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2)
-    return Body(Mesh(mesh.vertices, mesh.cells, {"all": np.arange(len(mesh.cells))}), rigid={"all": Rigid(900.0)})
+    return Body.rigid_body(box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2), Rigid(900.0))
 
 
 def test_bodies_of_a_scene_move_as_each_alone():
     scene = Scene({"finger": finger(), "ball": ball()})
-    weight = Inputs(payload=torch.tensor([[0.05]], dtype=torch.float64))
+    weight = Inputs(payload=np.array([[0.05]]))
     together = Simulator(scene, SOFT)
-    assert {"finger_youngs_modulus", "finger_string_length", "ball_all_density"} <= together.parameters.keys()
+    assert {"finger_youngs_modulus", "finger_string_length", "ball_body_density"} <= together.parameters.keys()
     motion = together.rollout(together.rest_state(), 6, scene.inputs({"finger": weight}))
     for name, body, material, inputs in (("finger", finger(), SOFT, weight), ("ball", ball(), {}, Inputs())):
         alone = Simulator(body, material)

@@ -44,15 +44,10 @@ def sopra_chambers():
 
 def sopra_silicone():
     """Volume of the solid: three lobes of 4 mm more than the half discs, that meet 30 degrees behind their centres."""
-    heights = np.linspace(0.0, 1.0, 2001)
-    radii = (0.0283923, 0.0212942, 0.0165622)
-    inner = (0.014, 0.0095, 0.0065)
-    total = 0.010 * lobes(radii[0], inner[0]) + 0.021 * lobes(radii[1], inner[1]) + 0.005 * lobes(radii[2], inner[2])
-    for i in (0, 1):
-        areas = [
-            lobes(radii[i] + t * (radii[i + 1] - radii[i]), inner[i] + t * (inner[i + 1] - inner[i])) for t in heights
-        ]
-        total += 0.120 * trapezoid(areas, heights)
+    sizes, share = np.array([[0.0283923, 0.014], [0.0212942, 0.0095], [0.0165622, 0.0065]]), np.linspace(0.0, 1.0, 2001)
+    total = sum(cap * lobes(*ends) for cap, ends in zip((0.010, 0.021, 0.005), sizes, strict=True))
+    for low, high in itertools.pairwise(sizes):
+        total += 0.120 * trapezoid([lobes(*(low + t * (high - low))) for t in share], share)
     return total - sum(sopra_chambers())
 
 
@@ -75,10 +70,6 @@ def area(polygon):
     return 0.5 * (polygon.conj() * np.roll(polygon, -1, axis=-1)).imag.sum(-1)
 
 
-def configured(*overrides):
-    return settings(*overrides).mesh
-
-
 @pytest.mark.parametrize(("cells", "size"), [("hexahedra", 0.01), ("hexahedra", 0.002), ("tetrahedra", 0.03)])
 def test_sopra_has_its_chambers_and_its_silicone_at_every_size(cells, size):
     if cells == "tetrahedra":
@@ -93,9 +84,7 @@ def test_sopra_has_its_chambers_and_its_silicone_at_every_size(cells, size):
 
 @pytest.mark.parametrize(("profile", "outline", "count"), SHAPES)
 def test_polygons_have_the_areas_of_the_curves_and_converge_to_them(profile, outline, count):
-    section = ArmGeometry(
-        (0.1,), (0.01, 0.01), (0.025, 0.025), count, profile, outline, wall=0.003, web=0.0025
-    ).section(0.025)
+    section = ArmGeometry(chambers=count, profile=profile, outline=outline, wall=0.003, web=0.0025).section(0.025)
     fine = [area(polygon) for polygon in polygons(section, 1e-4)]
     for size, most in ((1.0, 0.16), (0.002, 0.012), (0.0005, 8e-4)):
         np.testing.assert_allclose([area(polygon) for polygon in polygons(section, size)], fine, rtol=1e-12)
@@ -212,7 +201,7 @@ def test_sizes_that_make_no_mesh(arguments, message):
 
 @pytest.mark.parametrize(("option", "count"), [("arm_coarse", 530), ("arm", 1373), ("arm_fine", 1950)])
 def test_shipped_arms(option, count):
-    mesh = build_mesh(configured(f"mesh={option}"))
+    mesh = build_mesh(settings(f"mesh={option}").mesh)
     assert len(mesh.vertices) == count
     chambers = find_chambers(mesh)
     assert len(chambers) == 6

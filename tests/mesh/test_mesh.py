@@ -11,24 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from warp_resphys import Mesh, quadratic
 from warp_resphys.io import decoding
 from warp_resphys.io.arrays import IntArray
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.mesh.readers import read_mesh
 from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.mesh.volume_mesh import (
-    Mesh,
-    boundary_faces,
-    boundary_triangles,
-    check_mesh,
-    quadratic,
-    surface_vertices,
-)
+from warp_resphys.mesh.volume_mesh import boundary_faces, boundary_triangles, check_mesh, surface_vertices
 
-MESHIO_NAMES = {name: element.file_type for name, element in ELEMENTS.items()}
 BOXES = {
     "hexahedron": box_hexahedra,
     "tetrahedron": box_tetrahedra,
@@ -54,7 +46,7 @@ def is_closed(triangles: IntArray) -> bool:
 
 
 def write(path: Path, mesh: Mesh, *blocks: tuple[str, object], units: str = "m") -> Path:
-    cells = [*blocks, (MESHIO_NAMES[mesh.kind], mesh.cells)]
+    cells = [*blocks, (mesh.element.file_type, mesh.cells)]
     file_format = "gmsh" if path.suffix == ".msh" else None  # not ANSYS
     meshio.write(path, meshio.Mesh(mesh.vertices * PER_METRE[units], cells), file_format=file_format)
     return path
@@ -265,10 +257,7 @@ def test_files_without_usable_cells_are_refused(tmp_path: Path) -> None:
         read_mesh(surface)
 
 
-BAD_FILES = ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.msh"]
-
-
-@pytest.mark.parametrize("name", BAD_FILES)
+@pytest.mark.parametrize("name", ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.msh"])
 def test_unreadable_file_gives_one_sentence_and_no_output(
     tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -81,11 +81,8 @@ def test_files_that_are_no_closed_surface(tmp_path):
         fill_surface(written(tmp_path, box), 0.01, "mm")
     with pytest.raises(MeshError, match="there is no such file"):
         fill_surface(tmp_path / "other.stl", 0.01)
-    for name, content in (
-        ("torn.stl", b"solid robot\nfacet nor"),
-        ("robot.obj", b"\x00\x01"),
-        ("robot.xyz", b"1 2 3\n"),
-    ):
+    broken = {"torn.stl": b"solid robot\nfacet nor", "robot.obj": b"\x00\x01", "robot.xyz": b"1 2 3\n"}
+    for name, content in broken.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(MeshError, match="export"):
             fill_surface(tmp_path / name, 0.01)

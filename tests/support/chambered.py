@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, select_vertices
+from support.clamped import clamped
+from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra
 from warp_resphys.mesh import find_chambers
 from warp_resphys.mesh.volume_mesh import quadratic
 
@@ -32,4 +33,4 @@ def chambered(kind: str, fibres: Mapping[str, Any] | None = None) -> Body:
     mesh = hollow_box(kind)
     chambers = find_chambers(mesh, (1.0, 0.0, 0.0))
     energies = [Pressure(chambers), *([] if fibres is None else [Fibres(chambers, **fibres)])]
-    return Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=energies)
+    return clamped(mesh, energies=energies)

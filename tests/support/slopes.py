@@ -26,3 +26,11 @@ def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6):
         difference = (8.0 * (near[2] - near[1]) - (near[3] - near[0])) / 12.0
         error = float((slopes - difference).norm() / difference.norm())
         assert error < tolerance, f"{name}: {error:.1e}"
+
+
+def check_rows(rows, *names, bound=1e-6):
+    """Returns rows of `check_gradients` by parameter, all right within a bound, the named ones among them."""
+    found = {row.parameter: row for row in rows}
+    assert {*names} <= found.keys()
+    assert {name: row.relative_error for name, row in found.items() if not row.relative_error <= bound} == {}
+    return found

@@ -10,17 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.contact import SIDE, SOFT, G, crossings_and_gap, solves
-from warp_resphys import (
-    Body,
-    Rigid,
-    Scene,
-    Simulator,
-    SolverSettings,
-    SurfaceContact,
-    box_hexahedra,
-    box_tetrahedra,
-    select_vertices,
-)
+from warp_resphys import Body, Rigid, Scene, Simulator, SolverSettings, SurfaceContact, box_hexahedra, select_vertices
+from warp_resphys.mesh.boxes import box_tetrahedra
 
 
 @pytest.mark.parametrize(("mu", "kind"), [(0.2, "soft"), (0.5, "soft"), (0.5, "rigid")])

@@ -22,14 +22,12 @@ from dataclasses import replace
 import numpy as np
 import scipy.linalg
 import torch
-from numpy.typing import NDArray
 
 from support.contact import pressure
 from warp_resphys import Body, Contact, Mesh, Simulator, StableNeoHookean, box_hexahedra
 from warp_resphys.energies.contact.contact_points import vertex_areas
 from warp_resphys.energies.contact.obstacles import Cylinder, Sphere
 
-FloatArray = NDArray[np.float64]
 YOUNG, POISSON = 264e3, 0.45  # Pa, -
 GROWTH = 1.4  # of the cells away from the contact, from one to the next
 SPHERE_RADIUS, SPHERE_DEPTH = 0.02, 0.5e-3  # m
@@ -39,16 +37,16 @@ _ALONG = (0.0, 1.0, 2.0, 4.0, 6.0)  # vertices along the cylinder, over the thic
 _POINTS = 2**14  # of the surface of a layer
 
 
-def sphere_error(cell: float, device: str) -> float:
+def sphere_error(cell, device):
     """Relative error of the force on a sphere, for a size of the cells below it [m], which grow with the distance."""
     lines = _lines(cell, GROWTH, 0.03)
     mesh, ball = _block(lines, lines, lines), Sphere(radius=SPHERE_RADIUS)
     ((force, d),) = press(ball, mesh, [SPHERE_DEPTH], 2e-5, 1e5, device)
     depth = SPHERE_DEPTH + float((force * d).sum() / force.sum())
-    return float(force.sum()) / hertz_force(SPHERE_RADIUS, depth, lines[-1], YOUNG, POISSON) - 1.0
+    return float(force.sum()) / hertz_force(SPHERE_RADIUS, depth, lines[-1]) - 1.0
 
 
-def cylinder_errors(cell: float, device: str) -> FloatArray:
+def cylinder_errors(cell, device):
     """Relative errors of the force on a cylinder at `DEPTHS`, for a size of the cells below it [m].
 
     The growth of the cells is refined with their size. The force is that on the middle of a block twelve times as long
@@ -62,18 +60,18 @@ def cylinder_errors(cell: float, device: str) -> FloatArray:
     for depth, (force, d) in zip(DEPTHS, press(rod, mesh, DEPTHS, 1e-6, 2e5, device), strict=True):
         own = force * middle
         gap = float((own * d).sum() / own.sum())
-        expected = layer_force(CYLINDER_RADIUS, depth + gap, layer[-1], YOUNG, POISSON)
+        expected = layer_force(CYLINDER_RADIUS, depth + gap, layer[-1])
         errors.append(own.sum() / along[1] / expected - 1.0)
     return np.array(errors)
 
 
-def _lines(cell: float, growth: float, extent: float) -> FloatArray:
+def _lines(cell, growth, extent):
     """Distances from zero to an extent or a little further [m], between which cells grow by a factor."""
     count = math.ceil(math.log(1.0 + extent * (growth - 1.0) / cell) / math.log(growth))
     return np.concatenate([[0.0], np.cumsum(cell * growth ** np.arange(count))])
 
 
-def _block(x: FloatArray, y: FloatArray, depth: FloatArray) -> Mesh:
+def _block(x, y, depth):
     """A block below z = 0, with vertices at distances to both sides of zero along x and y, and at depths [m]."""
     lines = [np.concatenate([-way[:0:-1], way]) for way in (x, y)] + [-depth[::-1]]
     counts = [len(line) - 1 for line in lines]
@@ -82,13 +80,10 @@ def _block(x: FloatArray, y: FloatArray, depth: FloatArray) -> Mesh:
     return Mesh(np.stack([line[own] for line, own in zip(lines, index.T, strict=True)], 1), box.cells)
 
 
-def press(
-    obstacle: Sphere | Cylinder, mesh: Mesh, depths, distance: float, stiffness: float, device: str
-) -> list[tuple[FloatArray, FloatArray]]:
+def press(obstacle, mesh, depths, distance, stiffness, device):
     """Presses an obstacle at depths [m] below z = 0 into a block with a fixed base.
 
-    Returns:
-        For every depth, vertical forces [N] and distances [m] of the vertices, (N,).
+    Returns vertical forces [N] and distances [m] of the vertices, (N,), for every depth.
     """
     radius, deep = obstacle.radius, -float(mesh.vertices[:, 2].min())
     obstacle = replace(obstacle, position=(0.0, 0.0, radius + distance))
@@ -114,35 +109,33 @@ def press(
     return list(zip(forces, d, strict=True))
 
 
-def hertz_force(radius: float, depth: float, thickness: float, youngs_modulus: float, poissons_ratio: float) -> float:
+def hertz_force(radius, depth, thickness):
     """Force [N] on a rigid sphere that is pressed into a bonded layer (Dimitriadis et al. 2002, equation 12)."""
-    nu, chi = poissons_ratio, math.sqrt(radius * depth) / thickness
+    nu, chi = POISSON, math.sqrt(radius * depth) / thickness
     a = -(1.2876 - 1.4678 * nu + 1.3442 * nu**2) / (1.0 - nu)
     b = (0.6387 - 1.0277 * nu + 1.5164 * nu**2) / (1.0 - nu)
     p = math.pi
     layer = 1.0 - 2.0 * a / p * chi + 4.0 * (a / p * chi) ** 2 - 8.0 / p**3 * (a**3 + 4.0 * p**2 / 15.0 * b) * chi**3
     layer += 16.0 * a / p**4 * (a**3 + 3.0 * p**2 / 5.0 * b) * chi**4
-    return 4.0 / 3.0 * youngs_modulus / (1.0 - nu**2) * math.sqrt(radius) * depth**1.5 * layer
+    return 4.0 / 3.0 * YOUNG / (1.0 - nu**2) * math.sqrt(radius) * depth**1.5 * layer
 
 
-def layer_response(
-    wave_number: FloatArray, thickness: float, youngs_modulus: float, poissons_ratio: float
-) -> FloatArray:
+def layer_response(wave_number, thickness):
     """Displacement over pressure [m/Pa] of the surface of a bonded layer, by positive wave numbers [1/m]."""
-    nu, x = poissons_ratio, wave_number * thickness
+    nu, x = POISSON, wave_number * thickness
     c, decay = 3.0 - 4.0 * nu, np.exp(-2.0 * x)
     above = c * (1.0 - decay**2) - 4.0 * x * decay
     below = c * (1.0 + decay**2) + (4.0 * x**2 + 10.0 - 24.0 * nu + 16.0 * nu**2) * decay
-    return 2.0 * (1.0 - nu**2) / youngs_modulus / wave_number * above / below
+    return 2.0 * (1.0 - nu**2) / YOUNG / wave_number * above / below
 
 
-def layer_force(radius: float, depth: float, thickness: float, youngs_modulus: float, poissons_ratio: float) -> float:
+def layer_force(radius, depth, thickness):
     """Force over length [N/m] on a rigid cylinder that is pressed into a bonded layer in plane strain."""
-    nu, most = poissons_ratio, math.sqrt(2.0 * radius * depth)  # half of the width without a rise beside the contact
+    nu, most = POISSON, math.sqrt(2.0 * radius * depth)  # half of the width without a rise beside the contact
     spacing = (12.0 * thickness + 4.0 * most) / _POINTS  # of points in a period that is long enough
     waves = 2.0 * np.pi * np.arange(_POINTS // 2 + 1, dtype=np.float64) / (_POINTS * spacing)
-    uniform = thickness * (1.0 + nu) * (1.0 - 2.0 * nu) / ((1.0 - nu) * youngs_modulus)
-    response = np.concatenate([[uniform], layer_response(waves[1:], thickness, youngs_modulus, nu)])
+    uniform = thickness * (1.0 + nu) * (1.0 - 2.0 * nu) / ((1.0 - nu) * YOUNG)
+    response = np.concatenate([[uniform], layer_response(waves[1:], thickness)])
     green = np.fft.irfft(response, _POINTS)  # displacements under a pressure at one point
     half = int(most / spacing)
     x = spacing * np.arange(-half, half + 1)

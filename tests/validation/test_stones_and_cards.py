@@ -11,22 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from support.contact import G
-from warp_resphys import (
-    Body,
-    Contact,
-    HalfSpace,
-    Rigid,
-    Scene,
-    Simulator,
-    SolverSettings,
-    SurfaceContact,
-    box_hexahedra,
-)
+from warp_resphys import Body, Contact, HalfSpace, Rigid, Scene, Simulator, SurfaceContact, box_hexahedra
 
-FloatArray = NDArray[np.float64]
 DENSITY = 2000.0  # kg/m^3
 RADIUS, THICKNESS, STONE_WIDTH = 0.5, 0.12, 0.1  # of an arch [m]
 LENGTH, CARD, WIDTH = 0.2, 0.01, 0.1  # of a card [m]
@@ -38,21 +26,19 @@ ARCH, TWO_STOREYS = 0.307689, 0.297236
 
 
 @torch.no_grad()
-def built(scene: Scene, device: str):
-    """Returns the motion of rigid bodies that were put up at rest, for half a second."""
-    solver = SolverSettings(relative_tolerance=1e-6)
-    s = Simulator(scene, {}, 0.01, (0.0, 0.0, -G), solver=solver, device=device)
+def built(scene, device):
+    """The motion of rigid bodies that were put up at rest, for half a second."""
+    s = Simulator(scene, {}, 0.01, (0.0, 0.0, -G), relative_tolerance=1e-6, device=device)
     return s.rollout(s.rest_state(), 50)
 
 
-def arch(stones: int, friction: float) -> Scene:
+def arch(stones, friction):
     """A semicircular arch of rigid stones on a floor, which almost touch."""
     distance, kappa = 1e-3, 1e6
     gap, angle = 0.97 * distance, math.pi / stones
     floor = {"floor": HalfSpace(position=(0.0, 0.0, -0.5 * gap))}
-    bodies = dict[str, Body]()
+    bodies, brick = {}, box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
     for k in range(stones):
-        brick = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
         u = brick.vertices
         turn, r = math.pi - (k + u[:, 0]) * angle, RADIUS + THICKNESS * (u[:, 2] - 0.5)
         x = np.stack([r * np.cos(turn), STONE_WIDTH * (u[:, 1] - 0.5), r * np.sin(turn)], 1)
@@ -64,15 +50,11 @@ def arch(stones: int, friction: float) -> Scene:
     return Scene(bodies, SurfaceContact(kappa, friction, distance))
 
 
-def house(degrees: float, storeys: int, friction: float) -> Scene:
+def house(degrees, storeys, friction):
     """Storeys of pairs of rigid cards that lean on one another, with a flat card on every storey but the last.
 
-    A leaning card touches floor and neighbour with the edges of one of its faces.
-
-    Args:
-        degrees: angle of the leaning cards to the vertical.
-        storeys: number of storeys; each has one pair fewer than that below.
-        friction: its coefficient, on the floor and between cards, which almost touch.
+    A leaning card, at an angle to the vertical [degrees], touches floor and neighbour with the edges of one of its
+    faces. Each storey has one pair fewer than that below.
     """
     sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
     along, thick = LENGTH * np.array([sine, cosine]), CARD * np.array([-cosine, sine])
@@ -80,7 +62,7 @@ def house(degrees: float, storeys: int, friction: float) -> Scene:
     left = np.array([foot + thick, foot, foot + along, foot + along + thick])
     right = left[[1, 0, 3, 2]] * [-1.0, 1.0]
     pitch, rise = 2.0 * (along[0] - thick[0]) + CARD, left[3, 1] + REST
-    cards = list[FloatArray]()  # corners (4, 2) [m], lower left first, counter-clockwise
+    cards = []  # corners (4, 2) [m], lower left first, counter-clockwise
     for storey in range(storeys):
         floor = storey * (rise + CARD + REST)
         feet = [np.array([pitch * (k + 0.5 * storey), floor]) for k in range(storeys - storey)]
@@ -89,10 +71,9 @@ def house(degrees: float, storeys: int, friction: float) -> Scene:
             low, high = feet[0][0] + left[3, 0] - CARD, feet[-1][0] + right[2, 0] + CARD
             z = floor + rise
             cards.append(np.array([[low, z], [high, z], [high, z + CARD], [low, z + CARD]]))
-    kappa, bodies = 1e6, dict[str, Body]()
+    kappa, bodies, brick = 1e6, {}, box_hexahedra((1.0, WIDTH, 1.0), (1, 1, 1))
     ground = Contact({"floor": HalfSpace(position=(0.0, 0.0, -REST))}, kappa, friction, GAP)
     for k, corners in enumerate(cards):
-        brick = box_hexahedra((1.0, WIDTH, 1.0), (1, 1, 1))
         u, y, v = brick.vertices.T
         x, z = (corners[0] + np.outer(u, corners[1] - corners[0]) + np.outer(v, corners[3] - corners[0])).T
         card = replace(brick, vertices=np.stack([x, y, z], 1))
@@ -100,8 +81,8 @@ def house(degrees: float, storeys: int, friction: float) -> Scene:
     return Scene(bodies, SurfaceContact(kappa, friction, GAP))
 
 
-def card_drop(scene: Scene, device: str) -> float:
-    """Returns by how much the upper edges of a house of cards sink in half a second [m]."""
+def card_drop(scene, device):
+    """How far the upper edges of a house of cards sink in half a second [m]."""
     top = scene.vertices[:, 2] > scene.vertices[:, 2].max() - 1e-6
     z = built(scene, device).q[:, 0, top, 2].mean(1)
     return float(z[0] - z[-1])

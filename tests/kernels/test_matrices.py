@@ -34,12 +34,24 @@ def decompose(
     v_out[i] = v
 
 
+def mapped(kernel, f, *kinds):
+    """Outputs of a kernel for matrices, by their types."""
+    out = [wp.zeros(len(f), dtype=kind, device="cpu") for kind in kinds]
+    wp.launch(kernel, len(f), [wp.array(f, dtype=wp.mat33d, device="cpu"), *out], device="cpu")
+    return [array.numpy() for array in out]
+
+
 def decomposed(f):
     """Cofactor, rotation, nearest unimodular matrix, U, s and V of every matrix."""
-    kinds = [wp.mat33d, wp.mat33d, wp.mat33d, wp.mat33d, wp.vec3d, wp.mat33d]
-    out = [wp.zeros(len(f), dtype=kind, device="cpu") for kind in kinds]
-    wp.launch(decompose, len(f), [wp.array(f, dtype=wp.mat33d, device="cpu"), *out], device="cpu")
-    return [array.numpy() for array in out]
+    return mapped(decompose, f, *[wp.mat33d] * 4, wp.vec3d, wp.mat33d)
+
+
+def check_nearest(f, nearest, atol):
+    """Asserts that matrices have a determinant of one, and offsets along the normal of the surface det D = 1."""
+    np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-13)
+    normal = np.linalg.inv(nearest).transpose(0, 2, 1)
+    share = np.einsum("nij,nij->n", f - nearest, normal) / np.square(normal).sum((1, 2))
+    np.testing.assert_allclose(f - nearest, share[:, None, None] * normal, atol=atol)
 
 
 def test_decompositions():
@@ -74,26 +86,20 @@ def test_eigenvectors_of_symmetric_matrices():
     a = np.array([q * e @ q.T for q in turns for e in spectra] + [np.diag(e) for e in spectra])
     a = np.concatenate([a, [[[1.0, 1e-170, 0.0], [1e-170, 1.0, 0.1], [0.0, 0.1, 1.0]]]])
     a = (a + a.transpose(0, 2, 1)) / 2.0
-    v, e = (wp.zeros(len(a), dtype=kind, device="cpu") for kind in (wp.mat33d, wp.vec3d))
-    wp.launch(eigenpairs, len(a), [wp.array(a, dtype=wp.mat33d, device="cpu"), v, e], device="cpu")
+    v, e = mapped(eigenpairs, a, wp.mat33d, wp.vec3d)
     size = np.linalg.norm(a, axis=(1, 2))[:, None]
     expected = np.linalg.eigvalsh(a)
-    assert (np.abs(np.sort(e.numpy(), axis=1) - expected) <= 1e-14 * size).all()
-    np.testing.assert_allclose(
-        np.einsum("nki,nkj->nij", v.numpy(), v.numpy()), np.broadcast_to(np.eye(3), a.shape), atol=1e-14
-    )
-    np.testing.assert_allclose(np.linalg.det(v.numpy()), 1.0, atol=1e-14)
-    again = np.einsum("nik,nk,njk->nij", v.numpy(), e.numpy(), v.numpy())
+    assert (np.abs(np.sort(e, axis=1) - expected) <= 1e-14 * size).all()
+    np.testing.assert_allclose(v.transpose(0, 2, 1) @ v, np.broadcast_to(np.eye(3), a.shape), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(v), 1.0, atol=1e-14)
+    again = np.einsum("nik,nk,njk->nij", v, e, v)
     assert (np.abs(again - a).max((1, 2)) <= 1e-14 * size[:, 0]).all()
 
 
 def test_the_nearest_unimodular_matrix():
     f = MATRICES[np.linalg.det(MATRICES) > 0.0]
     nearest = decomposed(f)[2]
-    np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-12)
-    normal = np.linalg.inv(nearest).transpose(0, 2, 1)  # of the surface det D = 1
-    share = np.einsum("nij,nij->n", f - nearest, normal) / np.square(normal).sum((1, 2))
-    np.testing.assert_allclose(f - nearest, share[:, None, None] * normal, atol=1e-9)
+    check_nearest(f, nearest, atol=1e-9)
     distance = np.linalg.norm(f - nearest, axis=(1, 2))
     for spread in (0.01, 0.1, 0.5):
         other = nearest + spread * RANDOM.normal(size=f.shape)
@@ -114,10 +120,6 @@ def test_the_nearest_unimodular_matrix_is_continuous_where_its_algorithm_changes
     assert ((growth[:, 0] < 0.4) != (growth[:, 1] < 0.4)).sum() == 6
     assert ((trace[:, 0] < 12.0) != (trace[:, 1] < 12.0)).sum() == 1
     nearest = decomposed(pairs.reshape(-1, 3, 3))[2]
-    np.testing.assert_allclose(np.linalg.det(nearest), 1.0, atol=1e-13)
-    inverse = np.linalg.inv(nearest).transpose(0, 2, 1)
-    offset = pairs.reshape(-1, 3, 3) - nearest
-    share = np.einsum("nij,nij->n", offset, inverse) / np.square(inverse).sum((1, 2))
-    np.testing.assert_allclose(offset, share[:, None, None] * inverse, atol=1e-12)
+    check_nearest(pairs.reshape(-1, 3, 3), nearest, atol=1e-12)
     one, other = nearest.reshape(-1, 2, 3, 3).swapaxes(0, 1)
     assert np.abs(other - one).max() < 1e-6

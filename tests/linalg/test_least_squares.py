@@ -7,17 +7,16 @@ import torch
 from warp_resphys.linalg.least_squares import Point, Problem, UnitBox, damped, minimise, ridge
 
 
+def squares(r, j):
+    """|r|^2, its gradient and the second derivatives of Gauss and Newton."""
+    return float(r @ r), 2.0 * j.T @ r, 2.0 * j.T @ j
+
+
 class Valley:
     """|r|^2 with a bent narrow floor: r = (100 (y - x^2), x - 0.7), failing left of a wall."""
 
     def __init__(self, wall=-1.0):
         self.wall, self.calls, self.differentiated = wall, 0, 0
-
-    def residuals(self, x):
-        return np.array([100.0 * (x[1] - x[0] ** 2), x[0] - 0.7])
-
-    def jacobian(self, x):
-        return np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]])
 
     def __call__(self, x, derivatives):
         self.calls += not derivatives
@@ -26,8 +25,8 @@ class Valley:
         assert (x <= 1.0).all()
         if x[0] < self.wall:
             return np.inf, np.zeros(2), np.zeros((2, 2))
-        r, j = self.residuals(x), self.jacobian(x) if derivatives else np.full((2, 2), np.nan)
-        return float(r @ r), 2.0 * j.T @ r, 2.0 * j.T @ j
+        r = np.array([100.0 * (x[1] - x[0] ** 2), x[0] - 0.7])
+        return squares(r, np.array([[-200.0 * x[0], 100.0], [1.0, 0.0]]) if derivatives else np.full((2, 2), np.nan))
 
 
 def descend(valley, start, max_iterations):
@@ -51,8 +50,7 @@ def test_the_descent_does_not_walk_to_and_fro():
 
     def objective(x, derivatives):
         t = 40.0 * (x[0] - 0.5)
-        r, j = np.array([np.arctan(t), 0.3 * (x[1] - 0.4)]), np.diag([40.0 / (1.0 + t * t), 0.3])
-        return float(r @ r), 2.0 * j.T @ r, 2.0 * j.T @ j
+        return squares(np.array([np.arctan(t), 0.3 * (x[1] - 0.4)]), np.diag([40.0 / (1.0 + t * t), 0.3]))
 
     x, _ = descend(objective, [0.38, 0.9], 30)
     np.testing.assert_allclose(x, [0.5, 0.4], atol=1e-5)
@@ -69,8 +67,7 @@ def test_a_linear_function_needs_two_evaluations():
 
     def objective(x, derivatives):
         evaluated.append(derivatives)
-        r = matrix @ (x - [0.45, 0.52]) + [0.1, 0.1, -0.12]
-        return float(r @ r), 2.0 * matrix.T @ r, 2.0 * matrix.T @ matrix
+        return squares(matrix @ (x - [0.45, 0.52]) + [0.1, 0.1, -0.12], matrix)
 
     steps = []
     problem = UnitBox(objective, 1e-6, lambda x, value: steps.append((x.tolist(), value)))

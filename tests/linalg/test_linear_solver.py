@@ -188,8 +188,7 @@ def test_band_is_as_narrow_as_the_order_allows():
     assert sorted(order) == list(range(NODES))
     place = np.argsort(order)
     assert np.abs(place[rows] - place[cols]).max() < np.abs(rows - cols).max()
-    solver = make("banded", 3)
-    assert solver.bandwidth < 3 * np.abs(rows - cols).max()
+    assert make("banded", 3).bandwidth < 3 * np.abs(rows - cols).max()
 
 
 def test_an_indefinite_arrow_may_have_a_singular_band():

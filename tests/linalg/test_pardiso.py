@@ -17,18 +17,23 @@ ROWS, COLS = np.tril_indices(NODES)
 RIGHT = torch.as_tensor(np.random.default_rng(3).normal(size=(1, NODES, 2)))
 
 
-def matrix(seed, shift=20.0):
-    """A dense symmetric matrix with its upper triangle in rows, as the solver stores it."""
+def stored(dense):
+    """The upper triangle in rows, as the solver stores it."""
+    return torch.as_tensor(dense[np.triu_indices(NODES)])[None]
+
+
+def matrix(seed):
+    """A dense symmetric matrix, and as the solver stores it."""
     dense = np.random.default_rng(seed).normal(size=(NODES, NODES))
-    dense = dense + dense.T + shift * np.eye(NODES)
-    return dense, torch.as_tensor(dense[np.triu_indices(NODES)])[None]
+    dense = dense + dense.T + 20.0 * np.eye(NODES)
+    return dense, stored(dense)
 
 
 @pytest.fixture
 def solver():
     solver = PardisoSolver(ROWS, COLS, NODES, 1, torch.device("cpu"), torch.float64)
-    _, values = matrix(0)
-    assert (values[0, solver.address[:, 0]].numpy() == matrix(0)[0][ROWS, COLS]).all()
+    dense, values = matrix(0)
+    assert (values[0, solver.address[:, 0]].numpy() == dense[ROWS, COLS]).all()
     return solver
 
 
@@ -49,7 +54,7 @@ def test_a_direction_is_accurate_to_single_precision_and_a_solution_to_double(so
 def test_a_matrix_that_single_precision_makes_indefinite_has_a_direction(solver):
     turn = np.linalg.qr(matrix(2)[0])[0]
     dense = turn @ np.diag(np.logspace(-10, 0, NODES)) @ turn.T
-    values = torch.as_tensor(dense[np.triu_indices(NODES)])[None]
+    values = stored(dense)
     assert solver.factor(values.float().double()).failed.all()
     factor = solver.direction_factor(values)
     assert not factor.failed.any()
@@ -72,7 +77,7 @@ def test_low_rank_terms_keep_double_precision(solver):
 def test_a_singular_matrix_and_one_of_nan_have_no_factor(solver):
     singular = np.linalg.qr(matrix(4)[0])[0][:, :5]
     for broken in (singular @ singular.T, np.full((NODES, NODES), np.nan)):
-        values = torch.as_tensor(broken[np.triu_indices(NODES)])[None]
+        values = stored(broken)
         for factor in (solver.factor(values), solver.direction_factor(values)):
             assert factor.failed.all()
             assert np.isnan(solutions(factor)).all()

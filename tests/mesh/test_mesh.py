@@ -1,9 +1,8 @@
+import re
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
-from pathlib import Path
 
 import meshio
 import numpy as np
@@ -13,9 +12,8 @@ from hypothesis import strategies as st
 
 from warp_resphys import Mesh, quadratic
 from warp_resphys.io import decoding
-from warp_resphys.io.arrays import IntArray
 from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
 from warp_resphys.mesh.quality import cell_volumes
 from warp_resphys.mesh.readers import read_mesh
 from warp_resphys.mesh.selection import select_vertices
@@ -32,39 +30,39 @@ PER_METRE = {"m": 1, "cm": 100, "mm": 1000}
 TRIANGLES_PER_BRICK_SIDE = {"hexahedron": 2, "tetrahedron": 2, "tetrahedron10": 8, "hexahedron20": 6, "hexahedron27": 8}
 
 
-def enclosed_volume(mesh: Mesh) -> float:
+def enclosed_volume(mesh):
     """Divergence theorem on the boundary, so positive only if the triangles face outwards."""
     a, b, c = np.moveaxis(mesh.vertices[boundary_triangles(mesh)], 1, 0)
     return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
 
 
-def is_closed(triangles: IntArray) -> bool:
+def is_closed(triangles):
     """Every directed edge occurs once, and once in the other direction."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     directed = {tuple(edge) for edge in edges.tolist()}
     return len(directed) == len(edges) and all((b, a) in directed for a, b in directed)
 
 
-def write(path: Path, mesh: Mesh, *blocks: tuple[str, object], units: str = "m") -> Path:
+def write(path, mesh, *blocks, units="m"):
     cells = [*blocks, (mesh.element.file_type, mesh.cells)]
     file_format = "gmsh" if path.suffix == ".msh" else None  # not ANSYS
     meshio.write(path, meshio.Mesh(mesh.vertices * PER_METRE[units], cells), file_format=file_format)
     return path
 
 
-def with_vertex(mesh: Mesh, index: int, position: float | list[float]) -> Mesh:
+def with_vertex(mesh, index, position):
     vertices = mesh.vertices.copy()
     vertices[index] = position
     return Mesh(vertices, mesh.cells)
 
 
-def with_cell(mesh: Mesh, cell: int, nodes: int | list[int], vertices: int | IntArray) -> Mesh:
+def with_cell(mesh, cell, nodes, vertices):
     cells = mesh.cells.copy()
     cells[cell, nodes] = vertices
     return Mesh(mesh.vertices, cells)
 
 
-def test_beam_has_the_vertex_order_of_the_reference_files() -> None:
+def test_beam_has_the_vertex_order_of_the_reference_files():
     mesh = box_hexahedra()
     assert mesh.kind == "hexahedron"
     assert mesh.vertices.shape == (176, 3)
@@ -83,9 +81,7 @@ def test_beam_has_the_vertex_order_of_the_reference_files() -> None:
     divisions=st.tuples(*[st.integers(1, 4)] * 3),
 )
 @settings(max_examples=25, deadline=None)
-def test_any_box_is_valid_closed_and_outward(
-    kind: str, size: tuple[float, float, float], divisions: tuple[int, int, int]
-) -> None:
+def test_any_box_is_valid_closed_and_outward(kind, size, divisions):
     mesh = BOXES[kind](size, divisions)
     check_mesh(mesh)
     assert mesh.kind == kind
@@ -103,7 +99,43 @@ def test_any_box_is_valid_closed_and_outward(
     assert len(surface_vertices(mesh)) == np.prod(points + 1) - np.prod(points - 1)
 
 
-def test_boundary_encloses_the_cells_of_a_distorted_mesh_with_a_cavity() -> None:
+PLATE, SIDES, FIN = (
+    ((-0.005, -0.025, 0.0), (0.005, 0.025, 0.06)),
+    ((-0.015, -0.015, 0.0), (0.015, 0.015, 0.06)),
+    ((-0.005, -0.015, 0.06), (0.005, 0.015, 0.08)),
+)
+
+
+@pytest.mark.parametrize(("size", "nodes"), [(0.007, 8), (0.015, 20), (0.015, 27)])
+def test_a_cross_with_a_fin_is_filled_without_cracks(size, nodes):
+    mesh = boxes_hexahedra([PLATE, SIDES, FIN], size, nodes)
+    check_mesh(mesh)
+    assert mesh.element.nodes == nodes
+    section = 0.01 * 0.05 + 2 * 0.01 * 0.03
+    assert cell_volumes(mesh).sum() == pytest.approx(section * 0.06 + 0.01 * 0.03 * 0.02, rel=1e-12)
+    around, (a, b, c) = 2 * (0.03 + 0.05), np.moveaxis(mesh.vertices[boundary_triangles(mesh)], 1, 0)
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert area == pytest.approx(2 * section + around * 0.06 + 2 * (0.01 + 0.03) * 0.02, rel=1e-9)
+    corners = mesh.vertices[mesh.cells[:, :8]]
+    assert (corners.max(1) - corners.min(1)).max() <= size + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("boxes", "size", "sentence"),
+    [
+        ([], 0.01, "a body of boxes needs one box or more"),
+        ([PLATE, (PLATE[1], PLATE[0])], 0.01, "box 2 reaches from [0.005, 0.025, 0.06] to [-0.005"),
+        ([((0, 0, 0), (0.1, 0.0, 0.1))], 0.01, "box 1 reaches from [0.0, 0.0, 0.0] to [0.1, 0.0, 0.1] m: it has no"),
+        ([PLATE], 0.0, "the size of cells must be a positive length in metres, not 0.0"),
+        ([PLATE, ((0.1, 0, 0), (0.2, 0.1, 0.1))], 0.01, "the boxes do not form one body"),
+    ],
+)
+def test_boxes_that_make_no_body(boxes, size, sentence):
+    with pytest.raises(MeshError, match=re.escape(sentence)):
+        boxes_hexahedra(boxes, size)
+
+
+def test_boundary_encloses_the_cells_of_a_distorted_mesh_with_a_cavity():
     box = box_tetrahedra((0.1, 0.1, 0.1), (5, 5, 5))
     middle = np.abs(box.vertices[box.cells].mean(axis=1) - 0.05).max(axis=1) < 0.01
     moved = box.vertices + np.random.default_rng(3).uniform(-2e-3, 2e-3, box.vertices.shape)
@@ -115,7 +147,7 @@ def test_boundary_encloses_the_cells_of_a_distorted_mesh_with_a_cavity() -> None
     assert enclosed_volume(mesh) == pytest.approx(cell_volumes(mesh).sum(), rel=1e-12)
 
 
-def test_selection_of_a_plane_and_of_an_edge() -> None:
+def test_selection_of_a_plane_and_of_an_edge():
     mesh = box_hexahedra()
     assert select_vertices(mesh, x=0.0).tolist() == list(range(16))
     assert select_vertices(mesh, x=0.1, z=0.03).tolist() == [163, 167, 171, 175]
@@ -153,7 +185,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("make", "message"), REFUSED)
-def test_bad_arguments_are_refused(make: Callable[[], object], message: str) -> None:
+def test_bad_arguments_are_refused(make, message):
     with pytest.raises(MeshError, match=message):
         make()
 
@@ -173,7 +205,7 @@ TURNED = [4, 5, 6, 7, 0, 1, 2, 3]
         (lambda m: Mesh(m.vertices, m.cells[:, TURNED]), r"^90 .* \(0, 1, 2, 3, 4, \.\.\.; .* inverted"),
     ],
 )
-def test_broken_meshes_are_refused_by_name(broken: Callable[[Mesh], Mesh], match: str) -> None:
+def test_broken_meshes_are_refused_by_name(broken, match):
     mesh = box_hexahedra()
     check_mesh(mesh)
     with pytest.raises(MeshError, match=match):
@@ -181,7 +213,7 @@ def test_broken_meshes_are_refused_by_name(broken: Callable[[Mesh], Mesh], match
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_flatness_is_relative_to_the_longest_edge(scale: float) -> None:
+def test_flatness_is_relative_to_the_longest_edge(scale):
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, 1]])
     flat, thin = corners * [scale, scale, 1e-12 * scale], corners * [scale, scale, 1e-10 * scale]
     check_mesh(Mesh(thin, np.array([[0, 1, 2, 3]])))
@@ -189,7 +221,7 @@ def test_flatness_is_relative_to_the_longest_edge(scale: float) -> None:
         check_mesh(Mesh(flat, np.array([[0, 1, 2, 3]])))
 
 
-def test_hexahedron_is_checked_at_its_corners() -> None:
+def test_hexahedron_is_checked_at_its_corners():
     """With corner 6 of the unit cube at (s, s, s) the determinant there is 3 s - 2; inside it is positive."""
     cube = box_hexahedra((1, 1, 1), (1, 1, 1))
     check_mesh(with_vertex(cube, 7, 0.67))
@@ -197,7 +229,7 @@ def test_hexahedron_is_checked_at_its_corners() -> None:
         check_mesh(with_vertex(cube, 7, 0.66))
 
 
-def test_quadratic_tetrahedron_is_checked_at_its_nodes() -> None:
+def test_quadratic_tetrahedron_is_checked_at_its_nodes():
     """A midpoint at a quarter of its edge makes the map singular at the corner (quarter-point element)."""
     mesh = quadratic(Mesh(np.eye(4)[:, 1:], np.array([[0, 1, 2, 3]])))
     node = mesh.cells[0, 4]
@@ -207,7 +239,7 @@ def test_quadratic_tetrahedron_is_checked_at_its_nodes() -> None:
 
 
 @pytest.mark.parametrize(("gap", "cracked"), [(0.0, True), (1e-11, True), (1e-6, False)])
-def test_crack_between_coincident_vertices_is_refused(gap: float, cracked: bool) -> None:
+def test_crack_between_coincident_vertices_is_refused(gap, cracked):
     left = box_hexahedra((0.1, 0.1, 0.1), (4, 4, 4))
     right = left.vertices + np.array([0.1 + gap, 0, 0])
     mesh = Mesh(np.vstack([left.vertices, right]), np.vstack([left.cells, left.cells + len(right)]))
@@ -217,9 +249,9 @@ def test_crack_between_coincident_vertices_is_refused(gap: float, cracked: bool)
 
 @pytest.mark.parametrize(
     ("kind", "extension", "units"),
-    [("hexahedron", "vtk", "m"), ("tetrahedron", "vtu", "cm")],  # others in test_foreign_meshes.py
+    [("hexahedron", "vtk", "m"), ("tetrahedron", "vtu", "cm")],  # others in test_readers.py
 )
-def test_files_come_back_in_metres(tmp_path: Path, kind: str, extension: str, units: str) -> None:
+def test_files_come_back_in_metres(tmp_path, kind, extension, units):
     mesh = BOXES[kind]((0.1, 0.03, 0.02), (2, 1, 1))
     read = read_mesh(write(tmp_path / f"box.{extension}", mesh, units=units), units=units)
     assert read.kind == kind
@@ -227,7 +259,7 @@ def test_files_come_back_in_metres(tmp_path: Path, kind: str, extension: str, un
     assert np.array_equal(read.cells, mesh.cells)
 
 
-def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path: Path) -> None:
+def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path):
     mesh = box_tetrahedra()
     vertices = np.vstack([[[9, 9, 9], [8, 8, 8]], mesh.vertices])
     path = write(tmp_path / "box.vtk", Mesh(vertices, mesh.cells + 2))
@@ -239,14 +271,14 @@ def test_unreferenced_vertices_are_dropped_only_on_request(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("size", "written_in", "units"), [(0.1, "mm", "m"), (0.1, "m", "mm"), (6.0, "m", "m")])
-def test_implausible_size_is_refused(tmp_path: Path, size: float, written_in: str, units: str) -> None:
+def test_implausible_size_is_refused(tmp_path, size, written_in, units):
     path = write(tmp_path / "box.vtk", box_hexahedra([size] * 3, (1, 1, 1)), units=written_in)
     diagonal = f"{np.sqrt(3) * size * PER_METRE[written_in] / PER_METRE[units]:g} m"
     with pytest.raises(MeshError, match=f"units={units}, .* is {diagonal}, .* did you mean units="):
         read_mesh(path, units=units)
 
 
-def test_files_without_usable_cells_are_refused(tmp_path: Path) -> None:
+def test_files_without_usable_cells_are_refused(tmp_path):
     tetrahedra, hexahedra = box_tetrahedra(), box_hexahedra()
     mixed = write(tmp_path / "mixed.vtk", hexahedra, ("tetra", tetrahedra.cells))
     with pytest.raises(MeshError, match=r"mixed.vtk: the file has hexahedron and tetra cells"):
@@ -258,9 +290,7 @@ def test_files_without_usable_cells_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["missing.vtk", "folder.vtk", "mesh.xyz", "foreign.vtk", "cut.msh"])
-def test_unreadable_file_gives_one_sentence_and_no_output(
-    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_unreadable_file_gives_one_sentence_and_no_output(tmp_path, name, capfd):
     (tmp_path / "folder.vtk").mkdir()
     (tmp_path / "mesh.xyz").write_text("0 0 0\n")
     (tmp_path / "foreign.vtk").write_bytes(bytes(range(256)) * 4)
@@ -276,7 +306,7 @@ def test_unreadable_file_gives_one_sentence_and_no_output(
     assert capfd.readouterr() == ("", "")
 
 
-def test_format_that_needs_another_package_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_format_that_needs_another_package_names_it(tmp_path, monkeypatch):
     path = write(tmp_path / "box.med", box_tetrahedra())
     (tmp_path / "without" / "h5py.py").parent.mkdir()
     (tmp_path / "without" / "h5py.py").write_text("raise ModuleNotFoundError('no h5py', name='h5py')")
@@ -286,9 +316,7 @@ def test_format_that_needs_another_package_names_it(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.slow
-def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sentence(tmp_path, monkeypatch):
     path = write(tmp_path / "cut.tec", box_tetrahedra())
     path.write_text(path.read_text()[:2000])
     monkeypatch.setattr(decoding, "SECONDS", (1.0, 0.0))
@@ -305,6 +333,6 @@ def test_files_that_are_read_for_ever_or_claim_too_much_memory_end_with_one_sent
 
 
 @pytest.mark.slow
-def test_importing_the_mesh_modules_leaves_meshio_alone() -> None:
+def test_importing_the_mesh_modules_leaves_meshio_alone():
     code = "import sys, warp_resphys.mesh, warp_resphys.mesh.readers; sys.exit('meshio' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

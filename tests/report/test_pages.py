@@ -292,9 +292,10 @@ class TestBeams:
         links = [link for link in page.links if not link.startswith("data:")]
         assert links == [f"fold_{trial}/report.html" for trial in TRIALS]
         said = page.text
-        assert f"bare{number_text(folds['bare']['errors_mm']['simulation']['mean'])}" in said
+        for trial, end in (("bare", ""), ("load52", NONE)):
+            size, mean = (folds[trial]["per_trajectory"][0][key] for key in ("amplitude_mm", "errors_mm"))
+            assert f"{trial}amplitude {size:.3g} mm{number_text(mean['simulation'])}{end}" in said
         assert "diverged" in said[said.index("Test trial [mm]") : said.index("load52")]
-        assert f"load52{number_text(folds['load52']['errors_mm']['simulation']['mean'])}{NONE}" in said
         assert all(words in said for words in ("jumps once", "Root mean square"))
 
     def test_trials_are_read_as_long_as_they_count(self, tmp_path):

@@ -11,7 +11,8 @@ from support.configured import settings
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.safe_files import atomic_hdf5, create, read_json, write_json
-from warp_resphys.learning.metrics import marker_errors, summarise, summarise_trajectories
+from warp_resphys.learning.error_tables import ComparedModels
+from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.mesh.boxes import box_hexahedra
 
 GRAVITY = np.array([0.0, 0.02, -9.8])
@@ -64,19 +65,6 @@ def _write_recordings(folder, trials, tracked, reference, rng, release=61.3):
         }
     write_json(folder / "quality.json", quality)
     write_json(folder / "registration.json", registration)
-
-
-def _errors(simulated, measured, names, labels=()):
-    """Content of errors.json, of positions (R, T, M, 3) of models and as measured [m]."""
-    errors = {m: [marker_errors(*pair) for pair in zip(x, measured, strict=True)] for m, x in simulated.items()}
-    content = {
-        "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
-        "per_trajectory": summarise_trajectories(names, errors),
-    }
-    if labels:
-        away = {m: np.nanmean(1e3 * np.linalg.norm(x - measured, axis=3), axis=(0, 1)) for m, x in simulated.items()}
-        content["per_marker"] = {model: dict(zip(labels, each, strict=True)) for model, each in away.items()}
-    return content
 
 
 BEAM = settings(
@@ -147,7 +135,11 @@ def write_split(folder: Path, test, models=BEAM_MODELS, diverged=()):
         films[model][20:] = observed[model][0, 20:] = np.nan
     _write_rollouts(folder, list(test), STEP, np.arange(len(steps)), test[-1], observed, films)
     truth, count = np.stack([sag(BOUND, frames[trial], TRIALS[trial]) for trial in test]), round(SECONDS / STEP)
-    content = _errors({model: x[:, :count] for model, x in observed.items()}, truth[:, :count], test, TRACKED)
+    words, times = (tuple(test), tuple(TRACKED), ("released",) * len(test)), np.stack([frames[trial] for trial in test])
+    held, payload = np.repeat(BOUND[None], len(test), 0), np.array([TRIALS[trial] for trial in test])
+    trials = Trials(*words, times[:, :count], truth[:, :count], held, payload, GRAVITY, STEP, bound=BOUND)
+    simulated = {model: x[:, :count] for model, x in observed.items()}
+    content = ComparedModels(ObservedMotions(trials), (), {"1": test}, simulated).errors()
     if "resphys" in models:
         own = {"factor": [3.0] * 3, "variance": [1e-6, 0.0, 0.0, 0.0, 1.0], "coverage": 0.87, "half_width_mm": 3.0}
         content["intervals"] = {"level": 0.9, "calibrated_on": "validation", "models": {"resphys": own}}
@@ -278,7 +270,15 @@ def write_arm_run(
     for model in diverged:
         observed[model][0, 60:] = films[model][film >= 60] = np.nan
     _write_rollouts(folder, rolled, ARM_STEP, film, rolled[0], observed, films)
-    write_json(folder / "errors.json", _arm_errors(observed, markers[train:], rolled, test, labels, scales, horizons))
+    groups = {f"{scale:g}": rolled[test * k : test * (k + 1)] for k, scale in enumerate((1.0, *scales))}
+    left = {model: np.full(len(rolled), -1) for model in ("simfree", "resphys")}
+    left["simfree"][:2] = (42, 60)[: len(rolled)]
+    left["simfree"][test:][-2:] = (26, 20)[: len(rolled) - test]
+    names, times = tuple(driven), np.tile(ARM_STEP * np.arange(steps + 1), (len(driven), 1))
+    words, held = (names, tuple(labels), ("given",) * len(names)), markers[:, 0]
+    trials = Trials(*words, times, markers, held, np.zeros(len(names)), GRAVITY, ARM_STEP, bound=bound)
+    compared = ComparedModels(ObservedMotions(trials), (), groups, observed, left, horizons=horizons)
+    write_json(folder / "errors.json", compared.errors())
     _write_recordings(folder, list(driven)[:2], dict(zip(labels, bound, strict=True)), run.markers.reference, rng, None)
     if simulated:
         material = {"model": "stable_neo_hookean", "youngs_modulus": 250e3, "poissons_ratio": 0.49}
@@ -289,28 +289,6 @@ def write_arm_run(
     _write_trainings(folder, models)
     write_json(folder / "reconstruction.json", {"resphys": {"mean_mm": 0.12, "max_mm": 0.61}})
     _write_stages(folder, **{"import": 75.0})
-
-
-def _arm_errors(simulated, measured, names, test, labels, scales, horizons):
-    def part(first=0, last=None, frames=None):
-        rows, steps = slice(first, last), slice(1, None if frames is None else frames + 1)
-        own = {model: x[rows, steps] for model, x in simulated.items()}
-        return _errors(own, measured[rows, steps], names[rows], labels)
-
-    late = {"left": 2, "first_s": {"test_01": 1.2, "test_00": 0.84}}
-    content = part(0, test) | {"range": {"simfree": late, "resphys": {"left": 0, "first_s": {}}}}
-    if horizons:
-        content["horizons"] = {f"{w:g}": part(0, test, round(w / ARM_STEP))["errors_mm"] for w in horizons}
-    if scales:
-        content["scales"] = {"1": content["errors_mm"]} | {
-            f"{scale:g}": part(test * k, test * (k + 1))["errors_mm"] for k, scale in enumerate(scales, 1)
-        }
-        late = {"1": {}, f"{scales[0]:g}": {}, f"{scales[-1]:g}": {names[-1]: 0.4, names[-2]: 0.52}}
-        content["scales_range"] = {
-            scale: {m: {"left": len(first), "first_s": first} for m in ("simfree", "resphys")}
-            for scale, first in late.items()
-        }
-    return content
 
 
 STEPS = 40
@@ -339,8 +317,8 @@ def write_vertex_run(folder, run, *, models=tuple(PERIODS)[:-1], diverged=(), st
     names, test = tuple(AMPLITUDES), list(AMPLITUDES)[1:]
     target = np.stack([swinging(vertices, size, steps=steps) for size in AMPLITUDES.values()])
     times = np.tile(STEP * np.arange(steps + 1), (3, 1))
-    words = names, (), (begins,) * 3
-    Trials(*words, times, target, target[:, 0], np.zeros(3), GRAVITY, STEP).write(folder / "dataset.h5")
+    trials = Trials(names, (), (begins,) * 3, times, target, target[:, 0], np.zeros(3), GRAVITY, STEP)
+    trials.write(folder / "dataset.h5")
     runs = {
         m: np.stack([swinging(vertices, AMPLITUDES[t], PERIODS[m], OFFSETS.get(m, 0.0), steps) for t in test])
         for m in models
@@ -349,10 +327,9 @@ def write_vertex_run(folder, run, *, models=tuple(PERIODS)[:-1], diverged=(), st
         runs[model][1, 5:9] *= 1e200
         runs[model][1, 9:] = np.nan
     _write_rollouts(folder, test, STEP, np.arange(steps + 1), test[1], runs, {m: q[1] for m, q in runs.items()})
-    first = min(1, steps)
-    content = _errors({model: q[:, first:] for model, q in runs.items()}, target[1:, first:], test)
-    against = {m: rows for m, rows in content["errors_mm"].items() if m != "reconstruction"}
-    write_json(folder / "errors.json", content | {"errors_vs_reconstruction_mm": against})
+    simulated, motions = {m: q for m, q in runs.items() if m != "reconstruction"}, ObservedMotions(trials)
+    compared = ComparedModels(motions, (), {"1": test}, simulated, reconstructed=runs.get("reconstruction"))
+    write_json(folder / "errors.json", compared.errors())
     _write_trainings(folder, models)
     seconds = {name: {"mean": 0.421, "std": 0.1} for name in ("simulation", "target", "resphys", "inference")}
     write_json(folder / "times.json", {"steps": steps, "seconds": seconds})

@@ -1,6 +1,5 @@
 import gc
 import weakref
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,19 +14,19 @@ from warp_resphys.io.errors import InputError
 BATCH, STEPS = 2, 3
 
 
-def make_simulator(device: str, integrator: str = "implicit_euler") -> Simulator:
+def make_simulator(device, integrator="implicit_euler"):
     body = clamped(box_hexahedra((0.04, 0.02, 0.02), (2, 1, 1)))
     material = Corotated(1e5, 0.4, density=1000.0, mass_damping=0.5, stiffness_damping=0.001)
     return Simulator(body, material, integrator=integrator, relative_tolerance=1e-11, device=device)
 
 
-def array(tensor: torch.Tensor, dtype: type = wp.vec3d) -> wp.array:
+def array(tensor, dtype=wp.vec3d):
     """A Warp array of its own with a gradient."""
     device = wp.device_from_torch(tensor.device)
     return wp.array(tensor.cpu().numpy(), dtype=dtype, device=device, requires_grad=True)
 
 
-def moving_state(simulator: Simulator) -> State:
+def moving_state(simulator):
     random = torch.Generator().manual_seed(3)
     noise = simulator.tensor(torch.randn(2, BATCH, simulator.body.n_vertices, 3, generator=random))
     free = simulator.rest_positions[:, :1] / simulator.rest_positions[:, 0].max()
@@ -35,7 +34,7 @@ def moving_state(simulator: Simulator) -> State:
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
+def test_gradients_equal_those_of_torch(device, integrator):
     simulator = make_simulator(device, integrator)
     state = moving_state(simulator)
     random = torch.Generator().manual_seed(4)
@@ -80,16 +79,15 @@ def test_gradients_equal_those_of_torch(device: str, integrator: str) -> None:
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "bdf2"])
-def test_two_roll_outs_on_one_tape_are_one(device: str, integrator: str) -> None:
+def test_two_roll_outs_on_one_tape_are_one(device, integrator):
     simulator = make_simulator(device, integrator)
     state = moving_state(simulator)
 
-    def gradients(parts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def gradients(parts):
         q, v = array(state.q), array(state.v)
         density = array(simulator.tensor([1000.0]), wp.float64)
         tape = wp.Tape()
-        now: tuple[wp.array, wp.array] = (q, v)
-        before = None
+        now, before = (q, v), None
         for steps in parts:
             path, speeds = record_rollout(
                 tape, simulator, *now, steps, previous=before, parameters={"density": density}
@@ -106,7 +104,7 @@ def test_two_roll_outs_on_one_tape_are_one(device: str, integrator: str) -> None
         np.testing.assert_allclose(a, b, rtol=0.0, atol=1e-7 * np.abs(b).max())
 
 
-def test_a_dropped_tape_leaves_nothing_behind(device: str) -> None:
+def test_a_dropped_tape_leaves_nothing_behind(device):
     simulator = make_simulator(device)
     state = simulator.rest_state(BATCH)
     tape = wp.Tape()
@@ -128,7 +126,7 @@ def test_a_dropped_tape_leaves_nothing_behind(device: str) -> None:
         (lambda q, v: (q, v[:1]), "state.v has shape"),
     ],
 )
-def test_wrong_input_is_told(device: str, change: Callable[..., tuple[wp.array, wp.array]], sentence: str) -> None:
+def test_wrong_input_is_told(device, change, sentence):
     simulator = make_simulator(device)
     state = simulator.rest_state(BATCH)
     with pytest.raises(InputError, match=sentence):

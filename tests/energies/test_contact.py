@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.clamped import noise
 from support.contact import BLOCK, KAPPA, SIDE, SOFT, WEIGHT, D, G, distances, resting_floor
 from support.contact import on_obstacles as simulator
 from support.slopes import check_slopes
@@ -203,29 +204,28 @@ def test_gradients_of_a_rollout_that_sticks_slides_and_rebounds(integrator, move
     start, random = s.rest_state(3), torch.Generator().manual_seed(0)
     values = {"v": start.v + vector([0.01, 0.0, -0.05], [0.4, 0.1, -0.1], [0.1, 0.0, -1.0])[:, None]}
     zeros = torch.zeros(3, 2, 3, dtype=torch.float64)
-    values |= {"shift": zeros, "turn": zeros}
-    sizes = {"v": 1e-5, "friction": 1e-5, "stiffness": 0.5, "young": 25.0, "growth": 1e-8, "shift": 1e-8, "turn": 1e-6}
+    values |= {"obstacle_": zeros, "obstacle_turn_": zeros}  # vectors have prefixes of x, y and z
+    sizes = {"v": 1e-5, "contact_friction": 1e-5, "contact_stiffness": 0.5, "youngs_modulus": 25.0}
+    sizes |= {"obstacle_growth": 1e-8, "obstacle_": 1e-8, "obstacle_turn_": 1e-6}
     if moves:
-        for name, size in (("move", 2e-5), ("rotate", 2e-4)):
+        for name, size in (("obstacle_move_", 2e-5), ("obstacle_rotate_", 2e-4)):
             way = torch.randn(steps, 3, 2, 3, generator=random, dtype=torch.float64).cumsum(0)
             values[name], sizes[name] = (size * way).movedim(0, 1), 1e-4 * size
     else:
         values |= {
-            "friction": vector([0.9, 0.8], [0.2, 0.3], [0.4, 0.4]),
-            "stiffness": KAPPA * vector([1.0, 1.2], [0.8, 1.0], [0.6, 0.7]),
-            "young": 264e3 * vector([1.0], [0.8], [1.2]),
-            "growth": zeros[..., 0],
+            "contact_friction": vector([0.9, 0.8], [0.2, 0.3], [0.4, 0.4]),
+            "contact_stiffness": KAPPA * vector([1.0, 1.2], [0.8, 1.0], [0.6, 0.7]),
+            "youngs_modulus": 264e3 * vector([1.0], [0.8], [1.2]),
+            "obstacle_growth": zeros[..., 0],
         }
-    names = {"friction": "contact_friction", "stiffness": "contact_stiffness", "young": "youngs_modulus"}
-    vectors = {"shift": "obstacle_", "turn": "obstacle_turn_", "move": "obstacle_move_", "rotate": "obstacle_rotate_"}
 
     def rollout(values):
         given = {"contact_friction": 0.4}
         for name, value in values.items():
-            if name in vectors:
-                given |= {f"{vectors[name]}{axis}": value[..., k] for k, axis in enumerate("xyz")}
+            if name.endswith("_"):
+                given |= {f"{name}{axis}": value[..., k] for k, axis in enumerate("xyz")}
             elif name != "v":
-                given[names.get(name, f"obstacle_{name}")] = value
+                given[name] = value
         inputs = {name: given.pop(name).movedim(1, 0) for name in list(given) if "move" in name or "rotate" in name}
         return s.rollout(State(start.q, values["v"]), steps, Inputs(**inputs), given)
 
@@ -268,21 +268,22 @@ def test_gradients_of_a_leaning_beam_with_friction():
     s = leaning(0.5)
     push = torch.zeros(2, s.body.n_vertices, 3, dtype=torch.float64)
     push[:, select_vertices(BEAM, x=0.08), 1] = vector([2e-3], [1e-2])
-    values = {"push": push, "friction": vector([0.5], [0.3]), "shift": torch.zeros(2, 1, 3, dtype=torch.float64)}
-    values |= {"stiffness": KAPPA * vector([1.0], [0.7]), "young": 4e4 * vector([1.0], [1.1])}
-    weights = torch.randn(push.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    values = {"contact_friction": vector([0.5], [0.3]), "contact_stiffness": KAPPA * vector([1.0], [0.7])}
+    values |= {"youngs_modulus": 4e4 * vector([1.0], [1.1])}
+    places = {"push": push, "shift": torch.zeros(2, 1, 3, dtype=torch.float64)}
+    weights = noise(*push.shape)
 
     def solve(values):
-        given = {f"obstacle_{axis}": values["shift"][..., k] for k, axis in enumerate("xyz")}
-        given |= {"contact_stiffness": values["stiffness"], "youngs_modulus": values["young"]}
-        given |= {"contact_friction": values["friction"]}
+        given = {name: value for name, value in values.items() if name not in places}
+        given |= {f"obstacle_{axis}": values["shift"][..., k] for k, axis in enumerate("xyz")}
         before = s.static_equilibrium(None, given, batch=2)
         return before, s.static_equilibrium(Inputs(values["push"]), given, after=before).q
 
-    both = solve(values), solve({**values, "friction": 0.0})
+    values |= places
+    both = solve(values), solve({**values, "contact_friction": 0.0})
     aside = [(q - before.q)[..., 1].abs().amax(1).detach() for before, q in both]
     assert bool((aside[0] < 0.9 * aside[1]).all())
-    sizes = {"push": 1e-5, "friction": 1e-4, "shift": 1e-7, "stiffness": 5.0, "young": 1.0}
+    sizes = {"push": 1e-5, "shift": 1e-7, "contact_friction": 1e-4, "contact_stiffness": 5.0, "youngs_modulus": 1.0}
     check_slopes(lambda values: (weights * solve(values)[1]).flatten(1).sum(1), values, sizes)
 
 

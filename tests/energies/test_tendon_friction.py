@@ -134,19 +134,22 @@ def test_gradients_from_a_straight_rest_are_finite_and_right():
 
 
 @pytest.mark.parametrize(
-    ("more", "words"),
+    ("route", "more", "words"),
     [
-        ({"friction": -0.1}, "tendon_friction is -0.1"),
-        ({"bristle_length": 0.0}, "tendon_bristle_length is 0"),
-        ({"friction": None, "entry_angle": 1.0}, "acts by friction"),
-        ({"friction": None, "bristle_length": -1.0}, "tendon_bristle_length is -1"),
-        ({"entry_angle": -1.0}, "the entry angle of tendons is -1.0"),
-        ({"entry_angle": [0.1, 0.2]}, "give one angle, or 1"),
+        (STRAIGHT, {"friction": -0.1}, "tendon_friction is -0.1"),
+        (STRAIGHT, {"bristle_length": 0.0}, "tendon_bristle_length is 0"),
+        (STRAIGHT, {"friction": None, "entry_angle": 1.0}, "acts by friction"),
+        (STRAIGHT, {"friction": None, "bristle_length": -1.0}, "tendon_bristle_length is -1"),
+        (STRAIGHT, {"entry_angle": -1.0}, "the entry angle of tendons is -1.0"),
+        (STRAIGHT, {"entry_angle": [0.1, 0.2]}, "give one angle, or 1"),
+        (CORNERS, {"fixed_guides": [[4]]}, "it has guides 0 to 3"),
+        (SHORT, {"fixed_guides": [[0, 1, 2]]}, "it does not pull on the body"),
+        ([[0.3, 0.0, 0.0], [SIZE[0], 0.02, 0.02]], {}, r"lies 180 mm outside .*: .* name it among the fixed guides"),
     ],
 )
-def test_bad_friction_is_refused(more, words):
+def test_bad_friction_and_fixed_guides_are_refused(route, more, words):
     with pytest.raises(InputError, match=words):
-        simulator(STRAIGHT, **more)
+        simulator(route, **more)
 
 
 def test_friction_that_no_pose_holds_is_said(monkeypatch):
@@ -177,12 +180,3 @@ def test_guides_in_the_world_pull_as_a_cable_to_a_post():
     np.testing.assert_allclose(-force[tip], expected, rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(np.delete(force, tip, 0), 0.0, atol=1e-9)
     check_rows([row for row in check_gradients(s, "bent", steps=2) if abs(row.difference) > 1e-12])
-
-
-def test_fixed_guides_are_checked():
-    with pytest.raises(InputError, match="it has guides 0 to 3"):
-        simulator(CORNERS, fixed_guides=[[4]])
-    with pytest.raises(InputError, match="it does not pull on the body"):
-        simulator(SHORT, fixed_guides=[[0, 1, 2]])
-    with pytest.raises(InputError, match=r"lies 180 mm outside of the body: .* name it among the fixed guides"):
-        simulator([[0.3, 0.0, 0.0], [SIZE[0], 0.02, 0.02]])

@@ -258,12 +258,15 @@ def write_arm_run(
     drawn, count = np.stack(list(driven.values())), train + test
     parts = {"dataset.h5": slice(None, count)} | ({"dataset_scaled.h5": slice(count, None)} if scales else {})
     channels = {"pressure": tuple(f"chamber_{number + 1}" for number in range(chambers))}
-    for name, rows in parts.items():
-        names = tuple(driven)[rows]
+
+    def trials(rows, begins, **inputs):
+        names, x = tuple(driven)[rows], markers[rows]
         times = np.tile(ARM_STEP * np.arange(steps + 1), (len(names), 1))
-        words, x = (names, tuple(labels), ("rest",) * len(names)), markers[rows]
-        own = {"bound": bound, "inputs": {"pressure": drawn[rows]}, "channels": channels}
-        Trials(*words, times, x, x[:, 0], np.zeros(len(x)), GRAVITY, ARM_STEP, **own).write(folder / name)
+        words, still = (names, tuple(labels), (begins,) * len(names)), np.zeros(len(names))
+        return Trials(*words, times, x, x[:, 0], still, GRAVITY, ARM_STEP, bound=bound, **inputs)
+
+    for name, rows in parts.items():
+        trials(rows, "rest", inputs={"pressure": drawn[rows]}, channels=channels).write(folder / name)
     rolled, film = list(driven)[train:], np.arange(0, steps + 1, 2)
     observed = {m: np.stack([bent(bound, driven[name], m, sag) for name in rolled]) for m in models}
     films = {m: bent(mesh.vertices, driven[rolled[0]], m, sag)[film] for m in models}
@@ -274,10 +277,8 @@ def write_arm_run(
     left = {model: np.full(len(rolled), -1) for model in ("simfree", "resphys")}
     left["simfree"][:2] = (42, 60)[: len(rolled)]
     left["simfree"][test:][-2:] = (26, 20)[: len(rolled) - test]
-    names, times = tuple(driven), np.tile(ARM_STEP * np.arange(steps + 1), (len(driven), 1))
-    words, held = (names, tuple(labels), ("given",) * len(names)), markers[:, 0]
-    trials = Trials(*words, times, markers, held, np.zeros(len(names)), GRAVITY, ARM_STEP, bound=bound)
-    compared = ComparedModels(ObservedMotions(trials), (), groups, observed, left, horizons=horizons)
+    motions = ObservedMotions(trials(slice(None), "given"))
+    compared = ComparedModels(motions, (), groups, observed, left, horizons=horizons)
     write_json(folder / "errors.json", compared.errors())
     _write_recordings(folder, list(driven)[:2], dict(zip(labels, bound, strict=True)), run.markers.reference, rng, None)
     if simulated:

@@ -1,5 +1,7 @@
 """The file of a dataset; what drives its trials at their frames, and since when that has not changed."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from warp_resphys.data.driving import driving, first_change, phases_of, since_change
@@ -13,7 +15,7 @@ def dataset(begins, names="abc", resting=None, **inputs):
     """Trials of one marker at rest at six frames, of two steps each."""
     rows = len(begins)
     times, observed = np.broadcast_to(TIMES, (rows, 6)), np.zeros((rows, 6, 1, 3))
-    channels = {name: ("left", "right")[: values.shape[2]] for name, values in inputs.items()}
+    channels = {name: ("left", "right")[: values.shape[-1]] for name, values in inputs.items()}
     fields = {"inputs": inputs, "channels": channels, "resting": resting or {}}
     about = (times, observed, observed[:, 0], np.zeros(rows), np.zeros(3), 0.05)
     return Trials(tuple(names[:rows]), ("m",), begins, *about, bound=np.zeros((1, 3)), units=UNITS, **fields)
@@ -43,6 +45,26 @@ def test_inputs_before_the_trials_are_kept_and_joined_with_trials_at_rest(tmp_pa
     np.testing.assert_array_equal(driven.joined(rest).resting["pressure"], [[3.0, 5.0], [0.0, 0.0]])
     np.testing.assert_array_equal(rest.joined(driven).resting["pressure"], [[0.0, 0.0], [3.0, 5.0]])
     assert rest.joined(rest).resting == {}
+
+
+def test_constant_inputs_and_loads_before_the_trials_alone_are_kept_in_a_file(tmp_path):
+    force, moved = np.arange(6.0).reshape(2, 1, 3), np.arange(24.0).reshape(2, 4, 1, 3)
+    trials = dataset(("driven", "driven"), resting={"external_force": force})
+    trials = replace(trials, inputs={"pressure": np.array([[3.0], [5.0]]), "fixed_positions": moved}, channels={})
+    trials.write(tmp_path / "dataset.h5")
+    again = Trials.read(tmp_path / "dataset.h5")
+    assert again.channels == {}
+    for one, other in ((again.inputs, trials.inputs), (again.resting, trials.resting)):
+        assert one.keys() == other.keys()
+        assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_a_pose_is_under_its_last_inputs_or_under_constant_ones():
+    steps = np.arange(8.0).reshape(2, 4, 1)
+    for pressure in (steps, steps[:, 3]):
+        acting, resting = dataset(("static", "static"), pressure=pressure).acting(["a", "b"], None, None, 0.05)
+        assert resting.fields["pressure"].tolist() == [[3.0], [7.0]]
+        assert acting.at(3).fields["pressure"].tolist() == [[3.0], [7.0]]
 
 
 def test_inputs_are_those_of_the_step_that_begins_with_a_frame():

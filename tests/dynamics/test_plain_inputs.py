@@ -60,8 +60,6 @@ def test_wrong_numbers_of_values_are_refused():
     simulator = pulled()
     with pytest.raises(InputError, match=r"tendon_tension has shape \(1, 3\)"):
         simulator.step(simulator.rest_state(), Inputs(tendon_tension=[0.1, 0.2, 0.3]))
-    with pytest.raises(InputError, match="one number in a batch"):
-        Inputs(tendon_tension=0.1).repeat(1).joined(Inputs(tendon_tension=0.2))
 
 
 def test_simulations_are_printed_in_a_line():

@@ -1,5 +1,6 @@
 """Work in parts: interrupted, resumed, in memory and in other processes."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -53,6 +54,9 @@ def test_without_a_folder_the_arrays_stay_in_memory(count):
     parts.run(work)
     np.testing.assert_array_equal(parts.joined(work, "power"), [[n**k for k in range(FRAMES)] for n in (2, 3, 5)])
     assert parts.joined(work, "power", 8).shape == (3, 8)
+    other = [replace(part, work=partial(growing, ["7"] * len(part.names), {"computed": []})) for part in work]
+    parts.run(other)  # other work with the same labels
+    assert [parts.read(part, "number").tolist() for part in (*other, *work)] == [[7.0] * 2, [7.0], [2.0, 3.0], [5.0]]
 
 
 def test_shorter_trials_end_with_nan():

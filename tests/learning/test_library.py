@@ -195,5 +195,5 @@ def test_invalid_motions_are_refused(robot):
     motion = ObservedMotions.of(robot, robot.rollout(start, 3).q, start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         identify(robot, motion, {"mass": (1.0, 2.0)})
-    with pytest.raises(ValueError, match=r"trainer\.sequence is missing"):
+    with pytest.raises(wr.InputError, match=r"trainer\.sequence is missing"):
         fit_force(robot, motion, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))

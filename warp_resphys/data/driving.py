@@ -72,7 +72,7 @@ def driving(dataset: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
 
 
 def since_change(dataset: Trials, names: Sequence[str]) -> FloatArray:
-    """Returns the times (R, T) since the last change of the inputs [s], see `learning.intervals.time_since_change`."""
+    """Returns the times (R, T) since the last change of the inputs [s], see `time_since_change`."""
     rows = dataset.rows(names)
     acting = [np.moveaxis(values, 0, 1) for values in driving(dataset, names).values()]
     since = time_since_change(dataset.times[rows].T, acting).T
@@ -87,7 +87,7 @@ def first_change(dataset: Trials, name: str) -> float:
 
 
 def phases_of(dataset: Trials, names: Sequence[str]) -> NDArray[np.str_]:
-    """Returns the phases (R, T) of driven trials, see `learning.metrics.phases`; empty words for others and for poses.
+    """Returns the phases (R, T) of driven trials, see `phases`; empty words for others and for poses.
 
     The size of the inputs is their norm, each kind over its largest value.
     """

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Self, TypeVar
 
+import h5py
 import numpy as np
 import torch
 
@@ -26,6 +27,7 @@ UNDER_INPUTS: Final = "driven"  # of a body at rest under the inputs of the firs
 SLACK: Final = "slack"  # the same, where these do not act; as UNDER_INPUTS in a dataset
 RESTING: Final = ("rest", UNDER_INPUTS, SLACK)  # of motions that inputs begin, read at the time steps
 _KIND = "dataset"
+_RESTING, _CHANNELS = "_resting", "_channels"  # ends of names in a file
 T = TypeVar("T")
 _UNITS = {
     **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
@@ -128,7 +130,7 @@ class Trials:
         words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
         words |= {"sessions": self.sessions} if self.sessions else {}
         words |= {"obstacles": tuple(self.obstacles)} if self.obstacles else {}
-        words |= {f"{name}_channels": channels for name, channels in self.channels.items()}
+        words |= {f"{name}{_CHANNELS}": channels for name, channels in self.channels.items()}
         attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
             for name, unit in _UNITS.items():
@@ -140,7 +142,7 @@ class Trials:
             for name, values in self.obstacles.items():
                 create(file, f"obstacles/{name}", values, units=_UNITS["base"])
             for name, values in self.resting.items():
-                create(file, f"{name}_resting", values, units=self.units.get(name) or "1")
+                create(file, f"{name}{_RESTING}", values, units=self.units.get(name) or "1")
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -162,15 +164,18 @@ class Trials:
             }
             arrays = {name: read_array(file, name, x) for name, x in shapes.items() if name in file}
             known: dict[str, Any] = {**words, **arrays}
+            resting = [key.removesuffix(_RESTING) for key in file if key.endswith(_RESTING)]
             return cls(
                 **known,
                 times=times,
                 observed=observed,
                 gravity=np.asarray(file.attrs["gravity"], dtype=np.float64),
                 time_step=float(file.attrs["time_step"]),
-                inputs={name: read_array(file, name, (r, None, None)) for name in inputs},
-                resting={n: read_array(file, f"{n}_resting", (r, None)) for n in inputs if f"{n}_resting" in file},
-                channels={name: tuple(map(str, file.attrs[f"{name}_channels"])) for name in inputs},
+                inputs={name: _of_trials(file, name, r) for name in inputs},
+                resting={name: _of_trials(file, f"{name}{_RESTING}", r) for name in resting},
+                channels={
+                    n: tuple(map(str, file.attrs[f"{n}{_CHANNELS}"])) for n in inputs if f"{n}{_CHANNELS}" in file.attrs
+                },
                 sessions=more["sessions"],
                 obstacles={n: read_array(file, f"obstacles/{n}", (r, None, 6)) for n in more["obstacles"]},
             )
@@ -199,10 +204,14 @@ class Trials:
         """Indices of trials."""
         return [self.names.index(name) for name in names]
 
+    def _is_constant(self, name: str) -> bool:
+        """Whether an input has no time axis."""
+        return self.inputs[name].ndim == (3 if name in ("external_force", "fixed_positions") else 2)
+
     def _during(self, name: str, rows: Sequence[int], time_step: float) -> FloatArray:
         """(K', R, ...) an input resampled to a time step, by its values at the middle of each; (R, ...) if constant."""
         values = self.inputs[name][rows]
-        if values.ndim == (3 if name in ("external_force", "fixed_positions") else 2):
+        if self._is_constant(name):
             return values
         count = round(values.shape[1] * self.time_step / time_step)
         at = ((np.arange(count) + 0.5) * time_step / self.time_step).astype(np.int64)
@@ -252,7 +261,8 @@ class Trials:
             hung = payload_inputs(body, payload_at, self.payload[rows])
             acting |= {key: torch.from_numpy(masses) for key, masses in hung.items()}
         if static:
-            return Inputs(**acting), Inputs(**{key: acting[key][-1] for key in self.inputs})  # under the last values
+            last = {key: acting[key] if self._is_constant(key) else acting[key][-1] for key in self.inputs}
+            return Inputs(**acting), Inputs(**last)
         moved = self.contact_at(names, body, time_step)
         acting |= {name: torch.from_numpy(values[1:].copy()) for name, values in moved.items()}
         if (poses := self.base_at(names, time_step)) is not None:
@@ -260,6 +270,11 @@ class Trials:
             acting["fixed_positions"] = (fixed @ rotations(poses[1:, :, 3:]).mT) + poses[1:, :, None, :3]
         before = self.resting if self.begins[rows[0]] == UNDER_INPUTS else {}
         return Inputs(**acting), Inputs(**{key: torch.from_numpy(values[rows]) for key, values in before.items()})
+
+
+def _of_trials(file: h5py.Group, name: str, count: int) -> FloatArray:
+    """Reads an array (R, ...) of R trials."""
+    return read_array(file, name, (count, *[None] * (file[name].ndim - 1)) if name in file else None)
 
 
 def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArray) -> dict[str, FloatArray]:

@@ -82,7 +82,7 @@ class Parts:
         batch: int | None = None,
     ) -> None:
         self.name, self.workers, self.folder, self.fingerprint, self.batch = name, workers, folder, fingerprint, batch
-        self._kept: dict[str, Arrays] = {}
+        self._kept: dict[TrialPart, Arrays] = {}
 
     @classmethod
     def of(cls, context: StageContext, workers: Workers = ALONE, batch: int | None = None) -> "Parts":
@@ -108,18 +108,19 @@ class Parts:
                 self.folder.mkdir(parents=True, exist_ok=True)
             frames = [part.frames * len(part.names) for part in left]
             shared, crew = self.folder or Path.cwd(), workers.at_most(len(left))
-            results = fan_out(partial(_compute, self), left, crew, shared, lambda at: progress.advance(frames[at]))
+            keeps = Parts(self.name, folder=self.folder, fingerprint=self.fingerprint)  # without arrays
+            results = fan_out(partial(_compute, keeps), left, crew, shared, lambda at: progress.advance(frames[at]))
             if self.folder is None:
-                self._kept |= {part.label: arrays for part, arrays in zip(left, results, strict=True)}
+                self._kept |= dict(zip(left, results, strict=True))
 
     def _is_done(self, part: TrialPart) -> bool:
         if self.folder is None:
-            return part.label in self._kept
+            return part in self._kept
         return is_final(self._path(part), self.name, self.fingerprint)
 
     def _keep(self, part: TrialPart, arrays: Arrays) -> None:
         if self.folder is None:
-            self._kept[part.label] = arrays
+            self._kept[part] = arrays
             return
         with atomic_hdf5(self._path(part), self.name, {"fingerprint": self.fingerprint}) as file:
             for name, (values, unit) in arrays.items():
@@ -136,7 +137,7 @@ class Parts:
             DataFileError: the file or the array is missing or damaged.
         """
         if self.folder is None:
-            return self._kept[part.label][name][0]
+            return self._kept[part][name][0]
         with read_hdf5(self._path(part), self.name) as file:
             return read_array(file, name)
 

@@ -128,16 +128,18 @@ class Comparison:
             names: names of the trials.
             uncertain: whether models are left out whose parameters have no uncertainty.
         """
-        made: dict[int, Mapping[str, Sensitivity]] = {}
         found: dict[str, Mapping[str, Sensitivity]] = {}
         for name, model in self.models.items() if self.motions.trials.bound is not None else ():
             replaced = model.learned is not None and model.learned.replaces_simulator
             if replaced or not model.has_intervals or (uncertain and model.identified.uncertainty is None):
                 continue
-            key = id(model.simulator)
-            if key not in made:
-                made[key] = sensitivities(model.simulator, self.motions, names, model.identified, self.parts.batch)
-            found[name] = made[key]
+            alike = (other for other in found if self.models[other].simulator is model.simulator)
+            same = next((other for other in alike if self.models[other].identified == model.identified), None)
+            found[name] = (
+                sensitivities(model.simulator, self.motions, names, model.identified, self.parts.batch)
+                if same is None
+                else found[same]
+            )
         return found
 
     def _spreads(self, names: Sequence[str], linear: Linear, left_out: bool = False) -> dict[str, FloatArray]:

@@ -88,13 +88,13 @@ def rollout_parts(
         filmed: name of the trial whose vertices are kept.
         label: first part of the names of the files.
     """
-    used, parts = replace(simulator, solver=replace(simulator.settings, on_failure="count")), list[TrialPart]()
+    parts = list[TrialPart]()
     for number, whole in enumerate(motions.trials.batches(names)):
         steps = math.ceil(motions.trials.seconds(whole) / simulator.time_step)
         if not motions.trials.moving(whole) and isinstance(force, Learned) and force.replaces_simulator:
             steps = POSE_STEPS
         for first, some in cut(whole, batch):
-            work = partial(roll_out, used, motions, some, force, Identified.of(parameters), filmed)
+            work = partial(roll_out, simulator, motions, some, force, Identified.of(parameters), filmed)
             parts.append(TrialPart(f"{label}{number}_{first:03d}", some, steps + 1, work))
     return parts
 
@@ -111,7 +111,7 @@ def roll_out(
     """Rolls out trials that begin in the same way.
 
     Args:
-        simulator: its solver settings must count failures rather than raise them.
+        simulator: of which a copy is used, so that results do not depend on other parts, and its buffers are let go.
         motions: see `evaluate`.
         names: of the R trials.
         force: see `evaluate`.
@@ -125,6 +125,7 @@ def roll_out(
         steps at which trials left the training range, -1 where they did not; ``film`` (K + 1, N, 3) vertices [m].
     """
     data_driven = isinstance(force, Learned) and force.replaces_simulator
+    simulator = replace(simulator, solver=replace(simulator.settings, on_failure="count"))
     run, points, bodies = TrialRollout(simulator, motions, names, identified, data_driven), [], list[torch.Tensor]()
     predictor = run.predictor(force) if isinstance(force, Learned) else force
     for state in run.roll(predictor):

@@ -117,13 +117,6 @@ class Inputs:
         """Returns the inputs of the whole batch, repeated along the batch axis."""
         return self if times == 1 else self.map(lambda value, axis: torch.cat([value] * times, axis))
 
-    def joined(self, other: "Inputs") -> "Inputs":
-        """Returns the inputs of both batches, concatenated along the batch axis."""
-        theirs = other.fields
-        if numbers := [name for name, value in (self.fields | theirs).items() if not value.ndim]:
-            raise InputError(f"{numbers[0]} is one number in a batch: give (B, n) values to join batches.")
-        return self._derived({n: torch.cat([value, theirs[n]], axis) for n, (value, axis) in self.axes().items()})
-
     def to(self, like: torch.Tensor) -> "Inputs":
         """Returns the inputs with the device and dtype of a tensor."""
         return self._derived({name: value.to(like) for name, value in self.fields.items()})

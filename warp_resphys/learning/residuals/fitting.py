@@ -16,6 +16,7 @@ from ...data.trials import STATIC
 from ...dynamics.modes import RestStiffness
 from ...dynamics.simulator import Simulator
 from ...io.progress import Progress
+from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
 from ..evaluation import rollout_error
 from ..observed_motions import Identified, ObservedMotions
@@ -75,9 +76,8 @@ def fit_force(
     fitting = Fitting(
         simulator, motions, reconstructed, tuple(train), tuple(validation), Identified.of(parameters), **more
     )
-    settings = TrainingSettings(
-        network=network or NetworkSettings(), trainer=trainer or TrainerSettings(), in_the_loop=in_the_loop, seed=seed
-    )
+    groups = {"network": network or NetworkSettings(), "trainer": trainer or TrainerSettings()}
+    settings = parse(TrainingSettings, {**groups, "in_the_loop": in_the_loop, "seed": seed})
     with torch.random.fork_rng():
         return fit(fitting, settings)
 

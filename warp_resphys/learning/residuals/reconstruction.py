@@ -1,4 +1,4 @@
-r"""ReconstructedStep of residual forces from observed states or sparse markers.
+r"""Reconstruction of residual forces from observed states or sparse markers.
 
 For each step of an observed trajectory, find the force f that minimises
 
@@ -328,12 +328,9 @@ def reconstruct(
         ConvergenceError: a step without a solution.
     """
     parts, known = parts or Parts("reconstruct"), Identified.of(parameters)
-    used, wanted, cut_up = (
-        without_ringing(simulator, motions.observe),
-        settings or ReconstructionSettings(),
-        list[TrialPart](),
-    )
-    for number, whole in enumerate(motions.trials.batches(names or motions.trials.names)):
+    used, wanted = without_ringing(simulator, motions.observe), settings or ReconstructionSettings()
+    cut_up = list[TrialPart]()
+    for number, whole in enumerate(motions.trials.batches(motions.trials.names if names is None else names)):
         frames = motions.learned_steps(int(motions.trials.seconds(whole) / used.time_step + 1e-6)) + 1
         for first, batch in cut(whole, parts.batch):
             work = partial(_reconstructed, used, motions, batch, known, wanted)
@@ -352,8 +349,10 @@ def _reconstructed(
 ) -> Arrays:
     """Reconstruction of trials that begin in the same way, see `ReconstructedTrials`.
 
-    Forces from markers are in single precision, which rounds positions to 1e-8 m.
+    Forces from markers are in single precision, which rounds positions to 1e-8 m. A copy of the simulator is used, so
+    that results do not depend on other parts.
     """
+    simulator = replace(simulator)
     replay = motions.replay(simulator, names, identified)
     start = motions.start(replay, identified)
     constants, inputs, resting = replay.prepare(identified.values(simulator))

@@ -195,5 +195,10 @@ def test_invalid_motions_are_refused(robot):
     motion = ObservedMotions.of(robot, robot.rollout(start, 3).q, start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         identify(robot, motion, {"mass": (1.0, 2.0)})
+    with pytest.raises(wr.InputError, match="there is no trial 'motion 1': there are motion 0"):
+        evaluate(robot, motion, names=["motion 1"])
+    found = reconstruct(robot, motion)
     with pytest.raises(wr.InputError, match=r"trainer\.sequence is missing"):
-        fit_force(robot, motion, reconstruct(robot, motion), network=NetworkSettings(recurrent=4))
+        fit_force(robot, motion, found, network=NetworkSettings(recurrent=4))
+    with pytest.raises(wr.InputError, match="the trial 'motion 0' was not reconstructed"):
+        fit_force(robot, motion, replace(found, names=("other",)))

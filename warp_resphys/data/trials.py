@@ -87,11 +87,13 @@ class Trials:
 
     def session(self, name: str) -> str:
         """Session in which a trial was recorded; empty if there is one."""
-        return self.sessions[self.names.index(name)] if self.sessions else ""
+        (row,) = self.rows([name])
+        return self.sessions[row] if self.sessions else ""
 
     def begin_of(self, name: str) -> str:
         """How a trial begins: given, released, rest, driven or static."""
-        return self.begins[self.names.index(name)]
+        (row,) = self.rows([name])
+        return self.begins[row]
 
     def batches(self, names: Sequence[str]) -> list[tuple[str, ...]]:
         """Groups trials by how they begin and their session; the trials of a group can be simulated as one batch."""
@@ -201,7 +203,14 @@ class Trials:
         return replace(self, **changed)
 
     def rows(self, names: Sequence[str]) -> list[int]:
-        """Indices of trials."""
+        """Returns the indices of trials.
+
+        Raises:
+            InputError: there is no trial of a name.
+        """
+        for name in names:
+            if name not in self.names:
+                raise InputError(f"there is no trial {name!r}: there are {', '.join(self.names)}.")
         return [self.names.index(name) for name in names]
 
     def _is_constant(self, name: str) -> bool:

@@ -298,7 +298,13 @@ class ReconstructedTrials:
     read: Callable[[str], NDArray[Any]]
 
     def of(self, names: Sequence[str], *arrays: str) -> list[NDArray[Any]]:
-        """Returns some arrays of some trials."""
+        """Returns some arrays of some trials.
+
+        Raises:
+            InputError: a trial was not reconstructed.
+        """
+        if missing := [name for name in names if name not in self.names]:
+            raise InputError(f"the trial {missing[0]!r} was not reconstructed: there are {', '.join(self.names)}.")
         rows = [self.names.index(name) for name in names]
         index = slice(rows[0], rows[-1] + 1) if rows == [*range(rows[0], rows[-1] + 1)] else rows
         return [self.read(name)[index] for name in arrays]

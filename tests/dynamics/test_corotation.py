@@ -8,14 +8,12 @@ import pytest
 import torch
 
 from support.clamped import clamped, noise
-from warp_resphys import Corotated, Rigid, Simulator, SolverSettings, State, Tendons, box_hexahedra
+from warp_resphys import Corotated, Inputs, Mesh, Rigid, Simulator, SolverSettings, State, Tendons, box_hexahedra
 from warp_resphys.dynamics import equilibrium, kept_factor
 from warp_resphys.dynamics.kept_factor import Corotation
 from warp_resphys.fem.coordinates import SymmetryPlane
 from warp_resphys.linalg.pardiso import PardisoSolver, has_pardiso
 from warp_resphys.mesh.boxes import box_tetrahedra
-from warp_resphys.mesh.volume_mesh import Mesh
-from warp_resphys.stepping.inputs import Inputs
 
 pytestmark = pytest.mark.skipif(not has_pardiso(), reason="needs the package mkl, which x86 processors alone have")
 

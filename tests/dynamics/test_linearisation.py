@@ -8,14 +8,12 @@ import torch
 
 from support.chambered import chambered
 from support.clamped import clamped, noise
-from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Rigid, Simulator, Tendons
+from warp_resphys import Contact, Corotated, HalfSpace, InputError, Inputs, Mesh, Rigid, Simulator, Tendons
 from warp_resphys.dynamics.energy_set import EnergySet, place_energies
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.energies import Gent
 from warp_resphys.fem.coordinates import DeviceCoordinates
-from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.boxes import box_hexahedra
-from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import central_difference
 

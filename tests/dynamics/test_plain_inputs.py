@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Body, Corotated, Inputs, Scene, Simulator, SurfaceContact, Tendons, box_hexahedra
-from warp_resphys.io.errors import InputError
+from warp_resphys import Body, Corotated, InputError, Inputs, Scene, Simulator, SurfaceContact, Tendons, box_hexahedra
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (4, 1, 1))
 ROUTES = [[[x, 0.01, z] for x in (0.0, 0.05, 0.1)] for z in (0.002, 0.018)]

@@ -7,17 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from warp_resphys import Body, Contact, HalfSpace, Inputs, Mesh, ResphysWarning, Rigid, Simulator, quadratic
 from warp_resphys.dynamics.plausibility import small_strain_stiffness
-from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.contact.obstacle_contact import Contact
-from warp_resphys.energies.contact.obstacles import HalfSpace
 from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.energies.materials import Corotated, StableNeoHookean
-from warp_resphys.fem.bodies import Body, Rigid
-from warp_resphys.io.errors import ResphysWarning
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.volume_mesh import Mesh, quadratic
-from warp_resphys.stepping.inputs import Inputs
 
 
 def beam(scale=1.0, mesh=None):

@@ -10,10 +10,9 @@ import torch
 from support.clamped import clamped, noise
 from support.regions import beam, two_boxes
 from support.slopes import check_slopes
-from warp_resphys import Body, Corotated, Mesh, Scene, Simulator, StableNeoHookean, State, box_hexahedra
+from warp_resphys import Body, Corotated, InputError, Mesh, Scene, Simulator, StableNeoHookean, State, box_hexahedra
 from warp_resphys.fem.bodies import Glue, Rigid
 from warp_resphys.fem.coordinates import Coordinates, DeviceCoordinates, barycentric, control_vertices
-from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.mesh.selection import select_vertices
 

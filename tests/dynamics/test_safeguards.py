@@ -8,11 +8,10 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Body, Corotated, Simulator, SolverSettings, State, box_hexahedra
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra
 from warp_resphys.dynamics import statics
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.linalg.choice import make_linear_solver
-from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
 CLAMPED = clamped(MESH)

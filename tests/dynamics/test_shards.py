@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Corotated, Simulator, SolverSettings, State, box_hexahedra, select_vertices
+from warp_resphys import Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.linalg.threads import in_threads, shards_of
-from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))

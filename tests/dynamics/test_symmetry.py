@@ -7,9 +7,8 @@ import pytest
 
 from support.clamped import clamped
 from support.slopes import check_rows
-from warp_resphys import Body, Mesh, Rigid, Simulator, SolverSettings, StableNeoHookean, box_hexahedra
+from warp_resphys import Body, InputError, Mesh, Rigid, Simulator, SolverSettings, StableNeoHookean, box_hexahedra
 from warp_resphys.fem.coordinates import SymmetryPlane
-from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 SIZE = (0.1, 0.03, 0.03)

@@ -7,9 +7,7 @@ import torch
 import warp as wp
 
 from support.clamped import clamped
-from warp_resphys import Corotated, Inputs, Simulator, State, box_hexahedra
-from warp_resphys.dynamics.tape import record_rollout
-from warp_resphys.io.errors import InputError
+from warp_resphys import Corotated, InputError, Inputs, Simulator, State, box_hexahedra, record_rollout
 
 BATCH, STEPS = 2, 3
 

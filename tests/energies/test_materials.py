@@ -9,11 +9,10 @@ import torch
 
 from support.clamped import clamped
 from support.slopes import check_rows
-from warp_resphys import Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys import InputError, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies import Gent, MooneyRivlin
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.convex_material import ConvexMaterial, FibreFamily
-from warp_resphys.io.errors import InputError
 from warp_resphys.studies.gradient_check import check_gradients
 
 BODY = clamped(box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2)))

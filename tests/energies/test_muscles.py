@@ -7,9 +7,8 @@ import pytest
 
 from support.clamped import clamped
 from support.slopes import check_rows
-from warp_resphys import Corotated, Inputs, Simulator, SolverSettings, box_hexahedra, box_tetrahedra
+from warp_resphys import Corotated, InputError, Inputs, Simulator, SolverSettings, box_hexahedra, box_tetrahedra
 from warp_resphys.energies.muscles import Muscle, Muscles
-from warp_resphys.io.errors import InputError
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 

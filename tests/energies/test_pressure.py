@@ -9,13 +9,11 @@ import torch
 from support.chambered import BRICK, KINDS, chambered, hollow_box
 from support.clamped import noise
 from support.slopes import check_rows, check_slopes
-from warp_resphys import Body, Corotated, Inputs, Pressure, Simulator, SolverSettings
+from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, State
 from warp_resphys.energies.base import PlacedEnergy
-from warp_resphys.energies.fibres import Fibres
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
-from warp_resphys.stepping.state import State
 from warp_resphys.studies.gradient_check import central_difference, check_gradients
 
 SOFT = Corotated(100e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)

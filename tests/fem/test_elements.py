@@ -5,13 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from warp_resphys import Body, Mesh, Simulator, SolverSettings, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys import Body, Inputs, Mesh, Simulator, SolverSettings, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.energies.catalogue import MATERIALS
 from warp_resphys.fem.integration_points import discretise, physical_gradients
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.elements import BY_NODES, ELEMENTS, FACES, conical_simplex, degree_two_tetrahedron, gauss_box
 from warp_resphys.mesh.volume_mesh import surface_vertices
-from warp_resphys.stepping.inputs import Inputs
 
 SIZE, DIVISIONS = (0.03, 0.02, 0.02), (3, 2, 2)
 SHAPES = {name: element.shape for name, element in ELEMENTS.items()}

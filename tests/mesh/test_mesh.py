@@ -10,13 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warp_resphys import Mesh, quadratic
+from warp_resphys import Mesh, MeshError, quadratic, read_mesh, select_vertices
 from warp_resphys.io import decoding
-from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
 from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.readers import read_mesh
-from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.mesh.volume_mesh import boundary_faces, boundary_triangles, check_mesh, surface_vertices
 
 BOXES = {

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 import pyvista
 
-from warp_resphys import Mesh, ResphysWarning, box_hexahedra, box_tetrahedra, read_mesh
-from warp_resphys.io.errors import MeshError
+from warp_resphys import Mesh, MeshError, ResphysWarning, box_hexahedra, box_tetrahedra, read_mesh
 from warp_resphys.mesh import read_surfaces, write_mesh
 from warp_resphys.mesh.elements import ELEMENTS
 from warp_resphys.mesh.quality import cell_volumes

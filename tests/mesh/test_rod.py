@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from warp_resphys.io.errors import MeshError
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
+from warp_resphys import MeshError, box_hexahedra, box_tetrahedra, rod
 from warp_resphys.mesh.quality import cell_volumes
-from warp_resphys.mesh.rod import rod
 from warp_resphys.mesh.surface import locate
 from warp_resphys.mesh.volume_mesh import check_mesh
 

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from support.clamped import clamped
-from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra
+from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, quadratic
 from warp_resphys.mesh import find_chambers
-from warp_resphys.mesh.volume_mesh import quadratic
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)
 # Removed bricks (i, j, k): a chamber of two bricks and one of a single brick.

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from support.configured import settings
+from warp_resphys import ObservedMotions, box_hexahedra
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.safe_files import atomic_hdf5, create, read_json, write_json
 from warp_resphys.learning.error_tables import ComparedModels
-from warp_resphys.learning.observed_motions import ObservedMotions
-from warp_resphys.mesh.boxes import box_hexahedra
 
 GRAVITY = np.array([0.0, 0.02, -9.8])
 

@@ -3,10 +3,8 @@
 import numpy as np
 import torch
 
-from warp_resphys import box_hexahedra, select_vertices
-from warp_resphys.data.markers import bind_markers
+from warp_resphys import Inputs, bind_markers, box_hexahedra, select_vertices
 from warp_resphys.learning.trial_batch import TrialBatch
-from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

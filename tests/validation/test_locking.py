@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings
+from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, quadratic
 from warp_resphys.mesh import find_chambers
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
-from warp_resphys.mesh.volume_mesh import quadratic
 
 RUBBER = Corotated(264e3, 0.499, density=1070.0)
 CONVERGED = 31.63  # mm, under gravity

@@ -22,9 +22,8 @@ from pydantic import ConfigDict
 
 from support.command_line import outcome
 from support.main_job import end_of
-from warp_resphys import __version__, cli, commands
+from warp_resphys import InputError, __version__, cli, commands
 from warp_resphys.commands import NOBODY_READS, run_label
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.resuming import StageInterrupted
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings

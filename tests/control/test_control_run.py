@@ -11,7 +11,7 @@ import torch
 
 import warp_resphys
 from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
-from warp_resphys import Contact, HalfSpace, pipeline
+from warp_resphys import Contact, HalfSpace, InputError, Twin, pipeline
 from warp_resphys.control import sampling
 from warp_resphys.control.control_files import PLANNED, plans_file, read_motion, read_reduced, reduced_file
 from warp_resphys.control.control_stages import controllers_of, driven_settings, replay
@@ -21,13 +21,11 @@ from warp_resphys.control.reduction import reduce
 from warp_resphys.control.sampling import check_plannable
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import Laboratory, ReducedWorld
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.safe_files import read_array, read_hdf5
 from warp_resphys.settings.control import ReductionSettings
 from warp_resphys.stepping.rollout import states
 from warp_resphys.studies.live_twin import TwinSettings
 from warp_resphys.twin.reduced_estimator import ReducedEstimator
-from warp_resphys.twin.twin import Twin
 
 CONTROL = [
     "experiment=tendon_rod_control",

@@ -9,9 +9,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from support.command_line import outcome
+from warp_resphys import DataFileError, InputError, read_recording
 from warp_resphys.data.base_motion import since_first
-from warp_resphys.data.recordings.recording_files import read_recording
-from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.settings.data_kinds import BagSettings
 
 RATE, FRAMES = 50.0, 41

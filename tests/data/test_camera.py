@@ -17,7 +17,6 @@ from warp_resphys.data.camera import (
     motion_axes,
     path_axes,
 )
-from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.stepping.rotations import rotations
 
 X, Y, Z = np.eye(3)
@@ -82,9 +81,9 @@ def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
 
 def test_bad_input_is_named():
     lens, pose = Lens(torch.eye(3)), torch.eye(4)
-    with pytest.raises(InputError, match=r"shape \(3, 4\)"):
+    with pytest.raises(wr.InputError, match=r"shape \(3, 4\)"):
         PlacedCamera(lens, pose[:3])
-    with pytest.raises(InputError, match="no rotation with a shift"):
+    with pytest.raises(wr.InputError, match="no rotation with a shift"):
         PlacedCamera(lens, pose * torch.tensor([[-1.0], [1.0], [1.0], [1.0]]))
     with pytest.raises(wr.InputError, match=r"\(time, motion, point, 2\) in px"):
         wr.ObservedMotions.of(beam(264e3), torch.zeros(3, 1, 3, 3), observation=camera())
@@ -144,17 +143,17 @@ def test_rays_are_the_inverse_of_pixels():
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        ("a: 1", DataFileError, "has no camera_matrix of nine numbers"),
-        ("camera_matrix: {data: [a]}", DataFileError, "is no YAML with numbers"),
-        ("[", DataFileError, "is no YAML"),
-        ("camera_matrix: [1, 0, 2, 0, 3, 4, 0, 0, 1]\nD: [1, 2]", InputError, "give k1, k2, p1, p2"),
+        ("a: 1", wr.DataFileError, "has no camera_matrix of nine numbers"),
+        ("camera_matrix: {data: [a]}", wr.DataFileError, "is no YAML with numbers"),
+        ("[", wr.DataFileError, "is no YAML"),
+        ("camera_matrix: [1, 0, 2, 0, 3, 4, 0, 0, 1]\nD: [1, 2]", wr.InputError, "give k1, k2, p1, p2"),
     ],
 )
 def test_files_without_a_calibration_are_said(text, error, words, tmp_path):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(error, match=words):
         Lens.read(tmp_path / "camera.yaml")
-    with pytest.raises(DataFileError, match="Cannot read"):
+    with pytest.raises(wr.DataFileError, match="Cannot read"):
         Lens.read(tmp_path / "none.yaml")
 
 

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from support.command_line import outcome, refusal
-from warp_resphys.data.recordings.recording_files import read_recording
+from warp_resphys import DataFileError, read_recording
 from warp_resphys.io import decoding
-from warp_resphys.io.errors import DataFileError
 from warp_resphys.settings.data_kinds import TableSettings
 
 TIMES = 100.0 + np.arange(30) / 50.0

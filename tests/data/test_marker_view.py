@@ -5,10 +5,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from warp_resphys import InputError, bind_markers, box_hexahedra
 from warp_resphys.data.marker_view import MarkerView, ViewedMarkers
-from warp_resphys.data.markers import bind_markers
-from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.boxes import box_hexahedra
 
 NOMINAL = np.array([[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.036], [0.004, 0.0, 0.063]])
 PLACES = torch.as_tensor(NOMINAL)

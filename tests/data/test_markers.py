@@ -7,10 +7,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from warp_resphys import InputError, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.data.markers import KINDS, bind_markers
-from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.stepping.rotations import closest_rotation, twisted
 
 MESHES = {

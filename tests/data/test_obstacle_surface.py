@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body
+from warp_resphys import Body, Contact, Cylinder, HalfSpace, box_hexahedra
 from warp_resphys.data.obstacle_surface import ObstacleSurface
-from warp_resphys.energies.contact.obstacle_contact import Contact
+from warp_resphys.energies import Box, Capsule, Sphere
 from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
-from warp_resphys.energies.contact.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
-from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report.layers import obstacle_layers
 from warp_resphys.stepping.rotations import rotations
 

@@ -5,12 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from warp_resphys import DataFileError, InputError, box_hexahedra, box_tetrahedra, read_recording
 from warp_resphys.data.marker_names import assign
 from warp_resphys.data.recordings.processing import fill_gaps, find_release
-from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.data.registration import RigidTransform, axes_rotation, kabsch, register_markers
-from warp_resphys.io.errors import DataFileError, InputError
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.surface import closest_points
 from warp_resphys.mesh.volume_mesh import boundary_triangles
 

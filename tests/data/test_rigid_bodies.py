@@ -8,11 +8,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import settings
-from warp_resphys.data.markers import bind_markers
-from warp_resphys.data.recordings.recording_files import read_recording
+from warp_resphys import DataFileError, bind_markers, read_recording
 from warp_resphys.data.rigid_bodies import angles, arms, as_markers, corners_of, owners, with_axes, with_corners
 from warp_resphys.experiment.build import bound_markers, build_body, nominal_places
-from warp_resphys.io.errors import DataFileError
 from warp_resphys.studies.gradient_check import central_difference
 
 LENGTH = 0.06

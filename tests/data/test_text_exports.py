@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.command_line import outcome, refusal
-from warp_resphys.data.recordings.recording_files import read_recording
-from warp_resphys.io.errors import DataFileError
+from warp_resphys import DataFileError, read_recording
 
 FRAMES, TIME = np.arange(1, 31), np.arange(30) / 100.0
 TIP = np.stack([100 + 9 * np.sin(9 * TIME), 0 * TIME + 2, 5 * TIME + 1], -1)  # [mm]

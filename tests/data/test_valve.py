@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from warp_resphys import DataFileError, read_recording
 from warp_resphys.data.recordings.processing import valve_opening
 from warp_resphys.data.recordings.recording import Recording
-from warp_resphys.data.recordings.recording_files import read_recording
 from warp_resphys.data.recordings.segment import (
     CLAMP_LABELS,
     MARKERS,
@@ -18,7 +18,6 @@ from warp_resphys.data.recordings.segment import (
     mask_repeats,
     read_published_segment,
 )
-from warp_resphys.io.errors import DataFileError
 
 RATE = 100.0
 DECAY = 4.0  # [1/s]

@@ -10,15 +10,13 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import warp_resphys
+from warp_resphys import InputError, Robot, State
 from warp_resphys.control.worlds import World
 from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.data.registration import kabsch
 from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv
-from warp_resphys.io.errors import InputError
-from warp_resphys.robot.robot import Robot
-from warp_resphys.stepping.state import State
 from warp_resphys.studies.live import LiveRobot
 
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Inputs, Mesh, PointMass, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra((0.02, 0.01, 0.01), (2, 1, 1))
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, settings
+from warp_resphys import DataFileError, InputError, Inputs
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.trials import Trials, payload_inputs
@@ -19,7 +20,6 @@ from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
 from warp_resphys.experiment.splits import trials_of
-from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.resuming import StageContext, fingerprint, run_stages
 from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
@@ -28,7 +28,6 @@ from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.settings.stage_keys import IMPORTED, PLAYED, StageSettings
-from warp_resphys.stepping.inputs import Inputs
 
 ROOT = Path(__file__).parents[2]
 TIPS, BASES = tuple(f"Tip - {i}" for i in (1, 2, 3)), tuple(f"Base - {i}" for i in (1, 2, 3))

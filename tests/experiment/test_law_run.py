@@ -9,18 +9,15 @@ import torch
 import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import means, run_without_report
-from warp_resphys import select_vertices
+from warp_resphys import DataFileError, Inputs, State, select_vertices
 from warp_resphys.experiment.experiment import LAW
 from warp_resphys.experiment.simulate import build_target, initial_state
 from warp_resphys.experiment.splits import all_trials
-from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.safe_files import read_json
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.identification import law_search
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.robot.description import finished_experiment
-from warp_resphys.stepping.inputs import Inputs
-from warp_resphys.stepping.state import State
 
 TINY = [
     *("mesh.divisions=[4,1,1]", "data.steps=24", "data.weights_g.train=[60,140,200]", "data.weights_g.test=[160]"),

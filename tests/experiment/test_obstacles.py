@@ -10,31 +10,25 @@ import torch
 from support.configured import settings
 from support.main_job import run_without_report
 from support.played_run import check_robots
-from warp_resphys import Body
+from warp_resphys import Body, Contact, DataFileError, HalfSpace, InputError, Robot, SurfaceContact, Twin, box_hexahedra
 from warp_resphys.data.base_motion import contact_inputs, prescribed, rigid
 from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.data.recordings.processing import obstacle_motion
 from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.data.trials import Trials
-from warp_resphys.energies.contact.obstacle_contact import Contact
-from warp_resphys.energies.contact.obstacles import Box, HalfSpace, Sphere
-from warp_resphys.energies.contact.surface_contact import FrictionPair, SurfaceContact
+from warp_resphys.energies import Box, FrictionPair, Sphere
 from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
 from warp_resphys.experiment.simulate import target_settings
-from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.safe_files import read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.parameters import constants_of, identifiable_parameters
-from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.robot.description import Description
-from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings
 from warp_resphys.settings.performed import MotionSettings
 from warp_resphys.studies.live import LiveRobot
 from warp_resphys.studies.view import Page
-from warp_resphys.twin.twin import Twin
 
 BEAM = "mesh.divisions=[4,1,1]"
 FLOOR = "{floor: {shape: half_space, position: [0, 0, -0.005]}}"

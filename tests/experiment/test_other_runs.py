@@ -8,6 +8,7 @@ from support.configured import settings
 from support.main_job import finish, run
 from support.played_run import check_robots
 from support.segment_run import TRACKED, place_segment
+from warp_resphys import Inputs, load
 from warp_resphys.data.base_motion import prescribed
 from warp_resphys.data.input_response import wave_inputs
 from warp_resphys.data.marker_view import MarkerView
@@ -19,9 +20,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.sensitivity import sensitivities
 from warp_resphys.learning.replay import exact
 from warp_resphys.robot.description import finished_experiment
-from warp_resphys.robot.loading import load
 from warp_resphys.settings.performed import MotionSettings
-from warp_resphys.stepping.inputs import Inputs
 
 pytestmark = pytest.mark.slow
 FEW = (

@@ -15,8 +15,7 @@ from torch import nn
 import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import run_without_report
-from warp_resphys.energies.base import Energy
-from warp_resphys.energies.catalogue import make_material
+from warp_resphys.energies import Energy, make_material
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.io.classes import ClassSettings, check_packages
 from warp_resphys.io.errors import DataFileError, InputError

@@ -19,16 +19,14 @@ from support.command_line import outcome, refusal
 from support.configured import composed, settings
 from support.main_job import IN_RUN, QUIET
 from support.tags import draw_tag
-from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.energies.catalogue import read_law
 from warp_resphys.experiment.pictures.camera_laboratory import depth_image, noisy_mask
 from warp_resphys.experiment.pictures.picture_stages import picture_stages
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.resuming import run_stages
 from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.volume_mesh import boundary_triangles
-from warp_resphys.pictures.outlines import ClosedSurface, Outline
+from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
 from warp_resphys.pictures.scene_files import read_tracked
 from warp_resphys.report.pictures_page import PictureResult, picture_verdict
 from warp_resphys.settings.run import RunSettings
@@ -211,7 +209,7 @@ class TestPicturesOfAFolder:
         quick = settings(*silicone, "budget=quick").pictures
         assert [*quick.poses] == ["hammer_blue"]  # the twisted pose is of the other material
         other = ("data.poses.other={folder:other,material:hard}", "data.materials.hard={}")
-        with pytest.raises(InputError, match="test has a pose of hard, of which no pose is in"):
+        with pytest.raises(wr.InputError, match="test has a pose of hard, of which no pose is in"):
             settings(*silicone, *other, "data.test=[twist_red,other]")
 
 

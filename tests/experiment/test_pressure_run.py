@@ -13,18 +13,16 @@ import torch
 from support.configured import check, composed, settings
 from support.main_job import finish, without_reports
 from support.segment_run import TRACKED, place_segment
-from warp_resphys import pipeline
+from warp_resphys import ObservedMotions, ResphysError, pipeline
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learning_stages
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.recordings.importing import import_recordings
-from warp_resphys.io.errors import ResphysError
 from warp_resphys.io.resuming import StageContext, run_stages
 from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.error_tables import ComparedModels
-from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.learning.residuals import fitting
 from warp_resphys.learning.residuals.correction import force_frames
 from warp_resphys.settings.stage_keys import StageSettings

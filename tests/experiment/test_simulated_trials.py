@@ -8,23 +8,20 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, composed, settings
-from warp_resphys import Body, Simulator, box_hexahedra, box_tetrahedra, select_vertices
+from warp_resphys import Body, InputError, Inputs, Muscles, Simulator, box_hexahedra, box_tetrahedra, select_vertices
 from warp_resphys.data.base_motion import rigid
 from warp_resphys.data.trials import Trials
-from warp_resphys.energies.catalogue import make_material
-from warp_resphys.energies.muscles import Muscle, Muscles
+from warp_resphys.energies import Muscle, make_material
 from warp_resphys.experiment.ablation import generate_motion, read_motion
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.files import DATASET
 from warp_resphys.experiment.simulate import simulate, vertices_in
 from warp_resphys.experiment.splits import split_of, trials_of
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.resuming import StageContext
 from warp_resphys.io.settings import parse
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings
 from warp_resphys.settings.stage_keys import SIMULATOR, StageSettings
-from warp_resphys.stepping.inputs import Inputs
 
 SIZE = (0.1, 0.03, 0.03)
 OWN = (

@@ -7,16 +7,12 @@ import pytest
 import torch
 
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double
-from warp_resphys import Body, Simulator
-from warp_resphys.dynamics.nonlinear_solver import SolverSettings
-from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.search import first_points, search_parameters
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.stepping.inputs import Inputs
 
 TRUTH = {"youngs_modulus": 215e3, "stiffness_damping": 0.002}
 RANGES = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True), "stiffness_damping": Bounds(0.0, 0.02)}

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, ConvergenceError, Corotated, Inputs, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import WHOLE_STATE, bind_markers
-from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.observed_motions import at_steps
 from warp_resphys.learning.replay import Replay, Start, Windows
@@ -17,7 +16,6 @@ from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, T
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
-from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.studies.gradient_check import central_difference
 
 MESH = box_hexahedra(divisions=(2, 1, 1))

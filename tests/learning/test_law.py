@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
+from warp_resphys import Body, InputError, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies import make_material
-from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification.law import _constants, fit_classes
 from warp_resphys.learning.identification.weak_form import KnownMotion, NormalEquations, WeakForm
 

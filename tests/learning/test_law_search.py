@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Inputs, ObservedMotions, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Inputs, ObservedMotions, Simulator, box_hexahedra, evaluate, select_vertices
 from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.identification.law import LawClass, branches_of, strong_names
 from warp_resphys.learning.identification.law_scores import Score
 from warp_resphys.learning.identification.law_search import _LawSearch, identify_law

@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, Tendons
+from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, Tendons, box_hexahedra, select_vertices
 from warp_resphys.data.markers import WHOLE_STATE
-from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
-from warp_resphys.mesh.boxes import box_hexahedra
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.stepping.inputs import Inputs
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
 CLAMP = select_vertices(MESH, x=0.0)

@@ -5,10 +5,9 @@ import pytest
 import torch
 from torch import nn
 
-from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, InputError, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
-from warp_resphys.io.errors import InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
 from warp_resphys.learning.residuals.correction import LearnedPredictor, Range

@@ -9,20 +9,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.regions import beam
-from warp_resphys import Body, Corotated, Rigid, Simulator
+from warp_resphys import Body, Corotated, InputError, Inputs, Rigid, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_vertices
 from warp_resphys.data.rigid_bodies import angles, arms
-from warp_resphys.io.errors import InputError
+from warp_resphys.learning import Bounds, Prior, search_parameters
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.nuisances import NuisanceFit
-from warp_resphys.learning.identification.search import search_parameters
-from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
-from warp_resphys.mesh.boxes import box_hexahedra
-from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.rotations import twisted
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2))

@@ -5,13 +5,12 @@ import pytest
 import scipy.optimize
 import torch
 
-from warp_resphys import Body, Corotated, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, WHOLE_STATE, MarkerMap, bind_markers
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.residuals.reconstruction import make_reconstructor
-from warp_resphys.stepping.inputs import Inputs
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))

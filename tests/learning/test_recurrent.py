@@ -3,12 +3,11 @@
 import pytest
 import torch
 
-from warp_resphys.io.errors import InputError
+from warp_resphys import InputError, State
 from warp_resphys.learning.residuals.correction import LearnedPredictor
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.learning.residuals.training import Samples, SequenceTrainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
-from warp_resphys.stepping.state import State
 
 MODES = {"position_modes": 1, "velocity_modes": 0, "force_modes": 1}
 NETWORK = NetworkSettings(**MODES, layers=1, width=16, activation="silu", recurrent=8)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double
-from warp_resphys import Body, Contact, Corotated, HalfSpace, PointMass, Simulator, Tendons
+from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, PointMass, Simulator, State, Tendons
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.settings import parse
@@ -15,9 +15,7 @@ from warp_resphys.learning.parameters import tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, begin_inputs, estimate_release, hold, sideways_shapes
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.mesh.selection import select_vertices
-from warp_resphys.stepping.inputs import Inputs
 from warp_resphys.stepping.rollout import sample
-from warp_resphys.stepping.state import State
 
 
 def simulator(masses=(), kind=Simulator, **options):

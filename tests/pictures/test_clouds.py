@@ -11,13 +11,9 @@ from scipy.spatial.transform import Rotation
 import warp_resphys as wr
 from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
 from warp_resphys.experiment.pictures.camera_laboratory import depth_image
-from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
-from warp_resphys.pictures.clouds import Cloud
-from warp_resphys.pictures.outlines import ClosedSurface
-from warp_resphys.pictures.picture_misfit import PictureMisfit
-from warp_resphys.pictures.seen import Photo, SeenPose
+from warp_resphys.pictures import ClosedSurface, Cloud, Photo, PictureMisfit, SeenPose
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)
 CLAMP = wr.select_vertices(MESH, x=0.0)
@@ -178,5 +174,5 @@ def test_background_and_isolated_points_are_left_out():
     assert 90 <= len(Cloud(body).around(SCANNER, MESH, CLAMP, 100).measured) <= 100
     assert np.diff(kept[:, 0]).min() > -1e-3  # along the beam, or the other way round
     for wrong in (1e3 * body, 1e-3 * body):
-        with pytest.raises(InputError, match=r"check the unit \(data.cloud.units of a scan"):
+        with pytest.raises(wr.InputError, match=r"check the unit \(data.cloud.units of a scan"):
             Cloud(wrong).around(SCANNER, MESH, CLAMP, 100)

@@ -9,12 +9,9 @@ import shapely
 import torch
 
 import warp_resphys as wr
-from warp_resphys.data.camera import Lens, PlacedCamera
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
-from warp_resphys.io.errors import InputError
-from warp_resphys.learning.identification.search import search_parameters
-from warp_resphys.learning.parameters import Bounds, Prior
-from warp_resphys.pictures.outlines import ClosedSurface, Outline
+from warp_resphys.learning import Bounds, Prior, search_parameters
+from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
 from warp_resphys.pictures.picture_misfit import PictureMisfit, values_of
 from warp_resphys.pictures.seen import Photo, SeenPose, distance_of
 
@@ -94,14 +91,14 @@ def test_parameters_come_back(seen, kind):
 
 def test_a_body_beside_the_picture_is_named():
     seen, _ = pose()
-    with pytest.raises(InputError, match="0 does not show the simulated body where it is drawn"):
+    with pytest.raises(wr.InputError, match="0 does not show the simulated body where it is drawn"):
         seen.difference(seen.photos[0], seen.shape(TRUTH), {"camera_shift_1": 0.5})
 
 
 def test_a_step_that_moves_the_body_out_of_the_picture_has_failed(seen):
     photo = replace(seen.photos[0], tracked=None)
     misfit = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(-0.6, 0.6)}, TRUTH)
-    with pytest.raises(InputError, match="does not show the simulated body"):
+    with pytest.raises(wr.InputError, match="does not show the simulated body"):
         misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5}))
     assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.003})) is not None
     assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5})) is None
@@ -115,11 +112,11 @@ def test_values_belong_to_all_to_a_material_or_to_a_pose(seen):
     values = {"a": 1.0, "a@soft": 2.0, "a@beam": 3.0, "b": 1.0, "b@soft": 2.0, "c@other": 5.0}
     assert values_of(own, values) == {"a": 3.0, "b": 2.0}
     assert values_of(own, {"a": 1.0, "a@left": 2.0, "a@right": 3.0}, "left") == {"a": 2.0}
-    with pytest.raises(InputError, match="nobody is neither a pose, a material nor a lens"):
+    with pytest.raises(wr.InputError, match="nobody is neither a pose, a material nor a lens"):
         PictureMisfit([own], {"youngs_modulus@nobody": RANGES["youngs_modulus"]})
-    with pytest.raises(InputError, match="no parameter 'colour' to identify: choose from"):
+    with pytest.raises(wr.InputError, match="no parameter 'colour' to identify: choose from"):
         PictureMisfit([own], {"colour": RANGES["youngs_modulus"]})
-    with pytest.raises(InputError, match="nothing to identify"):
+    with pytest.raises(wr.InputError, match="nothing to identify"):
         PictureMisfit([own], {})
     misfit = PictureMisfit([own], {"youngs_modulus@soft": RANGES["youngs_modulus"]}, TRUTH)
     assert misfit.linearise(misfit.to_unit({"youngs_modulus@soft": 1.2e5})).loss < 0.2
@@ -143,9 +140,9 @@ def test_a_turned_clamp_twists_the_body():
 
 
 def test_a_pose_has_pictures_and_places_of_its_points(seen):
-    with pytest.raises(InputError, match="has no picture"):
+    with pytest.raises(wr.InputError, match="has no picture"):
         replace(seen, photos=())
-    with pytest.raises(InputError, match="places on the body are not known"):
+    with pytest.raises(wr.InputError, match="places on the body are not known"):
         replace(seen, points=None)
 
 

@@ -9,14 +9,9 @@ import shapely
 import torch
 
 import warp_resphys as wr
-from warp_resphys.data.camera import Lens, PlacedCamera
-from warp_resphys.io.errors import InputError
 from warp_resphys.learning.parameters import Bounds, Prior
-from warp_resphys.pictures.clouds import Cloud
-from warp_resphys.pictures.outlines import ClosedSurface, Outline
-from warp_resphys.pictures.picture_misfit import PictureMisfit
+from warp_resphys.pictures import ClosedSurface, Cloud, Lens, Outline, Photo, PictureMisfit, PlacedCamera, SeenPose
 from warp_resphys.pictures.released_force import ReleasedForce, at_own_times
-from warp_resphys.pictures.seen import Photo, SeenPose
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1), nodes=20)
 LENS = Lens(torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
@@ -134,12 +129,12 @@ def test_derivatives_are_those_of_differences(kind, tolerance):
 
 
 def test_what_cannot_be_released_is_named(seen):
-    with pytest.raises(InputError, match="no vertex carries the force"):
+    with pytest.raises(wr.InputError, match="no vertex carries the force"):
         ReleasedForce(np.array([], dtype=int), (0.0, 0.0, 1.0))
-    with pytest.raises(InputError, match="give three numbers and a time"):
+    with pytest.raises(wr.InputError, match="give three numbers and a time"):
         ReleasedForce(TIP, (0.0, 0.0, math.nan))
     scan = Photo("scan", PlacedCamera(None, LOOKS, CAMERA.centre))
-    with pytest.raises(InputError, match="beam moves, and a scan shows no time"):
+    with pytest.raises(wr.InputError, match="beam moves, and a scan shows no time"):
         replace(seen, photos=(scan,))
-    with pytest.raises(InputError, match="no parameter 'clamp_turn' to identify"):
+    with pytest.raises(wr.InputError, match="no parameter 'clamp_turn' to identify"):
         PictureMisfit([seen], {"clamp_turn": Bounds(0.0, 1.0)})

@@ -8,11 +8,10 @@ import pytest
 from matplotlib.image import imread
 
 from support.made_up_run import TRACKED, arm_settings, sag
+from warp_resphys import box_hexahedra, select_vertices
 from warp_resphys.data.registration import register_markers
 from warp_resphys.experiment.build import shipped_arm
-from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.chambers import find_chambers
-from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.report import body_picture, render
 from warp_resphys.report.body_motions import ComparedMotion
 from warp_resphys.report.body_picture import NOMINAL, MeshSummary, mesh_picture, registration_picture

@@ -24,14 +24,12 @@ from support.made_up_run import (
     write_split,
 )
 from support.report_page import report
+from warp_resphys import DataFileError, Mesh, box_hexahedra
 from warp_resphys.experiment import report as stage
 from warp_resphys.experiment.report import RunReader, make_folds_report
-from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.resuming import StageContext
 from warp_resphys.io.safe_files import read_json, write_json
-from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.readers import write_mesh
-from warp_resphys.mesh.volume_mesh import Mesh
 from warp_resphys.report import run_page
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Simulator, box_hexahedra
-from warp_resphys.dynamics.trajectory import Motion
-from warp_resphys.io.errors import InputError
+from warp_resphys import Body, InputError, Motion, Simulator, State, box_hexahedra
 from warp_resphys.mesh.motion_files import input_columns, write_csv
 from warp_resphys.robot.actuation import InputReader, RobotInput
 from warp_resphys.stepping.quantity import Quantity
-from warp_resphys.stepping.state import State
 
 
 def moved(batch, **more):

@@ -7,15 +7,12 @@ import trimesh
 from matplotlib.image import imread
 
 from support.command_line import refusal, settings_of
-from warp_resphys.dynamics.simulator import Simulator
-from warp_resphys.energies.materials import Corotated
-from warp_resphys.fem.bodies import Body
+from warp_resphys import Body, Corotated, Simulator, box_hexahedra, box_tetrahedra, read_mesh
 from warp_resphys.io.errors import InputError, MeshError, ResphysWarning
+from warp_resphys.mesh import read_surfaces, write_mesh
 from warp_resphys.mesh.arm import ArmGeometry, mesh_arm, name_surfaces
-from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.chambers import open_cavities
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
-from warp_resphys.mesh.readers import read_mesh, read_surfaces, write_mesh
 from warp_resphys.mesh.volume_mesh import Mesh, boundary_faces, quadratic
 from warp_resphys.studies.inspection import Inspection, inspect, inspect_mesh
 

@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from warp_resphys.io.errors import InputError
-from warp_resphys.robot.loading import load, recorded_trial
+from warp_resphys import InputError, load, recorded_trial
 from warp_resphys.studies.live_twin import LiveTwin, TwinSettings, planned_packets
 from warp_resphys.studies.view import Page
 from warp_resphys.twin.stream import Packet

@@ -12,8 +12,7 @@ import pytest
 
 from support.browser import opened, until
 from support.main_job import end_of
-from warp_resphys import cli
-from warp_resphys.io.errors import InputError
+from warp_resphys import InputError, cli
 from warp_resphys.robot.loading import held_out_names, load
 from warp_resphys.studies.live import LiveRobot, range_of
 from warp_resphys.studies.view import Page

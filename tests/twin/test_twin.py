@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from warp_resphys import InputError, Twin, load
 from warp_resphys.control.controllers import conditioned
-from warp_resphys.io.errors import InputError
-from warp_resphys.robot.loading import load
 from warp_resphys.twin.estimator import adapted, distances
 from warp_resphys.twin.stream import Listener, recorded_packets
 from warp_resphys.twin.tangent import StepTangent, shifted
-from warp_resphys.twin.twin import Twin
 
 NOISE = 1e-4
 

@@ -5,12 +5,9 @@ import pytest
 import torch
 
 from support.configured import settings
-from warp_resphys.io.errors import InputError
-from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys import InputError, Robot, Twin, box_hexahedra
 from warp_resphys.robot.description import Description
-from warp_resphys.robot.robot import Robot
 from warp_resphys.settings.body import SimulatorSettings
-from warp_resphys.twin.twin import Twin
 
 NOISE = 1e-4  # m
 RADIUS, PLACE = 0.02, np.array([0.075, -0.0225])  # m: of the bar, its x and z

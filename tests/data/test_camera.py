@@ -8,15 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
-from warp_resphys.data.camera import (
-    CORRECTIONS,
-    CameraMarkers,
-    Lens,
-    PlacedCamera,
-    axes_from_below,
-    motion_axes,
-    path_axes,
-)
+from support.slopes import differences
+from warp_resphys.data.camera import CameraMarkers, Lens, PlacedCamera, axes_from_below, motion_axes, path_axes
 from warp_resphys.stepping.rotations import rotations
 
 X, Y, Z = np.eye(3)
@@ -120,10 +113,8 @@ def test_a_lens_is_read_and_distorts_as_opencv_does(tmp_path):
     expected = np.column_stack([900.0 * moved_x + 320.0, 910.0 * moved_y + 240.0])
     np.testing.assert_allclose(lens.pixels(points), expected, rtol=1e-12)
     rational = Lens(lens.matrix, torch.tensor([0.1, -0.2, 1e-3, -2e-3, 0.3, 0.5, 0.0, 0.0], dtype=torch.float64))
-    grown = (
-        rational.pixels(points)[0]
-        - Lens(lens.matrix, torch.tensor([0.0, 0.0, 1e-3, -2e-3], dtype=torch.float64)).pixels(points)[0]
-    )
+    tangential = Lens(lens.matrix, torch.tensor([0.0, 0.0, 1e-3, -2e-3], dtype=torch.float64))
+    grown = rational.pixels(points)[0] - tangential.pixels(points)[0]
     share = (radial / (1.0 + 0.5 * square) - 1.0)[0]
     np.testing.assert_allclose(grown, share * np.array([900.0 * x[0], 910.0 * y[0]]), rtol=1e-9)
 
@@ -182,10 +173,8 @@ def test_derivatives_by_motions_and_corrections_are_those_of_differences():
     for number in range(3):
         ends = [PLACED.pixels(POINTS + by * tangents[number], corrections) for by in (step, -step)]
         assert torch.allclose(slopes[number], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-5)
-    for number in range(len(CORRECTIONS)):
-        by = step * torch.eye(len(CORRECTIONS), dtype=torch.float64)[number]
-        ends = [PLACED.pixels(POINTS, corrections + sign * by) for sign in (1.0, -1.0)]
-        assert torch.allclose(slopes[3 + number], (ends[0] - ends[1]) / (2.0 * step), rtol=1e-6, atol=1e-5)
+    by_correction = differences(lambda own: PLACED.pixels(POINTS, torch.as_tensor(own)), corrections.numpy(), step)
+    assert torch.allclose(slopes[3:], torch.stack(by_correction), rtol=1e-6, atol=1e-5)
 
 
 def test_corrections_mean_what_their_names_say():
@@ -213,10 +202,12 @@ def test_located_points_are_those_that_are_seen():
     scanner = PlacedCamera(None, POSE, MIDDLE)
     for camera, own in ((PLACED, measured), (scanner, scanner.seen_from(POINTS, corrections))):
         assert torch.allclose(camera.located(own, corrections), POINTS, atol=1e-9)
-        slopes = camera.located_by(own, corrections)
-        for number, by in enumerate(1e-6 * torch.eye(len(CORRECTIONS), dtype=torch.float64)):
-            ends = [camera.located(own, corrections + sign * by) for sign in (1.0, -1.0)]
-            assert torch.allclose(slopes[number], (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-8)
+
+        def located(by, camera=camera, own=own):
+            return camera.located(own, torch.as_tensor(by))
+
+        slopes = differences(located, corrections.numpy(), 1e-6)
+        assert torch.allclose(camera.located_by(own, corrections), torch.stack(slopes), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("plane", [(X, Y), (X, -Y), (Y, X), (X, Z), (-Y, Z), (X, Y + Z)])

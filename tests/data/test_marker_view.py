@@ -79,13 +79,8 @@ def test_a_body_is_carried_with_its_markers(name):
 def test_a_hidden_marker_hides_the_shape_of_its_frame_alone():
     points = shaken()
     points[2, 1] = np.nan
-    assert np.isnan(VIEWS["own plane"].of_arrays(points)).all(axis=(1, 2)).tolist() == [
-        False,
-        False,
-        True,
-        False,
-        False,
-    ]
+    hidden = np.isnan(VIEWS["own plane"].of_arrays(points)).all(axis=(1, 2))
+    assert hidden.tolist() == [False, False, True, False, False]
     context = VIEWS["plane"].of_arrays(points)
     assert np.argwhere(np.isnan(context).all(axis=2)).tolist() == [[2, 1]]
     assert np.isnan(context).sum() == 3  # its depth neither

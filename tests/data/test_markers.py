@@ -117,9 +117,8 @@ def test_derivative_of_the_closest_rotation(spread):
     turn = torch.as_tensor(Rotation.random(2, random_state=3).as_matrix())
     matrix = turn[:1] @ torch.diag(torch.tensor(spread, dtype=turn.dtype)) @ turn[1:]
     torch.autograd.gradcheck(closest_rotation, matrix.requires_grad_(True))
-    np.testing.assert_allclose(
-        closest_rotation(matrix).detach() @ closest_rotation(matrix).detach().mT, np.eye(3)[None], atol=1e-12
-    )
+    closest = closest_rotation(matrix).detach()
+    np.testing.assert_allclose(closest @ closest.mT, np.eye(3)[None], atol=1e-12)
 
 
 def test_a_diverged_body_has_no_markers_and_does_not_affect_others():

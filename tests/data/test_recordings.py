@@ -190,9 +190,7 @@ def test_errors_of_tables_name_line_and_column(tmp_path, positions, line, change
 def test_times_that_are_too_close_are_refused(tmp_path, positions, stamps):
     path = write_table(tmp_path / "swing.csv", positions)
     for line, stamp in enumerate(stamps, start=2):
-        edit(
-            path, line, lambda text, stamp=stamp: f"{stamp!r}".removeprefix("np.float64(").removesuffix(")") + text[6:]
-        )
+        edit(path, line, lambda text, stamp=float(stamp): f"{stamp!r}{text[6:]}")
     with pytest.raises(DataFileError, match=r"a frame rate of inf|do not belong to one recording|does not rise"):
         read_recording(path)
 
@@ -205,14 +203,8 @@ def archive(path, positions, **changes):
 
 def test_numpy_archive(tmp_path, positions):
     pressure = np.ones((40, 2))
-    path = archive(
-        tmp_path / "swing.npz",
-        1e3 * positions,
-        units="mm",
-        actuation=pressure,
-        actuation_units="kPa",
-        rest=1e3 * positions[0],
-    )
+    more = {"units": "mm", "actuation": pressure, "actuation_units": "kPa", "rest": 1e3 * positions[0]}
+    path = archive(tmp_path / "swing.npz", 1e3 * positions, **more)
     recording = read_recording(path)
     np.testing.assert_allclose(recording.positions, positions)
     np.testing.assert_allclose(recording.actuation, 1e3 * pressure)

@@ -91,11 +91,7 @@ class TestRegisterMarkers:
     @pytest.mark.parametrize(
         ("points", "settings", "sentence"),
         [
-            (
-                measured(m1=[0.1, 0.0, 0.0]),
-                {"use": NAMES[:4]},  # of four, none can be left out
-                "'Tip - 2'",
-            ),
+            (measured(m1=[0.1, 0.0, 0.0]), {"use": NAMES[:4]}, "'Tip - 2'"),  # of four, none can be left out
             (measured(m1=[0.1, 0.0, 0.0], m4=[0.0, 0.05, 0.0], m5=[0.03, 0.0, 0.0]), {}, "'Tip - 2' is "),
             (measured(m3=[0.0, 0.03, 0.0]), {"use": BASE}, "mm off (all three: "),
             (
@@ -166,16 +162,15 @@ def shifted(axes, **moved):
 
 def test_known_axes_leave_a_shift_that_one_marker_determines():
     points, rotation = shifted(["x", "z", "-y"])
-    assert_allclose = np.testing.assert_allclose
     for use in (NAMES[3:4], BASE, None):
         result = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=use, rotation=rotation)
-        assert_allclose(result.positions, NOMINAL, atol=1e-12)
+        np.testing.assert_allclose(result.positions, NOMINAL, atol=1e-12)
         assert result.rms < 1e-12
         assert result.inliers.sum() == (len(NAMES) if use is None else len(use))
     off, rotation = shifted(["x", "z", "-y"], m3=[0.02, 0.0, 0.0], m0=[0.0, 0.001, 0.0])
     result = register_markers(off, NOMINAL, NAMES, source=SOURCE, rotation=rotation)
     assert result.outliers == ("Base - 1",)
-    assert_allclose(result.residual[[3]], 0.02, atol=3e-4)
+    np.testing.assert_allclose(result.residual[[3]], 0.02, atol=3e-4)
 
 
 def test_axes_that_do_not_fit():

@@ -5,12 +5,14 @@ import logging
 import pytest
 
 from support.configured import settings
+from warp_resphys import Simulator
 from warp_resphys.experiment import duration
 from warp_resphys.experiment.duration import announcement, work_of
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.splits import split_of
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.resuming import run_stages
+from warp_resphys.learning.residuals.reconstruction import LeastSquares
 from warp_resphys.pipeline import _announce, acquire, learning_stages
 
 TINY = ("mesh.divisions=[4,1,1]", "budget=quick", "data.steps=6", "trainer.epochs=40", "trainer.rollout_every=20")
@@ -90,7 +92,23 @@ def test_only_unfinished_stages_are_announced_and_an_estimate_that_fails_ends_no
     assert len(caplog.messages) == before
 
 
-def test_a_step_is_timed_and_a_reconstructed_one_takes_longer(data):
+def test_steps_and_reconstructed_ones_are_timed_by_the_clock(data, monkeypatch):
+    """By a clock on which the first step of each kind, which may compile kernels, takes 1.5 s and others less."""
+    clock, passed = [0.0], {False: [1.5, *[0.1] * 9], True: [1.5, *[0.4] * 9]}
+    monkeypatch.setattr(duration.time, "perf_counter", lambda: clock[0])
+
+    def timed(step, seconds):
+        def stepped(self, *arguments):
+            result = step(self, *arguments)
+            clock[0] += seconds.pop(0)
+            return result
+
+        return stepped
+
     (first, *_) = stages_of(data)
     experiment = Experiment(first.settings, data[0], "count")
-    assert 0.0 < duration.pace_of(experiment, False) < duration.pace_of(experiment, True)
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulator, "step", timed(Simulator.step, passed[False]))
+        assert duration.pace_of(experiment, False) == pytest.approx(0.1 / 5)  # of five trials at once
+    monkeypatch.setattr(LeastSquares, "step", timed(LeastSquares.step, passed[True]))
+    assert duration.pace_of(experiment, True) == pytest.approx(0.4 / 5)

@@ -2,6 +2,7 @@
 
 import copy
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.configured import check, settings
-from warp_resphys import DataFileError, InputError, Inputs
+from warp_resphys import DataFileError, InputError
 from warp_resphys.data.recordings.recording import Recording
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
-from warp_resphys.data.trials import Trials, payload_inputs
+from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_body
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH
@@ -53,18 +54,13 @@ def laboratory(tmp_path_factory):
     return folder, run
 
 
-def true_markers(played, setup, trials, times):
+def true_markers(played, setup, dataset, times):
     """(R, T, M, 3) tracked markers in the frame of the body at times (R, T) since the release, as simulated [m]."""
     simulator = laboratory_simulator(played, setup.gravity)
     read = bound_markers(played.binding, simulator.body.mesh, setup.tracked, TIPS).to(simulator.rest_positions)
-    masses = payload_inputs(simulator.body, played.payload_at, np.array([trial.payload for trial in trials]))
-    held = torch.as_tensor(setup.tracked).expand(len(trials), -1, -1)
-    blank = held[:, None].expand(-1, times.shape[1], -1, -1)
-    inputs = Inputs(attached_mass=torch.as_tensor(masses["attached_mass"]))
-    motions = TrialBatch(
-        tuple(trial.name for trial in trials), torch.as_tensor(times).clamp_min(0.0), blank, held, inputs
-    )
-    start = Start(simulator.rest_state(len(trials)), torch.zeros(len(trials), dtype=torch.float64))
+    motions = TrialBatch.of(dataset, dataset.names, simulator.body, played.payload_at, simulator.time_step)
+    motions = replace(motions, times=torch.as_tensor(times).clamp_min(0.0))
+    start = Start(simulator.rest_state(len(times)), torch.zeros(len(times), dtype=torch.float64))
     with torch.no_grad():
         return Replay(simulator, read, motions)(start)[0].numpy()
 
@@ -85,7 +81,7 @@ def test_simulated_markers_come_back_within_noise(laboratory):
     released = np.array(list(read_json(folder / TRUTH)["released_s"].values()))
     results = np.array([trial["release_frame"] for trial in read_json(folder / QUALITY).values()]) / RATE
     times = motions.times.numpy() + (results - released)[:, None]
-    true = true_markers(played, setup, trials_of(run), times)
+    true = true_markers(played, setup, dataset, times)
     # The nominal places turn the frame by a little; what has to come back is the motion in it.
     turn, _ = Rotation.align_vectors(bound - bound.mean(0), setup.tracked - setup.tracked.mean(0))
     assert np.degrees(turn.magnitude()) < 1.0
@@ -199,9 +195,8 @@ def test_a_trial_with_markers_of_its_own(shelf):
     whole = shelf.bring_in()
     away = np.array([0.0, 0.003, 0.0])
     shelf.move("load101", "Tip - 2", away)
-    shelf.config["markers"]["tracked"]["Tip - 4"] = (
-        np.array(shelf.config["markers"]["tracked"]["Tip - 2"]) + away
-    ).tolist()
+    tracked = shelf.config["markers"]["tracked"]
+    tracked["Tip - 4"] = (np.array(tracked["Tip - 2"]) + away).tolist()
     for name, own in {"bare": "Tip - 2", "load52": "Tip - 2", "load101": "Tip - 4"}.items():
         shelf.config["data"]["trials"][name]["labels"] = ["Tip - 1", own, "Tip - 3", *BASES]
     check(shelf.config)
@@ -218,10 +213,9 @@ def test_a_trial_with_markers_of_its_own(shelf):
     np.testing.assert_allclose(results["bound"][:3], whole["bound"], rtol=0.0, atol=2e-4)
     shelf.learned = ["bare", "load52", "load101"]
     mean = shelf.bring_in()["bound"]
-    assert (
-        np.abs(mean[[0, 2]] - results["bound"][[0, 2]]).max() > 1e-5
-    )  # that trial has a say where it is learned from, and
-    np.testing.assert_array_equal(mean[[1, 3]], results["bound"][[1, 3]])  # none on markers that it does not have
+    # That trial has a say where it is learned from, and none on markers that it does not have.
+    assert np.abs(mean[[0, 2]] - results["bound"][[0, 2]]).max() > 1e-5
+    np.testing.assert_array_equal(mean[[1, 3]], results["bound"][[1, 3]])
     apart = np.linalg.norm(results["bound"][3] - results["bound"][1])  # ``away`` is in the frame of the recording
     assert apart == pytest.approx(np.linalg.norm(away), abs=2e-4)
     swing, same = (data["observed"][2] - data["held"][2] for data in (results, whole))
@@ -379,9 +373,8 @@ def test_inputs_keep_their_time_at_steps_of_another_length(ratio, count):
     times = 0.01 * ratio * (np.arange(count) + 1.0)
     np.testing.assert_allclose(given["pressure"][:, 0, 0], ((times - 0.005 * ratio) / 0.01).astype(int))
     moved = given["fixed_positions"][:, 0] - torch.from_numpy(body.mesh.vertices[body.fixed_vertices])
-    np.testing.assert_allclose(
-        moved[..., 1].numpy(), np.broadcast_to(0.1 * times[:, None], moved.shape[:2]), atol=1e-15
-    )
+    expected = np.broadcast_to(0.1 * times[:, None], moved.shape[:2])
+    np.testing.assert_allclose(moved[..., 1].numpy(), expected, atol=1e-15)
 
 
 def test_recordings_of_different_rates_look_like_sessions():

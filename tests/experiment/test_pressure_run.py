@@ -52,26 +52,20 @@ def stage_of(finished, name, kind):
 
 
 def motions(folder):
-    """Names, markers and pressures of all trials, those at higher pressures last."""
-    results = []
-    for name in ("dataset.h5", "dataset_scaled.h5"):
-        with read_hdf5(folder / name, "dataset") as file:
-            names = [str(name) for name in file.attrs["names"]]
-            results.append((names, read_array(file, "observed"), read_array(file, "pressure")))
-    (a, b) = results
-    return a[0] + b[0], np.concatenate([a[1], b[1]]), np.concatenate([a[2], b[2]])
+    """All trials, those at higher pressures last."""
+    return Trials.read(folder / "dataset.h5").joined(Trials.read(folder / "dataset_scaled.h5"))
 
 
 def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(finished):
     assert {path.stem for path in (finished / "stages").glob("*.json")} == STAGES
     assert not list(finished.glob("*_parts"))
     results = read_json(finished / "metrics.json")
-    names, observed, _ = motions(finished)
+    names, observed = (trials := motions(finished)).names, trials.observed
     with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
         tested = [str(name) for name in file.attrs["names"]]
         markers = {model: read_array(file, f"{model}_observed") for model in results["errors_mm"]}
-    assert names == ["t000", "t001", "t002", "t003", "t003_x1.5"]
-    assert tested == names[3:]
+    assert [*names] == ["t000", "t001", "t002", "t003", "t003_x1.5"]
+    assert tested == [*names[3:]]
     for model, x in markers.items():
         for row, factor in enumerate(("1", "1.5")):
             expected = 1e3 * np.linalg.norm(x[row] - observed[3 + row], axis=-1).mean()
@@ -91,10 +85,9 @@ def test_recordings_are_seen_by_cameras_and_registered_back(finished):
     assert (truth["material"]["mass_damping"], truth["material"]["fibre_stiffness"]) == (0.5, 1e4)
     recording = read_recording(finished / "recordings" / "t000.h5")
     assert np.linalg.norm(recording.positions[0, 0] - truth["bound"]["T1"]) > 0.01
-    _, _, pressure = motions(finished)
-    with read_hdf5(finished / "dataset.h5", "dataset") as file:
-        bound = read_array(file, "bound")
-    np.testing.assert_allclose(bound, np.array(list(truth["bound"].values())), atol=1e-3)
+    trials = motions(finished)
+    pressure = trials.inputs["pressure"]
+    np.testing.assert_allclose(trials.bound, np.array(list(truth["bound"].values())), atol=1e-3)
     assert 0.0 < pressure[:4].max() <= 20e3
     np.testing.assert_allclose(pressure[4], 1.5 * pressure[3])
     np.testing.assert_allclose(pressure[0], recording.actuation[1:])

@@ -110,9 +110,7 @@ class TestCompleteRun:
             assert (str(file.attrs["film_trial"]), file.attrs["time_step"]) == ("m50", 0.01)
             np.testing.assert_array_equal(file["film_steps"], np.arange(len(file["film_steps"])))
             fall = file["sysid_film"][2, -1, 2] - file["sysid_film"][0, -1, 2]
-        assert fall == pytest.approx(
-            -0.5 * 9.80709 * 0.02**2, rel=0.15
-        )  # freely at first; by half steps, kept at whole
+        assert fall == pytest.approx(-0.5 * 9.80709 * 0.02**2, rel=0.15)  # freely at first; by half steps
         assert films == {(12, 20, 3)}  # the whole steps of 0.01 s up to the last frame, which comes before 0.12 s
 
     def test_training_begins_without_a_force_and_descends(self, finished):
@@ -171,9 +169,8 @@ def test_folds(finished, tmp_path):
         assert read_json(folder / "metrics.json") == fold
         split = read_json(folder / "stages" / "train_resphys.json")["settings"]["split"]
         assert trial not in split["train"] + split["validation"]
-    assert all(
-        (run / place / "report.html").is_file() for place in (".", *(f"fold_{name}" for name in results["folds"]))
-    )
+    places = (".", *(f"fold_{name}" for name in results["folds"]))
+    assert all((run / place / "report.html").is_file() for place in places)
     shown = read_json(run / "stages" / "report.json")["settings"]
     assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in results["folds"].items()}
 

@@ -35,12 +35,6 @@ def error(model, trials, asked):
     return np.abs(predictions(trials, asked)[model].values - asked.values).max()
 
 
-def test_a_body_at_rest_does_not_move_from_its_own_origin():
-    asked = motions(np.ones((2, 5, 3)), origin=np.arange(6.0).reshape(2, 3))
-    values = predictions(motions(np.ones((1, 5, 3))), asked)["rest"].values
-    np.testing.assert_array_equal(values, np.broadcast_to(asked.origin[:, None], (2, 5, 3)))
-
-
 def test_between_two_levels_interpolation_is_a_straight_line_and_below_them_one_to_the_origin():
     trials = steps([1.0, 2.0, 4.0], np.square)
     assert error("interpolation", trials, steps([1.0, 2.0, 4.0], np.square)) < 1e-6

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from support.swinging_beam import MARKERS, MESH, TIP, blank, double
+from support.slopes import differences
+from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
 from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.search import first_points, search_parameters
@@ -23,16 +24,10 @@ def simulator(kind=Simulator, **options):
     return kind(Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01, integrator="bdf2", **options)
 
 
-def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0, seed=0):
+def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0):
     """Motions from rest under gravity with the true parameters, and their beginning."""
-    count, motions = len(masses), blank(frames, masses)
-    release = Start(sim.rest_state(count), torch.zeros(count, dtype=torch.float64))
-    with torch.no_grad():
-        markers = Replay(sim, MARKERS, motions)(release, {name: double([value]) for name, value in truth.items()})[0]
-    markers = markers + noise * torch.randn(
-        markers.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
-    )
-    return Replay(sim, MARKERS, replace(motions, observed=markers)), release
+    release = Start(sim.rest_state(len(masses)), torch.zeros(len(masses), dtype=torch.float64))
+    return simulated(Replay(sim, MARKERS, blank(frames, masses)), release, truth, noise=noise), release
 
 
 def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
@@ -138,12 +133,9 @@ def test_bounds_there_and_back(bounds):
 
 def resting_pose(sim):
     """A pose under a weight with the true parameters, and its beginning."""
-    still = blank(frames=1, masses=(0.1,))
-    start = Start.resting(sim.rest_positions[None])
-    assert Replay(sim, MARKERS, still).is_static
-    with torch.no_grad():
-        seen = Replay(sim, MARKERS, still)(start, {name: double([value]) for name, value in TRUTH.items()})[0]
-    return Replay(sim, MARKERS, replace(still, observed=seen)), start
+    still, start = Replay(sim, MARKERS, blank(frames=1, masses=(0.1,))), Start.resting(sim.rest_positions[None])
+    assert still.is_static
+    return simulated(still, start, TRUTH), start
 
 
 def test_stiffness_and_damping_are_identified_from_poses_and_motions():
@@ -169,13 +161,10 @@ def late(observe=MARKERS, noise=1e-5):
     force[BEGIN:, :, TIP, 1] = 0.02  # N
     motions = replace(blank(FRAMES, (0.0,) * count), inputs=Inputs(force))
     start = Start.resting(sim.rest_state(count).q)
-    with torch.no_grad():
-        delayed = replace(start, delay=double(DELAYS))
-        seen = Replay(sim, observe, motions)(delayed, {name: double([value]) for name, value in DAMPED.items()})[0]
-    random = torch.Generator().manual_seed(1)
-    seen = seen + noise * torch.randn(seen.shape, generator=random, dtype=torch.float64)
-    seen[1, 20:25, 0] = torch.nan
-    return Replay(sim, MARKERS, replace(motions, observed=seen)), start
+    delayed = replace(start, delay=double(DELAYS))
+    replay = simulated(Replay(sim, MARKERS, motions), delayed, DAMPED, observe, noise, seed=1)
+    replay.trials.observed[1, 20:25, 0] = torch.nan
+    return replay, start
 
 
 @pytest.mark.parametrize("placed", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -201,9 +190,8 @@ def test_derivatives_are_those_of_the_loss_with_the_best_delays_and_priors(accur
     for _ in range(2):
         misfit.update_prior_weight(unit)
     linear = misfit.linearise(unit)
-    for column, step in enumerate(1e-4 * np.eye(3)):
-        ends = [misfit.linearise(unit + sign * step, derivatives=False).loss for sign in (1.0, -1.0)]
-        assert linear.gradient[column] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-3), column
+    slopes = differences(lambda x: misfit.linearise(x, derivatives=False).loss, unit, 1e-4)
+    assert linear.gradient == pytest.approx(np.array(slopes), rel=1e-3)
     assert misfit.losses_or_infinite(unit[None])[0] == pytest.approx(linear.loss, rel=1e-9)
     step, matrix = np.array([1.0, -1.0, 0.5]), linear.gauss_newton
     np.testing.assert_allclose(matrix, matrix.T)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.swinging_beam import double, simulated
 from warp_resphys import Body, ConvergenceError, Corotated, Inputs, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import WHOLE_STATE, bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
@@ -30,12 +31,9 @@ NETWORK = NetworkSettings(**MODES, layers=0, width=8)
 CONFIG = InTheLoopSettings(epochs=4, penalty=1e-3, memory=5)
 
 
-def simulator():
-    return Simulator(Body(MESH, select_vertices(MESH, x=0.0)), time_step=STEP, relative_tolerance=1e-12)
-
-
-def tensor(*rows):
-    return torch.tensor(rows, dtype=torch.float64)
+def simulator(**options):
+    body = Body(MESH, select_vertices(MESH, x=0.0))
+    return Simulator(body, time_step=STEP, relative_tolerance=1e-12, **options)
 
 
 def motions_of(times, markers, held=None):
@@ -78,7 +76,7 @@ class TestAtSteps:
         assert np.isnan(result[:, 1]).all()  # three sights with that at the release: too few for a cubic
 
     def test_a_late_release_is_time_zero(self):
-        result = at_steps(self.seen(), STEP, delay=tensor(0.002)[0][None])[0]
+        result = at_steps(self.seen(), STEP, delay=double([0.002]))[0]
         np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
 
 
@@ -89,9 +87,7 @@ def observed_motions(frames=8):
     blank = motions_of(times, torch.as_tensor(POINTS).repeat(2, frames, 1, 1))
     rest = sim.rest_state(2)
     release = Start(State(rest.q, rest.v), torch.zeros(2, dtype=torch.float64))
-    with torch.no_grad():
-        markers = Replay(sim, MARKERS, blank)(release, {"youngs_modulus": tensor(180e3)[0][None]})[0]
-    return motions_of(times, markers), release
+    return simulated(Replay(sim, MARKERS, blank), release, {"youngs_modulus": 180e3}).trials, release
 
 
 @pytest.fixture(scope="module")
@@ -181,10 +177,8 @@ class TestInTheLoop:
     def test_cross_validation_selects_the_number_of_epochs(self, loss):
         """Here the held-out motions are those of training, there such as the simulator makes without a force."""
         motions, release = observed_motions()
-        sim = simulator()
-        with torch.no_grad():
-            exact = Replay(sim, MARKERS, motions)(release)[0]
-        other = MotionLoss([TrialGroup(Replay(sim, MARKERS, motions_of(motions.times, exact)), release, LOADS)], {})
+        exact = simulated(Replay(simulator(), MARKERS, motions), release)
+        other = MotionLoss([TrialGroup(exact, release, LOADS)], {})
         config, seen = CONFIG.changed(epochs=3), []
         assert cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
         assert len(seen) == 3
@@ -227,13 +221,7 @@ class TestWindows:
 
     def released(self, integrator, material=MATERIAL):
         """Two trials of the beam under tip loads of which it is released, whose states are known, and their start."""
-        real = Simulator(
-            Body(MESH, select_vertices(MESH, x=0.0)),
-            material,
-            time_step=STEP,
-            integrator=integrator,
-            relative_tolerance=1e-12,
-        )
+        real = simulator(material=material, integrator=integrator)
         load = torch.zeros(2, len(MESH.vertices), 3, dtype=torch.float64)
         load[:, TIP] = torch.tensor([[[0.0, 0.0, -0.02]], [[0.0, 0.01, 0.01]]], dtype=torch.float64)
         result = real.rollout(real.static_equilibrium(Inputs(load)), self.STEPS)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.swinging_beam import simulated
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, Tendons, box_hexahedra, select_vertices
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.errors import ConvergenceError
@@ -49,10 +50,7 @@ def replayed(frames, kind=Simulator, energies=(), static=False, **options):
     blank = TrialBatch(("a", "b"), times, held[:, None].repeat(1, frames, 1, 1), held, at, at if static else Inputs())
     replay = Replay(sim, WHOLE_STATE, blank)
     start = Start.resting(held.clone())
-    with torch.no_grad():
-        seen = replay(start, {name: torch.tensor([value]).double() for name, value in VALUES.items()})[0]
-    seen = seen + 1e-4 * torch.randn(seen.shape, generator=torch.Generator().manual_seed(0)).double()
-    return Replay(sim, replay.observe, replace(blank, observed=seen)), start
+    return simulated(replay, start, VALUES, noise=1e-4), start
 
 
 @pytest.mark.parametrize(
@@ -71,23 +69,6 @@ def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(stat
     wanted = alone[1:] - alone[0]
     torch.testing.assert_close(varied[0], alone[0], rtol=0.0, atol=1e-10)
     torch.testing.assert_close(varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max()))
-
-
-def test_the_error_of_a_prediction_is_of_second_order():
-    misfit = Misfit([replayed(10)], RANGES)
-    unit, direction = np.array([0.5, 0.5]), np.array([0.7, -0.7])
-    misfit.linearise(unit)
-    motion, tensor = misfit._motions[0], misfit.simulator.tensor
-    predicted = [motion.predict(tensor(unit + size * direction), 9) for size in (0.0, 0.05, 0.025)]
-    errors = []
-    for size, guess in zip((0.0, 0.05, 0.025), predicted, strict=True):
-        other = Misfit([replayed(10)], RANGES)
-        other.linearise(unit + size * direction, derivatives=False)
-        errors.append(float((other._motions[0].states(tensor(unit + size * direction))[-1].q - guess).norm()))
-    assert errors[0] < 1e-9
-    assert 3.0 < errors[1] / errors[2] < 5.0
-    assert errors[1] < 0.2 * float((predicted[1] - predicted[0]).norm())
-    assert motion.predict(tensor(unit), 10) is None
 
 
 def test_predicted_motions_take_fewer_iterations_and_have_the_same_derivatives():

@@ -9,6 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.regions import beam
+from support.slopes import differences
+from support.swinging_beam import double, simulated
 from warp_resphys import Body, Corotated, InputError, Inputs, Rigid, Simulator, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, MarkerMap, bind_markers, follow_vertices
 from warp_resphys.data.rigid_bodies import angles, arms
@@ -120,11 +122,7 @@ TRUTH = {"youngs_modulus": 215e3}
 RANGES = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}
 
 
-def one(value):
-    return torch.tensor([value], dtype=torch.float64)
-
-
-def posed(observe, noise=0.0, seed=0, truth=TRUTH):
+def posed(observe, noise=0.0, truth=TRUTH):
     """A replay of poses with nominal markers, of measurements by other markers."""
     attached = torch.zeros(len(WEIGHTS), len(REST), dtype=torch.float64)
     for row, weights in enumerate(WEIGHTS):
@@ -135,10 +133,7 @@ def posed(observe, noise=0.0, seed=0, truth=TRUTH):
     names, inputs = tuple(f"w{i}" for i in range(count)), Inputs(attached_mass=attached)
     blank = TrialBatch(names, torch.zeros(count, 1).double(), held[:, None], held, inputs)
     start = Start.resting(REST.expand(count, -1, -1))
-    with torch.no_grad():
-        seen = Replay(SIM, observe, blank)(start, {name: one(value) for name, value in truth.items()})[0]
-    seen = seen + noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(seed), dtype=seen.dtype)
-    return Replay(SIM, bind(), replace(blank, observed=seen)), start
+    return simulated(Replay(SIM, bind(), blank), start, truth, observe, noise), start
 
 
 ACCURACY = Accuracy(2e-3, 2e-3, 0.03, centre=CENTRE.tolist())
@@ -153,7 +148,7 @@ def test_the_modulus_is_recovered_from_misplaced_markers():
     assert abs(naive.parameters["youngs_modulus"] - 215e3) > 3.0 * abs(result.parameters["youngs_modulus"] - 215e3)
     assert result.placement["offsets"].keys() == set(LABELS)
     placed = PlacedMarkers.of(bind(), Placement.from_plain(result.placement, LABELS))
-    q = SIM.static_equilibrium(pair[0].trials.inputs, {name: one(x) for name, x in TRUTH.items()}).q
+    q = SIM.static_equilibrium(pair[0].trials.inputs, {name: double([x]) for name, x in TRUTH.items()}).q
     off = (placed(q) - PlacedMarkers.of(bind(), ASKEW)(q)).norm(dim=-1)
     assert float(off.max()) < 2e-4  # where the recording shows them, though frame and offsets are not distinguishable
     deviation = result.uncertainty.deviation["youngs_modulus"]
@@ -162,20 +157,17 @@ def test_the_modulus_is_recovered_from_misplaced_markers():
 
 def test_a_prior_determines_what_poses_do_not():
     """Weight against stiffness: poses under no other load than the body's own tell their ratio alone."""
-    ranges = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True), "density": Bounds(800.0, 1600.0)}
-    prior = replace(ranges["density"], prior=Prior(1200.0, 40.0))
+    ranges = {**RANGES, "density": Bounds(800.0, 1600.0, prior=Prior(1200.0, 40.0))}
     still, start = posed(bind(), noise=1e-5, truth={"youngs_modulus": 215e3, "density": 1070.0})
     own = still.trials.select([0])
     pair = Replay(SIM, bind(), own), start.select([0])
-    result = search_parameters(
-        Misfit([pair], {**ranges, "density": prior}), [{"youngs_modulus": 3e5, "density": 1000.0}], 30
+    result, apart = (
+        search_parameters(Misfit([seen], ranges), [{"youngs_modulus": 3e5, "density": 1000.0}], 30)
+        for seen in (pair, (still, start))
     )
     assert result.parameters["density"] == pytest.approx(1200.0, abs=4.0)
     assert result.parameters["youngs_modulus"] / 215e3 == pytest.approx(1200.0 / 1070.0, rel=0.01)
     assert result.uncertainty.deviation["density"] == pytest.approx(40.0, rel=0.1)
-    apart = search_parameters(
-        Misfit([(still, start)], {**ranges, "density": prior}), [{"youngs_modulus": 3e5, "density": 1e3}], 30
-    )
     assert apart.parameters["density"] == pytest.approx(1070.0, rel=0.02)  # the weights tell
     assert apart.uncertainty.deviation["density"] < 20.0
 
@@ -204,11 +196,8 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
     draw, places = np.random.default_rng(0), seen.mean(axis=2, keepdims=True)
     shaken = Rotation.from_rotvec(2e-3 * draw.normal(size=(count, 3))).as_matrix()[:, None]
     noisy = places + 1e-4 * draw.normal(size=places.shape) + (seen - places) @ shaken
-    pair = (
-        Replay(simulator, follow_vertices(mesh, cap, nominal), replace(blank, observed=torch.as_tensor(noisy))),
-        start,
-    )
-
+    seen = replace(blank, observed=torch.as_tensor(noisy))
+    pair = Replay(simulator, follow_vertices(mesh, cap, nominal), seen), start
     ranges, guess = {"beam_youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}, [{"beam_youngs_modulus": 4e5}]
     bodies = ((0, nominal - middle),)
     accuracy = Accuracy(markers=2e-3, mounting=0.03, rigid_bodies=bodies, centre=CENTRE.tolist())
@@ -217,9 +206,8 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
     off, plain = (abs(x.parameters["beam_youngs_modulus"] / 215e3 - 1.0) for x in (result, naive))
     assert off < 0.03
     assert plain > 3.0 * off
-    halved = search_parameters(
-        Misfit([pair], ranges, shares=[0.5] * 4), guess, 30
-    )  # Six of twelve coordinates are independent.
+    # Six of twelve coordinates are independent.
+    halved = search_parameters(Misfit([pair], ranges, shares=[0.5] * 4), guess, 30)
     wider, narrow = (x.uncertainty.deviation["beam_youngs_modulus"] for x in (halved, naive))
     assert wider / narrow == pytest.approx(math.sqrt(2.0 * (1.0 - 1.0 / 36.0) / (1.0 - 1.0 / 18.0)), rel=1e-3)
     places = nominal + Placement.from_plain(result.placement, LABELS).offsets.numpy()
@@ -243,11 +231,8 @@ def gained():
     """A replay of poses whose weights were off by `GAINS`."""
     replay, start = posed(PlacedMarkers.of(bind(), ASKEW), noise=1e-5)
     gains = torch.tensor(GAINS).double()[:, None]
-    return Replay(
-        SIM,
-        replay.observe,
-        replace(replay.trials, inputs=Inputs(attached_mass=replay.trials.inputs.attached_mass / gains)),
-    ), start
+    logged = Inputs(attached_mass=replay.trials.inputs.attached_mass / gains)
+    return Replay(SIM, replay.observe, replace(replay.trials, inputs=logged)), start
 
 
 @pytest.mark.parametrize("sessions", [1, 2])
@@ -262,21 +247,18 @@ def test_derivatives_by_the_values_of_trials_are_those_of_the_loss(sessions):
     unit = np.array([0.45, 0.4, 0.6, 0.55, 0.3])
     misfit.update_prior_weight(unit)
     misfit.update_prior_weight(unit)
-    gradient = misfit.linearise(unit).gradient
-    for column in range(len(unit)):
-        step = 1e-4 * np.eye(len(unit))[column]
-        ends = [misfit.linearise(unit + sign * step, derivatives=False).loss for sign in (1.0, -1.0)]
-        assert gradient[column] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=2e-4), column
+    slopes = differences(lambda x: misfit.linearise(x, derivatives=False).loss, unit, 1e-4)
+    assert misfit.linearise(unit).gradient == pytest.approx(np.array(slopes), rel=2e-4)
 
 
 def test_a_value_of_a_trial_needs_a_common_one():
     replay, _ = posed(bind())
     with pytest.raises(InputError, match="give attached_mass_factor, that of the others, too"):
-        replay.prepare({"attached_mass_factor@w1": one(1.1)})
+        replay.prepare({"attached_mass_factor@w1": double([1.1])})
     with pytest.raises(InputError, match="no parameter 'nothing' to identify"):
-        replay.prepare({"nothing@w1": one(1.1)})
-    both = {"attached_mass_factor": one(1.0), "attached_mass_factor@w1": one(1.5), "attached_mass_factor@x": one(9.0)}
-    _, inputs, _ = replay.prepare(both)
+        replay.prepare({"nothing@w1": double([1.1])})
+    both = {"attached_mass_factor": 1.0, "attached_mass_factor@w1": 1.5, "attached_mass_factor@x": 9.0}
+    _, inputs, _ = replay.prepare({name: double([value]) for name, value in both.items()})
     expected = replay.trials.inputs.attached_mass.clone()
     expected[1] *= 1.5
     torch.testing.assert_close(inputs.attached_mass, expected)

@@ -10,7 +10,7 @@ from warp_resphys.data.markers import KINDS, WHOLE_STATE, MarkerMap, bind_marker
 from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
-from warp_resphys.learning.residuals.reconstruction import make_reconstructor
+from warp_resphys.learning.residuals.reconstruction import follow, make_reconstructor
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
@@ -47,10 +47,7 @@ OBSERVED |= {kind: bind_markers(MESH, STEMS, "abc", kind=kind, vertices=TIP, pat
 
 def reconstruct(solver, start, observed):
     """All steps; states and forces stacked."""
-    state, results = start, []
-    for target in observed[1:]:
-        results.append(solver.step(state, solver.observation(target)))
-        state = results[-1].state
+    results = list(follow(solver, start, [solver.observation(target) for target in observed[1:]]))
     return torch.stack([r.state.q for r in results]), torch.stack([r.force for r in results])
 
 
@@ -181,9 +178,8 @@ def test_the_published_method_finds_the_same_minimum(name, integrator, regularis
     )
 
     def objective(t, q, force):
-        return float(
-            (markers(q[t]) - markers(observed[t + 1])).square().sum() + regularisation * force[t].square().sum()
-        )
+        missed = markers(q[t]) - markers(observed[t + 1])
+        return float(missed.square().sum() + regularisation * force[t].square().sum())
 
     for t in range(len(q)):
         assert objective(t, q, force) <= objective(t, q_other, force_other) * (1.0 + (1e-5 if t else 1e-9))
@@ -217,10 +213,8 @@ class TestLevenbergMarquardt:
     def test_gauss_newton_finds_the_same_minimum(self, integrator, modes):
         """With stems that turn, and with a marker that one of the environments did not see."""
         observed, start = observation(3, (0.1, 0.5), integrator=integrator)
-        sim, markers = (
-            simulator(integrator=integrator),
-            bind_markers(MESH, STEMS[::2], "ab", kind="rigid", vertices=TIP),
-        )
+        sim = simulator(integrator=integrator)
+        markers = bind_markers(MESH, STEMS[::2], "ab", kind="rigid", vertices=TIP)
         states, first = [start, start], None
         for target in observed[1:]:
             seen = markers(target)

@@ -116,11 +116,8 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
     scale = double([1e5, 1e-3, 1000.0, 1.0, 0.01, 1.0, 1.0, 1.0])
 
     def losses(values):
-        return (
-            replay.errors(replay(release, dict(zip(replay.parameter_names, values.mT, strict=True))))
-            .square()
-            .sum((1, 2, 3, 4))
-        )
+        errors = replay.errors(replay(release, dict(zip(replay.parameter_names, values.mT, strict=True))))
+        return errors.square().sum((1, 2, 3, 4))
 
     x = at[None].clone().requires_grad_()
     (gradient,) = torch.autograd.grad(losses(x).sum(), x)

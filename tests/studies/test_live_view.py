@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from support.browser import opened, until
-from support.main_job import end_of
-from warp_resphys import InputError, cli
+from support.command_line import outcome, refusal, sentence
+from warp_resphys import InputError
 from warp_resphys.robot.loading import held_out_names, load
 from warp_resphys.studies.live import LiveRobot, range_of
 from warp_resphys.studies.view import Page
@@ -95,24 +95,17 @@ def test_a_softer_body_hangs_lower_and_comes_back(live):
     ],
 )
 def test_what_cannot_be_viewed_is_said(finished, folder, change, said):
-    code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", *change)
-    assert code == 2
-    assert err.startswith("error: ")
-    assert said in err
+    assert said in sentence("view", f"run={finished[0]}", "port=0", *change)
 
 
 def test_a_port_in_use_and_a_missing_package_are_said(finished, folder, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", f"port={port}")
-    assert code == 2
-    assert err.startswith(f"error: port {port} of 127.0.0.1 cannot be used (Address already in use): choose another")
+        said = refusal("view", f"run={finished[0]}", f"port={port}")
+    assert said.startswith(f"error: port {port} of 127.0.0.1 cannot be used (Address already in use): choose another")
     monkeypatch.setitem(sys.modules, "viser", None)
-    code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0")
-    assert (code, err.splitlines()[-1]) == (
-        2,
-        "error: the viewer needs a package that is not installed: pip install 'warp-resphys[view]'.",
-    )
+    said = refusal("view", f"run={finished[0]}", "port=0").splitlines()[-1]
+    assert said == "error: the viewer needs a package that is not installed: pip install 'warp-resphys[view]'."
 
 
 def test_a_command_serves_it(finished, folder, monkeypatch):
@@ -125,8 +118,8 @@ def test_a_command_serves_it(finished, folder, monkeypatch):
 
     monkeypatch.setattr("warp_resphys.studies.view.show", show)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", "seconds=1", "trial=150 g")
-    assert code == 0, err
+    done = outcome("view", f"run={finished[0]}", "port=0", "seconds=1", "trial=150 g")
+    assert done.code == 0, done.err
     assert len(pages) == 1
     assert b"<html" in pages[0].lower()
 
@@ -136,8 +129,8 @@ def test_the_first_view_is_a_trial_that_nothing_was_learned_from(finished, folde
     played = []
     monkeypatch.setattr(LiveRobot, "play_trial", lambda self, name: played.append(name))
     for trial in ([], ["trial=hand"]):
-        code, err = end_of(cli.main, "warp-resphys", "view", f"run={finished[0]}", "port=0", "seconds=0.1", *trial)
-        assert code == 0, err
+        done = outcome("view", f"run={finished[0]}", "port=0", "seconds=0.1", *trial)
+        assert done.code == 0, done.err
     assert played == [held_out_names(load(finished[0]), moving=True)[0], None]
 
 

@@ -57,6 +57,14 @@ def refusal(*arguments: object) -> str:
     return refused.err
 
 
+def sentence(*arguments: object) -> str:
+    """The refusal, of a single line."""
+    refused = refusal(*arguments)
+    assert refused.startswith("error: ")
+    assert refused.count("\n") == 1
+    return refused
+
+
 def settings_of(settings: type[S], name: str, *overrides: str) -> S:
     """A configuration of the package, parsed into its class."""
     return parse(settings, composed(name, overrides))

@@ -1,5 +1,6 @@
 """Gradients beside differences."""
 
+import numpy as np
 import torch
 
 
@@ -34,3 +35,8 @@ def check_rows(rows, *names, bound=1e-6):
     assert {*names} <= found.keys()
     assert {name: row.relative_error for name, row in found.items() if not row.relative_error <= bound} == {}
     return found
+
+
+def differences(function, x, step):
+    """Central differences of a function by every entry of an array (K,), one for each."""
+    return [(function(x + change) - function(x - change)) / (2.0 * step) for change in step * np.eye(len(x))]

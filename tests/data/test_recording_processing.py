@@ -214,9 +214,11 @@ def test_base_markers_that_were_moved():
     compare_base([first, bumped], BASE, 5e-3)
     with pytest.raises(InputError, match="two or more"):
         compare_base([first, moved], BASE[:1])
+    assert [len(of_others) for of_others in compare_base([first], BASE, 1e-3)] == [0, 0]
     bumped.positions[:, 3] = np.nan
-    with pytest.raises(DataFileError, match="'base 2' is never seen"):
-        compare_base([first, bumped], BASE)
+    for recordings in ([first, bumped], [bumped]):
+        with pytest.raises(DataFileError, match="'base 2' is never seen"):
+            compare_base(recordings, BASE)
 
 
 @pytest.mark.parametrize("release", [60.0, 60.5])

@@ -47,19 +47,12 @@ def check_mesh(context: StageContext) -> None:
         shown, observed = list[FloatArray](), np.empty(0)
         with Progress(context.name, 2, "meshes") as progress, torch.no_grad():
             for experiment in experiments:
-                replay = experiment.motions.replay(
-                    experiment.model_simulator(model), names, experiment.identified(model)
-                )
+                motions, identified = experiment.motions, experiment.identified(model)
+                replay = motions.replay(experiment.model_simulator(model), names, identified)
                 if moving:
                     seconds = first_change(experiment.trials, names[0]) + CHECKED_SECONDS
                     replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
-                points = (
-                    replay(
-                        experiment.motions.start(replay, experiment.identified(model)), experiment.parameters(model)
-                    )[0]
-                    .cpu()
-                    .numpy()
-                )
+                points = replay(motions.start(replay, identified), experiment.parameters(model))[0].cpu().numpy()
                 shown.append(as_markers(points, experiment.trials.labels))
                 observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.trials.labels)
                 progress.advance()

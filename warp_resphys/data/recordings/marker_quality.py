@@ -275,7 +275,7 @@ def compare_base(
                 "cameras' frame was moved; register each recording by itself, or raise the limit of "
                 f"{_MILLI * largest_shift:g} mm."
             )
-    return np.stack(shifts[1:]), np.stack(distortions[1:])
+    return np.stack(shifts)[1:], np.stack(distortions)[1:]
 
 
 def check_motion(recording: Recording, labels: Sequence[str]) -> None:

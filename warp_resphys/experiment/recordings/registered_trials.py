@@ -117,9 +117,8 @@ class RegisteredTrials(Reader):
         for trial, recording, release in zip(self.trials, self.measured, self.releases, strict=True):
             frames = (None,) if self._base_motion(trial) is None else (self._rest_frames(recording),)
             sessions[trial.session].append(recording.frames(slice(*(frames if release is None else release.rest))))
-        for still in sessions.values():
-            if len(reference) > 1 and len(still) > 1:
-                compare_base(still, reference, self.markers.largest_distortion, self.markers.largest_shift)
+        for still in sessions.values() if len(reference) > 1 else ():
+            compare_base(still, reference, self.markers.largest_distortion, self.markers.largest_shift)
 
     def _rest_frames(self, recording: Recording) -> int:
         return max(round(self.data.rest_seconds * recording.rate), 1)
@@ -264,17 +263,13 @@ class RegisteredTrials(Reader):
         Recorded motions of obstacles take precedence over given ones.
         """
         trial, moving, whole, release = self.trials[row], self.moving[row], self.measured[row], self.releases[row]
-        frame, motion, folder, base = (
-            self.registrations[row].transform,
-            self._base_motion(trial),
-            self.data.folder,
-            None,
-        )
+        frame, motion = self.registrations[row].transform, self._base_motion(trial)
+        folder, base = self.data.folder or ".", None
         if release is not None:
             first = int(np.ceil(release.frame))
             whole = whole.frames(slice(first, first + len(moving.positions)))
         if isinstance(motion, MotionSettings):
-            base = prescribed(motion, moving.time, folder or ".")
+            base = prescribed(motion, moving.time, folder)
         elif motion == "reference":
             count = len(moving.labels)
             base = in_frame(followed(whole.positions[:, count:], self.rests[row][count:], whole.source), frame)
@@ -285,7 +280,7 @@ class RegisteredTrials(Reader):
                     "(docs/recordings.md), or set data.base_motion to reference if markers.reference move with it."
                 )
             base = in_frame(moving.base, frame)
-        obstacles = prescribed_all(self.data.obstacle_motion, trial.obstacle_motion, moving.time, folder or ".")
+        obstacles = prescribed_all(self.data.obstacle_motion, trial.obstacle_motion, moving.time, folder)
         obstacles |= {name: in_frame(poses, frame) for name, poses in moving.obstacles.items()}
         moved = {} if base is None else {"the base moves the body": base}
         for what, poses in (moved | {f"the obstacle {name!r} moves": path for name, path in obstacles.items()}).items():

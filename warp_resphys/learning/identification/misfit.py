@@ -242,14 +242,14 @@ class Misfit(BoundedMisfit):
             weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
             flat = weighted.reshape(*weighted.shape[:2], -1)
             slopes = np.zeros((*flat.shape[1:], len(unit)))  # (R, 3 T M, P)
-            for changed, owners in zip(flat[1:], self._owners(observed), strict=derivatives):
-                slopes += (changed - flat[0])[..., None] * owners[:, None] / steps
-            columns = nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
+            for changed, columns, owners in zip(flat[1:], self._moves, self._owners(observed), strict=derivatives):
+                slopes[..., columns] = (changed - flat[0])[..., None] * (owners[:, columns] / steps[columns])[:, None]
+            follow = nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
             shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
             shown = shown if self._shares is None else self._shares * shown
             rows = weighted[0].reshape(*weighted.shape[1:3], -1)
             seen = (observed.observed.shape[-1] * shown.sum(1)).tolist()
-            of_trials = zip(rows, slopes, seen, observed.names, columns, strict=True)
+            of_trials = zip(rows, slopes, seen, observed.names, follow, strict=True)
             trials += [LinearTrial(r, s, n, name, observed.session, c) for r, s, n, name, c in of_trials]
         return LinearMisfit(trials, *self.prior_rows(unit), nuisances)
 

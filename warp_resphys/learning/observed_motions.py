@@ -80,7 +80,7 @@ class ObservedMotions:
     def of(
         cls,
         simulator: Simulator,
-        observed: torch.Tensor,
+        observed: torch.Tensor | NDArray[np.float64],
         start: State | None = None,
         inputs: Inputs | None = None,
         resting: Inputs | None = None,
@@ -100,8 +100,10 @@ class ObservedMotions:
             more: further attributes.
 
         Raises:
-            InputError: observations of a wrong shape or number of vertices, or a motion of which nothing was seen.
+            InputError: observations of a wrong shape or number of points, a start or inputs of another number of motions
+                or steps, or an input that the body does not take.
         """
+        observed = torch.as_tensor(observed)
         observed = observed[:, None] if observed.ndim == 3 else observed
         if observed.ndim != 4 or observed.shape[-1] != observation.dimension or len(observed) < 2:
             raise InputError(
@@ -109,10 +111,19 @@ class ObservedMotions:
                 f"{observation.dimension}) in {observation.unit}, of two times or more."
             )
         count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
-        if isinstance(observation, WholeState) and observed.shape[2] != len(like):
-            raise InputError(f"{observed.shape[2]} points were observed, but the body has {len(like)} vertices.")
+        observation = observation.to(like)
+        if observed.shape[2] != (seen := observation(like.expand(count, -1, -1)).shape[1]):
+            kind = "the body has {} vertices" if isinstance(observation, WholeState) else "the observation has {} points"
+            raise InputError(f"{observed.shape[2]} points were observed, but {kind.format(seen)}.")
         points = _array(observed.transpose(0, 1))
-        acting, before = ((own or Inputs()).fitted(simulator.counts, like, count) for own in (inputs, resting))
+        fields = (x or Inputs() for x in (inputs, resting))
+        acting, before = (x.fitted(simulator.counts, like, count).to(like) for x in fields)
+        accepted = {name: (quantity, simulator.counts[name]) for name, quantity in simulator.inputs.items()}
+        for checked in (acting.at(0), before):
+            checked.check(accepted, count, len(like), len(simulator.fixed), like)
+        acting.check_steps(frames - 1)
+        if start is not None and len(start.q) != count:
+            raise InputError(f"start has {len(start.q)} states, but {count} motions were observed: give as many.")
         trials = Trials(
             names=tuple(f"motion {number}" for number in range(count)),
             labels=(),
@@ -127,7 +138,7 @@ class ObservedMotions:
             inputs={name: _array(x if axis == 0 else x.transpose(0, 1)) for name, (x, axis) in acting.axes().items()},
             resting={name: _array(x) for name, x in before.fields.items()},
         )
-        return cls(trials, observation.to(like), **more)
+        return cls(trials, observation, **more)
 
     @property
     def sees_states(self) -> bool:

@@ -47,7 +47,11 @@ class Bounds:
         if isinstance(limits, RangeSettings):
             prior = None if limits.prior is None else Prior(**dict(limits.prior))
             return cls(limits.lower, limits.upper, limits.logarithmic, prior, limits.per)
-        return limits if isinstance(limits, Bounds) else cls(limits[0], limits[1], logarithmic=min(limits) > 0.0)
+        if isinstance(limits, Bounds):
+            return limits
+        if not isinstance(limits, Sequence) or len(limits) != 2:
+            raise InputError(f"a range is {limits!r}: give the smallest and the largest value, or Bounds.")
+        return cls(limits[0], limits[1], logarithmic=min(limits) > 0.0)
 
     def __post_init__(self) -> None:
         """Checks the range.

@@ -30,7 +30,7 @@ class Accuracy:
         markers: of each coordinate of a marker's place on the body [m].
         shift: of each coordinate of the origin of the recording's frame [m].
         turn: of each component of its rotation vector [rad].
-        between_sessions: of what the placement of a session differs from that of all by, over those above.
+        between_sessions: of the placement of a session from the common one, relative to the deviations above.
         mounting: of each component of the rotation vector of a rigid body on the part that carries it [rad]; its
             position has that of markers.
         rigid_bodies: index of the first of the four points of each rigid body, and these on the undeformed body,

@@ -97,7 +97,7 @@ class Driven:
 class Recordings:
     """Quality of the recordings, and their registration on the body, by trial."""
 
-    quality: Mapping[str, Any]  # As `warp_resphys.data.recordings.marker_quality.Quality.to_plain` gives it.
+    quality: Mapping[str, Any]  # as in quality.json
     registered: Mapping[str, Any]  # `rms_mm`, `outliers`, and by label `positions` [m], `residual_mm` and `shift_mm`.
     nominal: Mapping[str, FloatArray]  # (3,) [m] nominal positions at rest, by label.
     beside: Collection[str]  # Labels of markers that stand beside the body.

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import inspect
+import operator
 import re
 import runpy
 from pathlib import Path
@@ -42,6 +43,11 @@ def test_every_public_name_is_on_a_page():
         public = functools.reduce(getattr, name.split("."), warp_resphys)
         assert public is getattr(importlib.import_module(f"warp_resphys.{module}"), own)
         assert public.__doc__
+
+
+def test_a_name_of_a_part_says_where_it_is():
+    with pytest.raises(AttributeError, match=r"no attribute 'Sphere': it is in warp_resphys\.energies"):
+        warp_resphys.Sphere
 
 
 def test_every_tutorial_is_in_the_contents_and_says_when_it_is_wrong():

@@ -31,7 +31,11 @@ def _public(name: str) -> Any:
             return [*public]
         if name in public:
             return public[name]
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    message = f"module {__name__!r} has no attribute {name!r}"
+    for part in _PARTS if name[:1] != "_" else ():
+        if hasattr(import_module(f"{__name__}.{part}"), name):
+            message += f": it is in {__name__}.{part}"
+    raise AttributeError(message)
 
 
 def __dir__() -> list[str]:

@@ -192,9 +192,20 @@ def test_invalid_motions_are_refused(robot):
         ObservedMotions.of(robot, torch.zeros(3), start)
     with pytest.raises(wr.InputError, match="5 points were observed, but the body has"):
         evaluate(robot, ObservedMotions.of(robot, torch.zeros(3, 5, 3), start))
-    motion = ObservedMotions.of(robot, robot.rollout(start, 3).q, start)
+    q = robot.rollout(start, 3).q
+    with pytest.raises(wr.InputError, match="5 points were observed, but the observation has"):
+        ObservedMotions.of(robot, q[:, :, :5], start, observation=MARKERS)
+    with pytest.raises(wr.InputError, match="start has 1 states, but 2 motions were observed"):
+        ObservedMotions.of(robot, q.expand(-1, 2, -1, -1), start)
+    with pytest.raises(wr.InputError, match="Unknown input pressure"):
+        ObservedMotions.of(robot, q, start, wr.Inputs(pressure=1.0))
+    with pytest.raises(wr.InputError, match="external_force has 2 time steps, but 3 are"):
+        ObservedMotions.of(robot, q, start, wr.Inputs(external_force=torch.zeros(2, *q.shape[1:]).to(q)))
+    motion = ObservedMotions.of(robot, q.numpy(), start)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         identify(robot, motion, {"mass": (1.0, 2.0)})
+    with pytest.raises(wr.InputError, match=r"a range is 200000\.0: give the smallest and the largest value"):
+        identify(robot, motion, {"youngs_modulus": 2e5})
     with pytest.raises(wr.InputError, match="there is no trial 'motion 1': there are motion 0"):
         evaluate(robot, motion, names=["motion 1"])
     found = reconstruct(robot, motion)

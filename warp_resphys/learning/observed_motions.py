@@ -100,8 +100,8 @@ class ObservedMotions:
             more: further attributes.
 
         Raises:
-            InputError: observations of a wrong shape or number of points, a start or inputs of another number of motions
-                or steps, or an input that the body does not take.
+            InputError: observations of a wrong shape or number of points, a start or inputs for another number of
+                motions or steps, or an input that the body does not take.
         """
         observed = torch.as_tensor(observed)
         observed = observed[:, None] if observed.ndim == 3 else observed
@@ -113,7 +113,9 @@ class ObservedMotions:
         count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
         observation = observation.to(like)
         if observed.shape[2] != (seen := observation(like.expand(count, -1, -1)).shape[1]):
-            kind = "the body has {} vertices" if isinstance(observation, WholeState) else "the observation has {} points"
+            kind = (
+                "the body has {} vertices" if isinstance(observation, WholeState) else "the observation has {} points"
+            )
             raise InputError(f"{observed.shape[2]} points were observed, but {kind.format(seen)}.")
         points = _array(observed.transpose(0, 1))
         fields = (x or Inputs() for x in (inputs, resting))

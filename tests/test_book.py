@@ -3,7 +3,6 @@
 import functools
 import importlib
 import inspect
-import operator
 import re
 import runpy
 from pathlib import Path
@@ -47,7 +46,7 @@ def test_every_public_name_is_on_a_page():
 
 def test_a_name_of_a_part_says_where_it_is():
     with pytest.raises(AttributeError, match=r"no attribute 'Sphere': it is in warp_resphys\.energies"):
-        warp_resphys.Sphere
+        _ = warp_resphys.Sphere
 
 
 def test_every_tutorial_is_in_the_contents_and_says_when_it_is_wrong():

@@ -266,6 +266,9 @@ class TestBadInput:
             warp_resphys.load(tmp_path / "nothing")
         with pytest.raises(DataFileError, match="not a run folder"):
             warp_resphys.load(tmp_path)
+        (tmp_path / "pulls.csv").write_text("time [s]\n")
+        with pytest.raises(DataFileError, match=r"pulls\.csv is no robot: name a run folder, or a \.safetensors file"):
+            warp_resphys.load(tmp_path / "pulls.csv")
 
     @pytest.mark.parametrize(
         ("file", "change", "sentence"),

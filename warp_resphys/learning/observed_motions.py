@@ -113,16 +113,10 @@ class ObservedMotions:
         count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
         observation = observation.to(like)
         if observed.shape[2] != (seen := observation(like.expand(count, -1, -1)).shape[1]):
-            kind = (
-                "the body has {} vertices" if isinstance(observation, WholeState) else "the observation has {} points"
-            )
-            raise InputError(f"{observed.shape[2]} points were observed, but {kind.format(seen)}.")
+            kind = "vertices of the body" if isinstance(observation, WholeState) else "points of the observation"
+            raise InputError(f"{observed.shape[2]} points were observed, but there are {seen} {kind}.")
         points = _array(observed.transpose(0, 1))
-        fields = (x or Inputs() for x in (inputs, resting))
-        acting, before = (x.fitted(simulator.counts, like, count).to(like) for x in fields)
-        accepted = {name: (quantity, simulator.counts[name]) for name, quantity in simulator.inputs.items()}
-        for checked in (acting.at(0), before):
-            checked.check(accepted, count, len(like), len(simulator.fixed), like)
+        acting, before = (_fitted(simulator, own or Inputs(), count) for own in (inputs, resting))
         acting.check_steps(frames - 1)
         if start is not None and len(start.q) != count:
             raise InputError(f"start has {len(start.q)} states, but {count} motions were observed: give as many.")
@@ -287,6 +281,15 @@ class ObservedMotions:
         at = torch.arange(max(map(len, series)))
         series = [values[at.clamp_max(len(values) - 1).to(values.device)] for values in series]
         return torch.cat([*(values.expand(len(at), -1, -1) for values in constant), *series], -1)
+
+
+def _fitted(simulator: Simulator, inputs: Inputs, count: int) -> Inputs:
+    """Returns the inputs of some motions, or raises InputError for those that the body does not take."""
+    fitted = inputs.fitted(simulator.counts, simulator.rest_positions, count).to(simulator.rest_positions)
+    accepted = {name: (quantity, simulator.counts[name]) for name, quantity in simulator.inputs.items()}
+    vertices, fixed = simulator.body.n_vertices, len(simulator.fixed)
+    fitted.at(0).check(accepted, count, vertices, fixed, simulator.rest_positions)
+    return fitted
 
 
 def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from ..io.errors import DataFileError, InputError, listed
 from ..learning.parameters import own_name
 from ..stepping.state import State
 from .actuation import BASE
-from .description import Description, describe, finished_experiment
+from .description import SUFFIX, Description, describe, finished_experiment
 from .robot import Robot
 
 
@@ -41,6 +41,8 @@ def load(path: str | Path, model: str | None = None, device: str = "cpu", on_fai
     place = Path(path).expanduser()
     where = choose_device(device)
     if place.is_file():
+        if place.suffix != SUFFIX:
+            raise DataFileError(f"{place} is no robot: name a run folder, or a {SUFFIX} file of `Robot.save`.")
         description = Description.read(place)
         if model not in (None, description.model):
             raise InputError(

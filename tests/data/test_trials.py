@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from warp_resphys import Body, box_hexahedra
 from warp_resphys.data.driving import driving, first_change, phases_of, since_change
 from warp_resphys.data.trials import Trials
 from warp_resphys.io.safe_files import read_hdf5
@@ -35,17 +34,6 @@ def test_inputs_are_kept_with_the_unit_of_their_quantity(tmp_path):
         assert {name: file[name].attrs["units"] for name in UNITS} == UNITS
     for name, values in own.inputs.items():
         np.testing.assert_array_equal(again.inputs[name], values)
-    replace(own, channels={}).write(tmp_path / "dataset.h5")
-    assert Trials.read(tmp_path / "dataset.h5").channels == {}
-
-
-def test_poses_have_the_last_of_their_inputs_or_constant_ones():
-    mesh = box_hexahedra((0.1, 0.02, 0.02), (2, 1, 1))
-    steps = np.arange(12.0)[None, :, None] * np.array([1.0, 2.0])[:, None, None]
-    for pressure in (steps, steps[:, -1]):
-        trials = dataset(("static", "static"), pressure=steps)
-        _, resting = replace(trials, inputs={"pressure": pressure}).acting("ab", Body(mesh), None, 0.05)
-        np.testing.assert_array_equal(resting.actuation["pressure"], [[11.0], [22.0]])
 
 
 def test_inputs_before_the_trials_are_kept_and_joined_with_trials_at_rest(tmp_path):

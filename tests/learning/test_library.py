@@ -11,6 +11,7 @@ from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Checkpoint, Parts
 from warp_resphys.io.resuming import StageContext
+from warp_resphys.learning.comparison import Comparison, Model
 from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.identification.identification import identify
 from warp_resphys.learning.identification.misfit import Misfit
@@ -174,6 +175,21 @@ def test_workers_training_through_the_simulator_and_recurrent_networks_are_for_f
     )
     assert errors[0] < 0.4 * uncorrected
     assert errors[1] < 0.1 * uncorrected
+
+
+def test_models_of_one_simulator_have_the_derivatives_of_their_parameters(robot):
+    motions = let_go(robot, 0.05, 0.1, markers=MARKERS)
+    bound = MARKERS(robot.rest_positions[None])[0].numpy()
+    motions = replace(motions, trials=replace(motions.trials, labels=("a", "b", "c"), bound=bound))
+    found, simulator = identify(beam(180e3), motions, {"youngs_modulus": (1e5, 1e6)}), beam(180e3)
+    models = {
+        "close": Model(simulator, found),
+        "soft": Model(simulator, replace(found, parameters={"youngs_modulus": 1e5})),
+    }
+    names = motions.trials.names
+    spreads = [Comparison(some, motions, names, {"1": names}).spreads for some in (models, {"soft": models["soft"]})]
+    np.testing.assert_allclose(spreads[0]["soft"], spreads[1]["soft"], rtol=1e-6)
+    assert np.nanmax(spreads[0]["soft"]) > 2.0 * np.nanmax(spreads[0]["close"])
 
 
 def test_forces_from_markers_bring_the_markers_there(robot):

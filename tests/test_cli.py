@@ -198,7 +198,7 @@ class TestUserErrors:
             ("seed", "unknown command 'seed' (--help lists all)"),
             ("seed=1 inspct", "unknown command 'inspct', did you mean 'inspect'?"),
             ("seed=${nothing}", "Interpolation key 'nothing' not found"),
-            ("material.density=???", "Missing mandatory value: density (at material.density)"),
+            ("material.density=???", "material.density has no value: add material.density=VALUE"),
             ("+seed=1", "Could not append to config. An item is already at 'seed'."),
             ("hydra.run.dir=conf/config.yaml", "cannot write conf/config.yaml (File exists)"),
             ("--config-name other", "Cannot find primary config 'other'."),

@@ -23,7 +23,7 @@ from hydra.errors import HydraException, InstantiationException, MissingConfigEx
 from hydra.types import RunMode
 from hydra.version import setbase
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import MarkedYAMLError
 
 from .commands import CONFIG_PACKAGE, OWN_OPTIONS, USER_ERROR, configuration, ends_where_nobody_reads, quote, run_label
@@ -218,6 +218,8 @@ def _explain(error: BaseException, started: bool) -> str | None:
         text = quote(value) if '"' in value else f'"{value}"'
         hint = f", and a text with special characters in quotes, {shlex.quote(f'{key}={text}')}" if equals else ""
         return f"cannot read the override {override!r} ({_sentence(error)}): write key=value{hint}"
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key} has no value: add {error.full_key}=VALUE (--help explains the keys)"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return _sentence(error)
     if is_disk_full(error):

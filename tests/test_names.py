@@ -41,11 +41,8 @@ class TestCommandLine:
     )
     def test_texts_are_as_they_were_typed(self, folder, text):
         settings = shown(RECORDED, f"data.folder={text}", f"title={text}", "mesh=file", f"mesh.path={text}/a.msh")
-        assert (settings["data"]["folder"], settings["title"], settings["mesh"]["path"]) == (
-            text,
-            text,
-            f"{text}/a.msh",
-        )
+        read = settings["data"]["folder"], settings["title"], settings["mesh"]["path"]
+        assert read == (text, text, f"{text}/a.msh")
 
     def test_what_exists_is_a_file_without_interpolation_or_sweep(self, folder):
         for name in ("${x}", "a,b", "choice(a)"):
@@ -122,14 +119,10 @@ class TestFiles:
     def test_a_group_replaces_that_of_another_experiment(self, own):
         base = "defaults: [beam_real, _self_]\nmarkers: {reference: {_replace_: true, a: [0, 0, 1], b: [0, 1, 0]}}"
         assert [*own(base, name="base")["markers"]["reference"]] == ["a", "b"]
-        assert [*own("defaults: [base]\nmarkers: {reference: {c: [1, 1, 0]}}")["markers"]["reference"]] == [
-            "a",
-            "b",
-            "c",
-        ]
-        again = (
-            "defaults: [base, override /trainer: short, _self_]\nmarkers: {reference: {_replace_: true, c: [1, 1, 0]}}"
-        )
+        more = own("defaults: [base]\nmarkers: {reference: {c: [1, 1, 0]}}")["markers"]["reference"]
+        assert [*more] == ["a", "b", "c"]
+        again = "defaults: [base, override /trainer: short, _self_]\n"
+        again += "markers: {reference: {_replace_: true, c: [1, 1, 0]}}"
         assert (own(again)["trainer"]["epochs"], [*own(again)["markers"]["reference"]]) == (100, ["c"])
         assert [*own(again, "markers.reference.d=[0,0,0]")["markers"]["reference"]] == ["c", "d"]
         assert own("defaults: [base]\nmarkers: {reference: {_replace_: true}}")["markers"]["reference"] == {}

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import shapely
 import torch
 
 import warp_resphys as wr
+from support.slopes import differences
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.learning import Bounds, Prior, search_parameters
 from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
@@ -42,8 +42,7 @@ def pose(outline=True, tracked=False, name="beam", both_ends=False):
     q = plain.shape(TRUTH)
     corrections = PlacedCamera.corrections(TRUTH)
     region = surface.region(CAMERA.pixels(q, corrections).numpy())
-    rows, columns = np.indices(SIZE)
-    mask = np.asarray(shapely.contains_xy(region, columns.ravel(), rows.ravel())).reshape(SIZE)
+    mask = noisy_mask(region, SIZE[::-1], 0.0, np.random.default_rng(0))
     pixels = CAMERA.pixels(POINTS(q[None])[0], corrections).numpy()
     photo = Photo("0", CAMERA, Outline.of_mask(mask) if outline else None, pixels if tracked else None)
     return replace(plain, photos=(photo,)), mask
@@ -60,11 +59,7 @@ def test_derivatives_are_those_of_differences(seen):
         misfit = PictureMisfit([own], RANGES)
         unit = misfit.to_unit({**FIRST, "youngs_modulus": 1.6e5, "camera_shift_1": 0.001})
         linear = misfit.linearise(unit)
-        gradient = []
-        for column in range(len(unit)):
-            step = 1e-3 * np.eye(len(unit))[column]
-            ends = [misfit.linearise(unit + by * step, derivatives=False).loss for by in (1.0, -1.0)]
-            gradient.append((ends[0] - ends[1]) / 2e-3)
+        gradient = differences(lambda x, misfit=misfit: misfit.linearise(x, derivatives=False).loss, unit, 1e-3)
         assert linear.gradient == pytest.approx(gradient, rel=tolerance, abs=tolerance * np.abs(gradient).max())
 
 

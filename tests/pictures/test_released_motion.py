@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import shapely
 import torch
 
 import warp_resphys as wr
+from support.slopes import differences
+from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures import ClosedSurface, Cloud, Lens, Outline, Photo, PictureMisfit, PlacedCamera, SeenPose
 from warp_resphys.pictures.released_force import ReleasedForce, at_own_times
@@ -58,9 +59,7 @@ def released(frames=18, row_time=ROW_TIME, outlines=False):
         outline, pixels = None, CAMERA.pixels(POINTS(q[None])[0], corrections).numpy()
         if outlines:
             region = surface.region(CAMERA.pixels(q, corrections).numpy())
-            rows, columns = np.indices(SIZE)
-            inside = shapely.contains_xy(region, columns.ravel(), rows.ravel()).reshape(SIZE)
-            outline = Outline.of_mask(np.asarray(inside))
+            outline = Outline.of_mask(noisy_mask(region, SIZE[::-1], 0.0, np.random.default_rng(0)))
         measured.append(replace(photo, tracked=pixels, outline=outline))
     return replace(pose, photos=tuple(measured))
 
@@ -119,12 +118,8 @@ def test_derivatives_are_those_of_differences(kind, tolerance):
     if kind == "depths":
         own = with_depths(own)
     misfit = PictureMisfit([own], RANGES)
-    unit, gradient = misfit.to_unit({**FIRST, "camera_shift_3": 0.001}), []
-    for column in range(len(unit)):
-        step = 1e-3 * np.eye(len(unit))[column]
-        ends = [misfit.linearise(unit + by * step, derivatives=False).loss for by in (1.0, -1.0)]
-        gradient.append((ends[0] - ends[1]) / 2e-3)
-    gradient = np.array(gradient)
+    unit = misfit.to_unit({**FIRST, "camera_shift_3": 0.001})
+    gradient = np.array(differences(lambda x: misfit.linearise(x, derivatives=False).loss, unit, 1e-3))
     assert misfit.linearise(unit).gradient == pytest.approx(gradient, rel=tolerance, abs=tolerance * gradient.max())
 
 

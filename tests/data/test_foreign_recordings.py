@@ -128,7 +128,9 @@ def test_foreign_files(tmp_path, content):
         read_recording(tmp_path / "notes.c3d")
 
 
-def test_the_byte_order_of_sgi_is_refused(tmp_path, trajectory):
+def test_an_unknown_unit_and_the_byte_order_of_sgi_are_refused(tmp_path, trajectory):
+    with pytest.raises(DataFileError, match="positions in 'inch'"):
+        read_recording(write_c3d(tmp_path / "inch.c3d", trajectory, "abc", unit="inch"))
     content = bytearray(write_c3d(tmp_path / "a.c3d", trajectory, "abc").read_bytes())
     content[(content[0] - 1) * 512 + 3] = 86
     (tmp_path / "a.c3d").write_bytes(content)
@@ -164,8 +166,3 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
         monkeypatch.setattr(decoding, limit, given)
     with pytest.raises(DataFileError, match=rf"whole\.c3d cannot be decoded \(.*{message}\): copy"):
         read_recording(path)
-
-
-def test_unknown_unit(tmp_path, trajectory):
-    with pytest.raises(DataFileError, match="positions in 'inch'"):
-        read_recording(write_c3d(tmp_path / "inch.c3d", trajectory, "abc", unit="inch"))

@@ -115,15 +115,10 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
         ((PLACES, "xyz"), "name two of the body's axes"),
         ((PLACES * torch.tensor([0, 0, 1]), None, True), "the 4 markers that are seen together lie on one line"),
         ((PLACES[:1], "xz", True), "the 1 markers that are seen together are at one place"),
+        ((PLACES, None, True, ((0, 1, 2), (1, 2, 3))), "two trials have some markers in common, and not all"),
+        ((PLACES, None, True, ((0, 1), (2, 3))), "the 2 markers that are seen together lie on one line"),
     ],
 )
 def test_degenerate_markers_are_refused(arguments, said):
     with pytest.raises(InputError, match=said):
         MarkerView(*arguments)
-
-
-def test_sets_that_share_markers_are_refused():
-    with pytest.raises(InputError, match="two trials have some markers in common, and not all"):
-        MarkerView(PLACES, own=True, sets=((0, 1, 2), (1, 2, 3)))
-    with pytest.raises(InputError, match="the 2 markers that are seen together lie on one line"):
-        MarkerView(PLACES, own=True, sets=((0, 1), (2, 3)))

@@ -105,8 +105,7 @@ def test_what_binds_markers_makes_the_recordings_anew():
 def test_gravity_and_release_are_recovered(laboratory):
     folder, run = laboratory
     truth, quality = read_json(folder / TRUTH), read_json(folder / QUALITY)
-    with read_hdf5(folder / DATASET, "dataset") as file:
-        gravity = np.asarray(file.attrs["gravity"])
+    gravity = Trials.read(folder / DATASET).gravity
     true = np.array(truth["gravity"])
     lean = np.degrees(np.arccos(gravity @ true / np.linalg.norm(gravity) / np.linalg.norm(true)))
     assert lean < 0.5

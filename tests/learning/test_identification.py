@@ -94,13 +94,10 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
 
 
-def test_nothing_to_identify_is_refused():
-    with pytest.raises(InputError, match="nothing to identify"):
-        Misfit([replay_of(simulator(), TRUTH, frames=3)], {})
-
-
-def test_a_motion_that_stands_still_is_refused():
+def test_no_parameters_and_a_motion_that_stands_still_are_refused():
     replay, release = replay_of(simulator(gravity=(0.0, 0.0, 0.0)), TRUTH, frames=3)
+    with pytest.raises(InputError, match="nothing to identify"):
+        Misfit([(replay, release)], {})
     still = replay.trials.held[:, None].repeat(1, 3, 1, 1)
     motions = replace(replay.trials, observed=still)
     with pytest.raises(InputError, match="'m0' stay where they were held"):

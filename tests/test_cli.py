@@ -180,12 +180,10 @@ class TestOwnOptions:
         [("name: a\nname: b\n", "found duplicate key name"), ("name: [a\nseed: 1\n", "expected ',' or ']'")],
     )
     def test_invalid_yaml_is_named_with_its_line(self, command, own, text, problem):
-        (own / "experiment" / "my_robot.yaml").write_text("# @package _global_\n" + text)
+        (path := own / "experiment" / "my_robot.yaml").write_text("# @package _global_\n" + text)
         code, errors = command("experiment=my_robot")
         assert code == 2
-        assert errors.startswith(
-            f"error: {own / 'experiment' / 'my_robot.yaml'}, line 3 cannot be read as YAML ({problem}"
-        )
+        assert errors.startswith(f"error: {path}, line 3 cannot be read as YAML ({problem}")
         assert errors.count("\n") == 1
 
 

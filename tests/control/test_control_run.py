@@ -272,15 +272,13 @@ class TestDriving:
         names = ["open_sysid", "open_resphys", "receding_resphys", "receding_linear", "feedback_5"]
         assert list(tracking) == controllers_of(control_of(folder)) == names
         with read_hdf5(folder / "driven.h5", "driven") as file:
-            path, points = (read_array(file, f"circle_0.4s/{key}") for key in ("path", "points"))
-            inputs = read_array(file, "circle_0.4s/inputs")
+            path, points, inputs = (read_array(file, f"circle_0.4s/{key}") for key in ("path", "points", "inputs"))
         for row, name in enumerate(names):
             wanted = 1e3 * np.linalg.norm(points[row] - path, axis=1).mean()
             assert tracking[name]["mean_mm"] == pytest.approx(wanted)
             assert np.ptp(points[row], axis=0).max() > 1e-3
-        np.testing.assert_allclose(
-            inputs[1], read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s")["inputs"]
-        )
+        plan = read_motion(folder / plans_file("resphys"), PLANNED, "circle_0.4s")
+        np.testing.assert_allclose(inputs[1], plan["inputs"])
 
     def test_a_replay_repeats_the_motion(self, folder):
         names = ["receding_resphys", "feedback_5"]

@@ -85,10 +85,7 @@ def published(tmp_path):
     rest = np.empty((7, 3))
     rest[list(MARKERS)] = SEGMENT_NOMINAL
     moved = np.isin(np.arange(7), [MARKERS[SEGMENT_LABELS.index(name)] for name in TIP_LABELS])
-    trials = [
-        rest + moved[:, None] * swing(opening, amplitude)[:, None]
-        for opening, amplitude in ((0.0725, 2e-3), (0.12, 9e-3))
-    ]
+    trials = [rest + moved[:, None] * swing(*own)[:, None] for own in ((0.0725, 2e-3), (0.12, 9e-3))]
     noisy = np.stack(trials) + np.random.default_rng(1).normal(0.0, 5e-6, (2, 150, 7, 3))
     noisy[0, 40] = noisy[0, 39]
     arrays = {"pressure_mbar": np.array([50.0, 325.0]), "markers": noisy, "rate_hz": np.array(RATE)}

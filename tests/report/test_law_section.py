@@ -96,10 +96,8 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
 @pytest.mark.usefixtures("no_drawing")
 def test_a_law_that_is_not_used_is_said_to_be_so(tmp_path):
     page = run(tmp_path, law(accepted=False, validation={"trials": ["80 g"], "law": 0.2, "below": 0.1}))
-    assert (
-        "The identified law is not used: its root mean square error on the validation trials (80 g) is 20 %"
-        in page.text
-    )
+    said = "The identified law is not used: its root mean square error on the validation trials (80 g) is 20 %"
+    assert said in page.text
     assert "with the law" not in page.text
     assert "failed" in law_text(law(validation={"trials": ["0.05 kg"], "law": 0.1, "below": None}))
 

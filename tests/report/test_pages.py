@@ -272,9 +272,8 @@ class TestBeams:
         ):
             assert said in head
         assert "no force: no epoch of its training was kept" in page.text
-        assert re.findall(r'class="marked"><th scope="row">([^<]+)<', page.source) == [
-            "+ identified parameters (SysID)"
-        ]
+        marked = re.findall(r'class="marked"><th scope="row">([^<]+)<', page.source)
+        assert marked == ["+ identified parameters (SysID)"]
 
     @pytest.mark.usefixtures("no_drawing")
     def test_page_over_folds_leads_to_theirs(self, tmp_path):

@@ -95,9 +95,8 @@ class TestSentences:
     def test_what_a_regression_can_do_needs_no_simulator(self):
         errors = {**self.ERRORS, "regression": [1e-3, 1.2e-3, 1.1e-3, 1e-3, 1.3e-3]}
         first, do = sentences(errors)
-        assert first.startswith(
-            "Kernel regression, without physics, has 99.7 % less error than any corrected simulator"
-        )
+        said = "Kernel regression, without physics, has 99.7 % less error than any corrected simulator"
+        assert first.startswith(said)
         assert do == "Kernel regression is enough for trials like these; to judge the simulator, test it on others."
 
     def test_a_simpler_model_is_advised_only_where_it_is_as_good(self):

@@ -32,7 +32,7 @@ from warp_resphys.io.resuming import package_versions
 from warp_resphys.io.safe_files import read_json, write_text
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.learning.metrics import PUBLISHED_MM
-from warp_resphys.report.data import trial_errors
+from warp_resphys.report.data import Metrics, trial_errors
 from warp_resphys.report.wording import MODELS, NONE, duration_text, error_parts, number_text, published_parts
 
 RUNS: Final = Path("runs")
@@ -76,9 +76,10 @@ class Run:
         self.failure = (sentence or f"exit code {child.returncode}") if child.returncode else ""
 
     @cached_property
-    def metrics(self) -> dict[str, Any]:
+    def metrics(self) -> Metrics:
         """Content of metrics.json."""
-        return dict(read_json(self.folder / "metrics.json"))
+        metrics: Metrics = read_json(self.folder / "metrics.json")
+        return metrics
 
     @cached_property
     def data(self) -> dict[str, Any]:
@@ -201,7 +202,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     if run.data.get("train_fraction", 1.0) < 1.0 and {*tested} <= {*run.data["train"]}:
         how = "in the part that was not used for training"
     errors = {model: own for model, own in trial_errors(metrics).items() if model in COMPARED}
-    intervals = metrics.get("intervals", {}).get("models", {}).get("resphys")
+    intervals = metrics["intervals"]["models"].get("resphys") if "intervals" in metrics else None
     return {
         "day": str(made["finished"]).partition("T")[0],
         "machine": {**made.get("machine", {}), **made["versions"]},
@@ -212,7 +213,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
         "errors_mm": {model: metrics["errors_mm"][model] for model in COMPARED if model in metrics["errors_mm"]},
         "beside": beside(errors),
         "gains": {"sysid": gain_of(errors, "simulation", "sysid"), "resphys": gain_of(errors, "sysid", "resphys")},
-        "intervals": intervals and {key: intervals[key] for key in ("coverage", "half_width_mm")},
+        "intervals": intervals and {"coverage": intervals["coverage"], "half_width_mm": intervals["half_width_mm"]},
         "seconds": sum(sum(part["seconds"].values()) for part in (metrics, *folds.values())),
         "moved_mm": metrics.get("mesh_check", {}).get("moved_mm"),
     }
@@ -286,15 +287,15 @@ def _time_table(labels: Sequence[str], columns: Mapping[str, Run]) -> list[str]:
 
 
 def _markers_table(name: str, run: Run) -> list[str]:
-    published = ROWS["beams"][name]["published"]
+    published, metrics = ROWS["beams"][name]["published"], read_json(run.folder / "metrics.json")
     rows = []
-    for row in run.metrics["by_markers"]:
+    for row in metrics["by_markers"]:
         count = row["markers"]
         median = f"below {published['median_mm']:g}" if count >= published["markers"] else "not given"
         spread = "small" if count >= published["markers_of_small_spread"] else "high"
         ours = (number_text(row[key]) for key in ("median_mm", "interquartile_range_mm", "largest_mm"))
         rows.append([str(count), median, spread, *ours])
-    uncorrected = number_text(run.metrics["uncorrected_mm"])
+    uncorrected = number_text(metrics["uncorrected_mm"])
     note = f"Error over all vertices [mm] of random sets of markers on the surface. Uncorrected: {uncorrected} mm."
     heads = ["Published median", "Published spread", "Median here", "Interquartile range here", "Largest here"]
     return [table(["Markers", *heads], rows), note]

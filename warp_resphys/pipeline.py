@@ -43,8 +43,9 @@ from .io.kernel_cache import start_quietly
 from .io.progress import show
 from .io.resuming import Stage, package_versions, resources_used, run_stages, unfinished
 from .io.safe_files import read_json, write_json
-from .learning.metrics import summarise_folds
+from .learning.metrics import ErrorSummary, summarise_folds
 from .report.control_section import tracking_table
+from .report.data import Metrics
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
 from .settings.body import TargetSettings
@@ -339,7 +340,7 @@ def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, workers: 
 
 def _run_folds(
     run: RunSettings, folder: Path, splits: Mapping[str, Split], first: Sequence[Stage], acquired: str
-) -> dict[str, Any]:
+) -> Metrics:
     """Runs a cross-validation, each fold in its own folder; returns the content of metrics.json."""
     folds = {
         name: Fold(name, folder / files.fold_folder(name), partial(learning_stages, run, split, "..", acquired))
@@ -350,32 +351,33 @@ def _run_folds(
         times = len(left) / workers_of(run).at_most(len(left)).count
         _announce(run, left[0].stages(ALONE), left[0].folder, ALONE, times)
     run_folds(folds, workers_of(run))
-    metrics = {}
+    metrics = dict[str, Metrics]()
     for name, fold in folds.items():
         metrics[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
         write_json(fold.folder / files.METRICS, metrics[name])
-    return {
+    over_folds: Metrics = {
         "errors_mm": summarise_folds(_of_all([of_fold["errors_mm"] for of_fold in metrics.values()])),
         "folds": metrics,
-        **intervals_of_folds(folder, {name: fold.folder for name, fold in folds.items()}),
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
     }
+    if (intervals := intervals_of_folds(folder, {n: fold.folder for n, fold in folds.items()}))["models"]:
+        over_folds["intervals"] = intervals
+    return over_folds
 
 
-def _of_all(folds: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _of_all(folds: Sequence[Mapping[str, ErrorSummary]]) -> list[dict[str, ErrorSummary]]:
     """Errors of the models that all folds have: a law is used in some folds alone."""
     shared = [model for model in folds[0] if all(model in fold for fold in folds)]
     return [{model: fold[model] for model in shared} for fold in folds]
 
 
-def _print(metrics: Mapping[str, Any], folder: Path, run: RunSettings) -> None:
+def _print(metrics: Metrics, folder: Path, run: RunSettings) -> None:
     """Prints what the report begins with: the mean errors, the verdict and the advice."""
-    tracking, shapes = metrics.get("control", {}).get("tracking"), metrics.get("shapes")
     tables = [results_table(metrics, run)]
-    tables += [tracking_table(tracking)] if tracking else []
-    tables += [shapes_table(shapes)] if shapes else []
+    tables += [tracking_table(metrics["control"]["tracking"])] if "control" in metrics else []
+    tables += [shapes_table(metrics["shapes"])] if "shapes" in metrics else []
     said, *advice = (*verdict(metrics, run), "")
     last = [" ".join(filter(None, advice)), f"Report: {folder / files.REPORT}"]
     lines = ["  ".join(filter(None, last))] if len(last[0]) < _SHORT else last

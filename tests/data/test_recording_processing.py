@@ -192,7 +192,7 @@ def test_quality_of_a_recording():
         "base 2 jumps once, by 1.73 mm, in frame 40.",
         "base 2 should not move and drifts by 1.73 mm.",
     )
-    table = quality_table(dataclasses.asdict(result)["markers"])
+    table = quality_table(result.markers)
     assert table["tip 1"][:4] == ["98.0 %", "2", "3", "3"]
     assert table["base 2"][4] == "1 (1.73 mm)"
     with pytest.raises(DataFileError, match=r"swing\.c3d has no marker named 'foot'"):

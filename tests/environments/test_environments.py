@@ -119,7 +119,7 @@ class TestWorlds:
         drawn = world.robot.parameters["youngs_modulus"].numpy()
         description = world.robot.description
         assert np.ptp(drawn) > 0.0
-        deviation = description.uncertainty["deviation"]["youngs_modulus"]
+        deviation = description.uncertainty.deviation["youngs_modulus"]
         assert np.abs(drawn - description.parameters["youngs_modulus"]).max() < 4.0 * deviation
         same = make_vector("reach", folder, 4, spread=0.0, noise=0.0, **QUICK)
         seen = played(same, 2)[0]

@@ -9,7 +9,7 @@ from support.main_job import finish
 from warp_resphys import box_hexahedra, select_vertices
 from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.mesh.volume_mesh import surface_vertices
-from warp_resphys.report.ablation_page import verdict
+from warp_resphys.report.ablation_page import MarkerErrors, verdict
 
 COUNTS = [1, 4, 33, 42]
 TINY = [
@@ -81,7 +81,7 @@ def test_a_set_depends_on_the_seed_and_neither_on_the_other_counts_nor_on_proces
 
 def test_verdict_looks_from_the_largest_number_of_markers_down():
     def row(markers, median, spread):
-        return {"markers": markers, "median_mm": median, "interquartile_range_mm": spread}
+        return MarkerErrors(markers, median, 0.0, 0.0, spread, 0.0, 0.0, ())
 
     said = verdict([row(1, 0.05, 0.2), row(2, 0.2, 0.04), row(4, 0.09, 0.06), row(8, 0.02, 0.01)], 1.0)
     assert said.startswith("With 4 or more markers, the median error stays below 0.1\N{NO-BREAK SPACE}mm")

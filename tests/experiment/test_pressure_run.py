@@ -273,13 +273,13 @@ def test_a_diverged_roll_out_and_one_that_left_the_range_are_reported():
 def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(finished):
     """The stored variance beside roll-outs with parameters that are drawn from a narrowed posterior."""
     experiment = Experiment(stage_of(finished, "evaluate", StageSettings), finished)
-    identified = experiment.identification("sysid")
-    names, uncertainty = [*identified["parameters"]], identified["uncertainty"]
-    deviation = 1e-3 * np.array([uncertainty["deviation"][name] for name in names])
-    covariance = np.array(uncertainty["correlation"]) * np.outer(deviation, deviation)
-    ranges = np.diag([12.0 / uncertainty["ranges"][name] ** 2 for name in names])  # variances of uniform distributions
+    identified = experiment.identified("sysid")
+    names, uncertainty = [*identified.parameters], identified.uncertainty
+    deviation = 1e-3 * np.array([uncertainty.deviation[name] for name in names])
+    covariance = np.array(uncertainty.correlation) * np.outer(deviation, deviation)
+    ranges = np.diag([12.0 / uncertainty.ranges[name] ** 2 for name in names])  # variances of uniform distributions
     covariance = 1e-6 * np.linalg.inv(np.linalg.inv(1e6 * covariance) + ranges)
-    means = [identified["parameters"][name] for name in names]
+    means = [*identified.parameters.values()]
     drawn = np.random.default_rng(0).multivariate_normal(means, covariance, 400)
     replay = experiment.motions.replay(experiment.model_simulator("sysid"), ["t003"], experiment.identified("sysid"))
     sets = {name: torch.from_numpy(drawn[:, column].copy()) for column, name in enumerate(names)}

@@ -26,6 +26,8 @@ WITHOUT = {
     "deviation": {"youngs_modulus": 4e3, "density": 50.0},
     "correlation": np.eye(2).tolist(),
 }
+PLACED = {"offsets": {}, "shift": [], "turn": [], "centre": []}
+PLACED = {**PLACED, "sessions": {"monday": PLACED}}
 UNLIMITED = {"poorest": {}, "poorest_deviation": 0.0, "ranges": dict.fromkeys(("youngs_modulus", "density"), 1e12)}
 IDENTIFIED = {
     "uncertainty": {
@@ -34,7 +36,7 @@ IDENTIFIED = {
         **UNLIMITED,
         "left_out": {"a": WITHOUT},
     },
-    "placement": {"sessions": {"monday": {}}, "new_session": np.diag(NEW_SESSION).tolist()},
+    "placement": {**PLACED, "new_session": np.diag(NEW_SESSION).tolist()},
 }
 
 
@@ -79,7 +81,7 @@ def test_the_position_of_a_rigid_body_does_not_vary_with_its_orientation():
     slopes = {"density": moved[None, ..., 0], "youngs_modulus": moved[None, ..., 1]}
     identified = {
         "uncertainty": {"deviation": dict.fromkeys(slopes, 1.0), "correlation": np.eye(2).tolist(), **UNLIMITED},
-        "placement": {"sessions": {"monday": {}}, "new_session": np.eye(2).tolist()},
+        "placement": {**PLACED, "new_session": np.eye(2).tolist()},
     }
     plate, found = trials(tuple(f"plate {corner}" for corner in CORNERS)), Identification.from_plain(identified)
     linear = dict.fromkeys(NAMES, Sensitivity(corners[None], slopes, moved[None]))

@@ -37,8 +37,13 @@ FIBRES = {"tension": 50e3, "slack": 0.01, "toe": 0.02, "stiffening": 10e3, "comp
 FIBRES = {f"fibre_{name}_1": value for name, value in FIBRES.items()} | {"fibre_elevation_1": 0.0}
 
 
+def errors_on(trials, error, below):
+    """Errors of a law on trials."""
+    return {"trials": trials, "split": "validation", "law": error, "below": below}
+
+
 def law(**changes):
-    """Content of law.json."""
+    """Content of law.json, and what metrics.json adds."""
     constants = {"c10": 40e3, "bulk_1": 7e6, "ogden_3": 8e3, "prony_modulus_1": 20e3, "prony_time_1": 0.08}
     own = {
         "model": "law",
@@ -49,12 +54,13 @@ def law(**changes):
         "parameters": {},
         "deviation": {"c10": 400.0, "bulk_1": 6.5e6, "ogden_3": 100.0, "prony_modulus_1": 10.0, "prony_time_1": 1e-3},
         "at_bounds": ["prony_time_1"],
-        "validation": {"trials": ["80 g", "180 g"], "law": 4.9e-5, "below": 0.1025},
+        "validation": errors_on(["80 g", "180 g"], 4.9e-5, 0.1025),
         "classes": [
             {"groups": [], "constants": {"c10": 44e3, "bulk_1": 7e6}, "residual": 0.02, "validation": None},
             {"groups": ["elastic", "branches"], "constants": constants, "residual": 0.003, "validation": 1.2e-4},
         ],
         "data": {"name": "own", "trials": ["0.05 kg"]},
+        "against": "simulation",
     }
     return {**own, **changes}
 
@@ -95,15 +101,15 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
 
 @pytest.mark.usefixtures("no_drawing")
 def test_a_law_that_is_not_used_is_said_to_be_so(tmp_path):
-    page = run(tmp_path, law(accepted=False, validation={"trials": ["80 g"], "law": 0.2, "below": 0.1}))
+    page = run(tmp_path, law(accepted=False, validation=errors_on(["80 g"], 0.2, 0.1)))
     said = "The identified law is not used: its root mean square error on the validation trials (80 g) is 20 %"
     assert said in page.text
     assert "with the law" not in page.text
-    assert "failed" in law_text(law(validation={"trials": ["0.05 kg"], "law": 0.1, "below": None}))
+    assert "failed" in law_text(law(validation=errors_on(["0.05 kg"], 0.1, None)))
 
 
 def test_a_law_by_file_that_its_own_run_did_not_use_is_said_to_be_so():
-    given = law(file="other.json", validation={"trials": ["80 g"], "law": 0.1, "below": 0.2})
+    given = law(file="other.json", validation=errors_on(["80 g"], 0.1, 0.2))
     assert "did not use it" not in law_text({**given, "accepted_there": True})
     assert law_text({**given, "accepted_there": False}).endswith("did not use it: it was not clearly closer there.")
 

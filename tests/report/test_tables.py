@@ -1,5 +1,6 @@
 """Tables of the page, and which trials, markers and frames are shown."""
 
+from dataclasses import replace
 from io import StringIO
 from types import SimpleNamespace
 
@@ -9,9 +10,11 @@ from rich.console import Console
 
 from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
-from warp_resphys.data.recordings.marker_quality import quality_table
+from warp_resphys.data.recordings.marker_quality import MarkerQuality, quality_table
 from warp_resphys.io.safe_files import write_json
 from warp_resphys.io.settings import parse
+from warp_resphys.learning.identification.search import Identification
+from warp_resphys.learning.identification.uncertainty import Uncertainty
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM
 from warp_resphys.report.body_motions import instants
 from warp_resphys.report.control_section import control_section
@@ -115,16 +118,15 @@ def test_control_is_told_by_controller_and_speed():
 class TestIdentification:
     @pytest.fixture
     def identified(self):
-        return {
-            "parameters": {"youngs_modulus": 251.3e3, "stiffness_damping": 0.0029},
-            "at_bounds": ["stiffness_damping"],
-            "uncertainty": {
-                "deviation": {"youngs_modulus": 2513.0, "stiffness_damping": 1e-4},
-                "correlation": [[1.0, 0.5], [0.5, 1.0]],
-                "poorest": {"youngs_modulus": 0.1, "stiffness_damping": 0.99},
-                "poorest_deviation": 0.034,
-            },
-        }
+        parameters = {"youngs_modulus": 251.3e3, "stiffness_damping": 0.0029}
+        uncertainty = Uncertainty(
+            deviation={"youngs_modulus": 2513.0, "stiffness_damping": 1e-4},
+            correlation=[[1.0, 0.5], [0.5, 1.0]],
+            poorest={"youngs_modulus": 0.1, "stiffness_damping": 0.99},
+            poorest_deviation=0.034,
+            ranges={},
+        )
+        return Identification(parameters, at_bounds=("stiffness_damping",), uncertainty=uncertainty)
 
     def test_a_row_a_parameter(self, identified):
         modulus, damping = parameter_rows(identified, {"youngs_modulus": 264e3}, {"youngs_modulus": 250e3})
@@ -132,9 +134,9 @@ class TestIdentification:
         assert modulus.cells == [Cell("264"), Cell("251.3", beside="± 2.5"), Cell("250"), Cell("")]
         assert damping.head == "Stiffness damping [ms]"
         assert damping.cells == [Cell(NONE), Cell("2.90", beside="± 0.10"), Cell(NONE), Cell("yes")]
-        identified["parameters"]["youngs_modulus"] = -3.0
+        identified = replace(identified, parameters={"youngs_modulus": -3.0})
         assert parameter_rows(identified, {}, {})[0].cells[1].text == "0.0"
-        assert parameter_rows({**identified, "uncertainty": None}, {}, {})[0].cells[1].text == f"{MINUS}0.003"
+        assert parameter_rows(replace(identified, uncertainty=None), {}, {})[0].cells[1].text == f"{MINUS}0.003"
 
     @pytest.mark.parametrize(
         ("parameter", "value", "head", "text"),
@@ -153,21 +155,21 @@ class TestIdentification:
         ],
     )
     def test_names_and_units(self, parameter, value, head, text):
-        (row,) = parameter_rows({"parameters": {parameter: value}, "at_bounds": []}, {}, {})
+        (row,) = parameter_rows(Identification({parameter: value}), {}, {})
         assert (row.head, row.cells[1].text) == (head, text)
 
     def test_what_the_data_cannot_tell(self, identified):
         said = uncertainty_text("sysid", identified, {}).replace(NO_BREAK_SPACE, " ")
         assert said == "SysID: stiffness damping is least certain (3.4 % of the range)."
-        assert uncertainty_text("sysid", {**identified, "uncertainty": None}, {}) == ""
-        identified["uncertainty"] |= {"poorest_deviation": 1.9, "correlation": [[1.0, -0.95], [-0.95, 1.0]]}
-        said = uncertainty_text("sysid", identified, {})
+        assert uncertainty_text("sysid", replace(identified, uncertainty=None), {}) == ""
+        tied = replace(identified.uncertainty, poorest_deviation=1.9, correlation=[[1.0, -0.95], [-0.95, 1.0]])
+        said = uncertainty_text("sysid", replace(identified, uncertainty=tied), {})
         assert "the data do not constrain stiffness damping: set a prior." in said
         assert f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)" in said
 
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
-        identified["uncertainty"]["deviation"]["youngs_modulus"] = deviation
+        identified.uncertainty.deviation["youngs_modulus"] = deviation
         prior = {"mean": 250e3, "deviation": 10e3}
         ranges = {"youngs_modulus": parse(RangeSettings, {"lower": 5e4, "upper": 2e6, "prior": prior})}
         said = uncertainty_text("sysid", identified, ranges)
@@ -182,8 +184,7 @@ class TestIdentification:
 
 
 def test_rows_of_markers_that_were_never_seen():
-    marker = {"label": "A", "seen": 0.0, "gaps": 1, "longest_gap_frames": 9, "masked_frames": 9, "jumps": []}
-    table = quality_table([{**marker, "noise_mm": None, "drift_mm": None}])
+    table = quality_table([MarkerQuality("A", False, 0.0, 1, 9, 9, (), None, None)])
     assert table == {"A": ["0.0 %", "1", "9", "9", "0", "", ""]}
     table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
     assert table.columns == ["A", "B", "Root mean square"]

@@ -168,6 +168,7 @@ def _search(found):
             "correlation": correlation.tolist(),
             "poorest": dict(zip(found, [0.8, 0.6, 0.01, 0.0], strict=False)),
             "poorest_deviation": 0.12,
+            "ranges": dict.fromkeys(found, 1.0),
         },
     }
 
@@ -181,7 +182,9 @@ def write_folds(folder: Path, models=BEAM_MODELS):
         folds[trial] = read_json(folder / f"fold_{trial}" / "errors.json")
     means = {model: float(np.mean([fold["errors_mm"][model]["mean"] for fold in folds.values()])) for model in models}
     over = {model: {"mean": mean, "std": 0.1, "trajectories": 3, "diverged": 0} for model, mean in means.items()}
-    write_json(folder / "metrics.json", {"folds": folds, "errors_mm": over, "versions": {"numpy": "9"}})
+    write_json(
+        folder / "metrics.json", {"folds": folds, "errors_mm": over, "versions": {"numpy": "9"}, "device": "cpu"}
+    )
 
 
 ARM_MODELS = ("simulation", "sysid", "simfree", "resphys")

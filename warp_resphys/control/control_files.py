@@ -13,6 +13,7 @@ from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
 from ..io.safe_files import atomic_hdf5, create, read_array, read_checkpoint, read_hdf5, write_checkpoint
 from ..learning.residuals.correction import Learned
+from ..report.data import ReducedErrors
 from .linear_model import LinearModel
 from .polynomials import Polynomial, SquaredPolynomial
 from .reduced_force import ReducedForce
@@ -82,9 +83,9 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
         raise DataFileError(f"{path} is of an earlier version: delete it and run the same command again.") from error
 
 
-def read_quality(path: Path) -> Mapping[str, Any]:
+def read_quality(path: Path) -> ReducedErrors:
     """Reads the errors of a reduced model, and the counts of samples that it was fitted to."""
-    quality: Mapping[str, Any] = read_checkpoint(path, _REDUCED)[1]["quality"]
+    quality: ReducedErrors = read_checkpoint(path, _REDUCED)[1]["quality"]
     return quality
 
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import repeat
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from ..io.safe_files import write_json
 from ..io.settings import parse
 from ..mesh.motion_files import input_columns, write_csv
 from ..report.body_motions import DrivenBodies
+from ..report.data import ControlResults, ReducedErrors, TrackingErrors
 from ..robot.loading import load
 from ..settings.control import ControlSettings
 from ..settings.stage_keys import StageSettings
@@ -227,9 +228,9 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
 
 def _summary(
     folder: Path, control: ControlSettings, controllers: Sequence[str], motions: Mapping[str, MotionArrays]
-) -> dict[str, Any]:
+) -> ControlResults:
     """Content of control.json: errors [mm] by speed and controller, computing times, quality of the reduced models."""
-    by_speed: dict[str, Any] = {}
+    by_speed: dict[str, dict[str, TrackingErrors]] = {}
     for seconds in control.seconds:
         names = [motion_name(shape, seconds) for shape in control.shapes]
         errors = {name: 1e3 * np.linalg.norm(motions[name]["points"] - motions[name]["path"], axis=2) for name in names}
@@ -242,11 +243,11 @@ def _summary(
             for row, controller in enumerate(controllers)
         }
     times = np.concatenate([motion["seconds"] for motion in motions.values()], axis=1)
-    planned = {
+    planned: dict[str, dict[str, list[float]]] = {
         model: {name: read_motion(folder / plans_file(model), PLANNED, name)["errors_mm"].tolist() for name in motions}
         for model in control.models
     }
-    models = {model: read_quality(folder / reduced_file(model)) for model in control.models}
+    models: dict[str, ReducedErrors] = {model: read_quality(folder / reduced_file(model)) for model in control.models}
     return {
         "tracking": by_speed,
         "command_ms": {

@@ -1,10 +1,10 @@
 """Simulated bodies that are commanded and observed step by step: robots, reduced models, the simulated laboratory."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -107,7 +107,7 @@ class RobotWorld(World[State]):
     ) -> None:
         if given not in robot.inputs:
             raise InputError(f"there is no input {given!r}: the robot has {', '.join(robot.inputs) or 'none'}.")
-        if spread > 0.0 and not (robot.description.uncertainty or {}).get("deviation"):
+        if spread > 0.0 and robot.description.uncertainty is None:
             raise InputError(
                 f"{robot.description.name} has no standard deviations of its parameters, which spread needs: set "
                 "spread=0, or choose a run that identifies parameters."
@@ -121,13 +121,12 @@ class RobotWorld(World[State]):
 
     @override
     def vary(self, random: Sequence[np.random.Generator]) -> None:
-        if not self._spread:
-            return
         description = self._nominal.description
-        uncertainty: Mapping[str, Any] = description.uncertainty or {}
-        names = list(uncertainty["deviation"])
-        deviation = np.array([uncertainty["deviation"][name] for name in names])
-        root = np.linalg.cholesky(np.array(uncertainty["correlation"]) + 1e-9 * np.eye(len(names)))
+        uncertainty = description.uncertainty
+        if not self._spread or uncertainty is None:
+            return
+        names, deviation = [*uncertainty.deviation], np.array([*uncertainty.deviation.values()])
+        root = np.linalg.cholesky(np.array(uncertainty.correlation) + 1e-9 * np.eye(len(names)))
         mean = np.array([description.parameters[name] for name in names])
         drawn = np.stack([root @ generator.standard_normal(len(names)) for generator in random])
         values = mean + self._spread * deviation * drawn

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,18 @@ from ..io.errors import DataFileError, InputError, listed
 
 _MILLI = 1e3
 _MOST_FITS = 20_000  # Sets of markers that are tried in the search for outliers.
+
+
+class RegistrationSummary(TypedDict, total=False):
+    """Registration of a trial in registration.json."""
+
+    positions: dict[str, list[float]]  # (3,) of the markers, in the frame of the body [m]
+    rms_mm: float
+    residual_mm: dict[str, float | None]  # by marker
+    outliers: list[str]
+    shift_mm: dict[str, list[float]]  # (3,) of the markers
+    mounting: dict[str, dict[str, float]]  # `distance_mm` and `angle_deg` from the common one, by rigid body
+    vertical_deg: float  # between the verticals of this trial and of all
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,14 +70,54 @@ def law_path(name: str) -> Path:
     return known[name]
 
 
-def law_content(model: str, constants: Mapping[str, float]) -> dict[str, Any]:
+class LawTest(TypedDict):
+    """Errors of a law on the trials that it was tested on, root mean squares over the amplitude of the motion."""
+
+    trials: list[str]
+    split: str  # that they belong to
+    law: float | None  # with the law; None where the simulation failed
+    below: float | None  # without it
+
+
+class TriedClass(TypedDict):
+    """A class of laws that was tried."""
+
+    groups: list[str]
+    constants: dict[str, float]
+    residual: float | None  # of the weak form
+    validation: float | None  # as `LawTest.law`
+
+
+class LawContent(TypedDict):
+    """Content of law.json; only the model and the constants of a law are needed to use it."""
+
+    model: str
+    constants: dict[str, float]
+    format: NotRequired[int]
+    units: NotRequired[dict[str, str]]  # by constant
+    accepted: NotRequired[bool]  # whether it helps on the trials that it was tested on
+    parameters: NotRequired[dict[str, float]]  # identified beside it
+    deviation: NotRequired[dict[str, float]]  # standard deviations of constants and parameters
+    at_bounds: NotRequired[list[str]]
+    validation: NotRequired[LawTest]
+    groups: NotRequired[list[str]]  # of terms, besides the modulus
+    loss: NotRequired[float]
+    classes: NotRequired[list[TriedClass]]
+    stretches: NotRequired[list[float]]  # least and largest in the trials that it was identified from
+    data: NotRequired[dict[str, str | list[str]]]  # `name` of the run that identified it, and its training `trials`
+    versions: NotRequired[dict[str, str]]
+    file: NotRequired[str]  # of a law of another run
+    accepted_there: NotRequired[bool]
+
+
+def law_content(model: str, constants: Mapping[str, float]) -> LawContent:
     """Returns the content of a law's file, see `read_law`."""
     units = {name: unit_of(name) for name in constants}
     return {"format": LAW_FORMAT, "model": model, "constants": dict(constants), "units": units}
 
 
-def read_law(name: str) -> dict[str, Any]:
-    """Contents of a law that `identify_law` wrote, with at least its ``model`` and its ``constants``.
+def read_law(name: str) -> LawContent:
+    """Reads a law that `identify_law` wrote.
 
     Args:
         name: as for `law_path`.
@@ -113,7 +153,7 @@ def read_law(name: str) -> dict[str, Any]:
             f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
         )
     absent = dict.fromkeys(("c10", "bulk_1"), 0.0) if known["model"] == ConvexMaterial.model else {}
-    return {**known, "constants": absent | constants}
+    return {**known, "model": known["model"], "constants": absent | constants}
 
 
 def unit_of(name: str) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ from .build import build_body, build_simulator, simulation_device
 from .files import METRICS, REPORT
 from .folds import workers_for
 from .simulate import build_target, weights
+
+if TYPE_CHECKING:
+    from ..report.ablation_page import AblationMetrics
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
@@ -59,9 +62,9 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
     metrics = _metrics(folder, run)
     write_json(folder / METRICS, metrics)
-    from ..report.ablation_page import ablation_table, verdict  # matplotlib
+    from ..report.ablation_page import MarkerErrors, ablation_table, verdict  # matplotlib
 
-    rows = metrics["by_markers"]
+    rows = [MarkerErrors(**row) for row in metrics["by_markers"]]
     show(run.heading, ablation_table(rows), verdict(rows, metrics["uncorrected_mm"]), f"Report: {folder / REPORT}")
 
 
@@ -184,7 +187,7 @@ def report_ablation(context: StageContext) -> None:
     write_ablation_report(context.run_dir / REPORT, _metrics(context.run_dir, run), run, **counts)
 
 
-def _metrics(folder: Path, run: RunSettings) -> dict[str, Any]:
+def _metrics(folder: Path, run: RunSettings) -> "AblationMetrics":
     """Contents of metrics.json: errors, time and memory of finished stages, versions and device."""
     return {
         **read_json(folder / SUMMARY),

@@ -140,21 +140,17 @@ class Experiment:
             dataset, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **given
         )
 
-    def identification(self, model: str) -> dict[str, Any]:
-        """Returns the identification of a model: parameters, their uncertainty and the placement of markers, if any."""
+    def identified(self, model: str) -> Identification:
+        """Returns the identification of a model's simulator: parameters, their uncertainty, marker places; or none."""
         key = self.sources(model)[1]
         if key is None or (key != LAW and self.settings.identify is None):
-            return {}
-        identified = read_if_there(self.folder / IDENTIFICATION)
+            return Identification()
+        identified = Identification.read(self.folder / IDENTIFICATION)
         if key != LAW:
-            return dict(identified[key])
-        sysid, parameters = identified.get("sysid", {}), read_json(self.folder / LAW_FILE)["parameters"]
-        own = {name: value for name, value in sysid.get("own", {}).items() if split_name(name)[0] in parameters}
-        return {"parameters": parameters, "own": own, "placement": sysid.get("placement")}
-
-    def identified(self, model: str) -> Identification:
-        """Returns the identified parameters of a model's simulator and its marker places; empty without any."""
-        return Identification.from_plain(self.identification(model))
+            return identified[key]
+        sysid, parameters = identified.get("sysid", Identification()), read_json(self.folder / LAW_FILE)["parameters"]
+        of_trials = {name: value for name, value in sysid.own.items() if split_name(name)[0] in parameters}
+        return Identification(parameters, of_trials, sysid.placement)
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator, by name, and those of trials; empty without any."""

@@ -50,7 +50,6 @@ def fold_folder(trial: str) -> str:
     return f"fold_{trial}"
 
 
-def read_if_there(path: Path) -> dict[str, Any]:
+def read_if_there(path: Path) -> Any:
     """Contents of a JSON file, or an empty dictionary if the file does not exist."""
-    content: dict[str, Any] = read_json(path) if path.is_file() else {}
-    return content
+    return read_json(path) if path.is_file() else {}

@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -17,7 +16,7 @@ from ..io.progress import Progress
 from ..io.resuming import Stage, StageInterrupted, run_stages, unfinished
 from ..io.safe_files import read_array, read_hdf5
 from ..learning.baselines import BASELINES
-from ..learning.intervals import LEVEL, intervals_of_each_other
+from ..learning.intervals import LEVEL, IntervalTable, ModelIntervals, intervals_of_each_other
 from ..settings.run_keys import ParallelSettings
 from .build import simulation_device
 from .experiment import INTERVAL_MODELS
@@ -106,14 +105,14 @@ def _run(fold: Fold) -> None:
         raise WorkerError(f"fold {fold.name}: {error}") from error
 
 
-def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> dict[str, Any]:
+def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> IntervalTable:
     """Prediction intervals of a cross-validation; each fold is calibrated on the test trials of the other folds.
 
     Args:
         folder: of the dataset.
         folders: folders of the folds, by the trial that a fold leaves out.
     """
-    data, names, models = Trials.read(folder / DATASET), list(folders), dict[str, Any]()
+    data, names, models = Trials.read(folder / DATASET), list(folders), dict[str, ModelIntervals]()
     for model in (*BASELINES, *INTERVAL_MODELS) if data.bound is not None and len(names) > 2 else ():
         series: dict[str, list[FloatArray]] = {"observed": [], "spread": []}
         for own in folders.values():
@@ -124,4 +123,4 @@ def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> dict[str, A
             spreads = series["spread"] if len(series["spread"]) == len(names) else None
             if (covered := intervals_of_each_other(data, names, series["observed"], spreads)) is not None:
                 models[model] = covered
-    return {"intervals": {"level": LEVEL, "calibrated_on": "folds", "models": models}} if models else {}
+    return {"level": LEVEL, "calibrated_on": "folds", "models": models}

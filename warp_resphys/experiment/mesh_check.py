@@ -1,7 +1,5 @@
 """Stage: the simulation of test trials with a finer mesh."""
 
-from typing import Any
-
 import numpy as np
 import torch
 
@@ -15,6 +13,7 @@ from ..io.safe_files import write_json
 from ..learning.error_tables import amplitudes
 from ..learning.metrics import marker_errors, summarise
 from ..learning.replay import Replay
+from ..report.data import MeshCheck
 from ..settings.stage_keys import StageSettings
 from .build import finer
 from .experiment import Experiment
@@ -34,7 +33,7 @@ def check_mesh(context: StageContext) -> None:
     refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
     other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})
     model = "simulation" if settings.identify is None else "sysid"
-    content: dict[str, Any] = {"model": model}
+    content: MeshCheck = {"model": model}
     try:
         experiments = [Experiment(meshed, context.run_dir) for meshed in (settings, other)]
         meshes = [experiment.body.mesh for experiment in experiments]

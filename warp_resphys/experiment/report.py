@@ -11,10 +11,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import TypeAdapter
 
 from ..data.obstacle_surface import ObstacleSurface
+from ..data.recordings.marker_quality import Quality
+from ..data.registration import RegistrationSummary
 from ..data.rigid_bodies import as_markers, owners
 from ..data.trials import STATIC, Trials
+from ..energies.catalogue import LawContent
 from ..energies.muscles import Muscles
 from ..energies.tendons import Tendons
 from ..fem.bodies import Body
@@ -23,12 +27,14 @@ from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.resuming import StageContext, package_versions, resources_used
 from ..io.safe_files import read_array, read_hdf5, read_json
+from ..learning.error_tables import ErrorTables
+from ..learning.identification.search import Identification
 from ..learning.intervals import half_widths_of
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.selection import select_vertices
 from ..mesh.volume_mesh import Mesh
-from ..report.data import Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
+from ..report.data import Driven, Film, FollowedPath, Metrics, Placed, Recordings, RunReport, TrialResults
 from ..report.wording import MODELS, models_in_figures
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity
@@ -78,7 +84,8 @@ def make_folds_report(context: StageContext) -> None:
     from ..report import run_page  # matplotlib
 
     folder, run = context.run_dir, context.settings
-    metrics, reader = {"device": str(choose_device(run.device)), **read_json(folder / METRICS)}, RunReader(folder, run)
+    metrics: Metrics = read_json(folder / METRICS)
+    reader = RunReader(folder, run)
     data = RunReport(
         metrics=metrics,
         settings=run,
@@ -95,7 +102,7 @@ def common_folder(folder: Path) -> Path:
     return folder if (folder / DATASET).is_file() else folder.parent
 
 
-def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> dict[str, Any]:
+def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> Metrics:
     """Contents of metrics.json of a split.
 
     These are errors, noise of the observations if known, selected weights, results of identification and
@@ -106,39 +113,42 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
         stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
     files = {model: folder / training_file(model) for model in LEARNED}
-    identified, truth = map(read_if_there, (folder / IDENTIFICATION, common_folder(folder) / TRUTH))
-    law = {} if run.law is None else read_if_there(folder / LAW_FILE)
-    if law:
-        kept = ("accepted", "groups", "constants", "validation", "data", "file", "accepted_there")
-        law = {key: law[key] for key in kept if key in law}
-        law["against"] = "sysid" if "sysid" in identified else "simulation"
-    more = {
-        "law": law,
-        "reconstruction": read_if_there(folder / RECONSTRUCTION),
-        "control": read_if_there(folder / CONTROL) if run.control is not None else {},
-        "shapes": read_if_there(folder / SHAPES) if run.shapes else {},
-        "placement": placement(read_if_there(common_folder(folder) / REGISTRATION), identified),
-        "mesh_check": {} if run.mesh_check is None else read_if_there(folder / MESH_CHECK),
-        "seconds_per_test_trajectory": read_if_there(folder / TIMES).get("seconds", {}) if run.timing else {},
-        **({"noise_mm": truth["noise_mm"]} if "noise_mm" in truth else {}),
-    }
-    return {
-        **read_json(folder / ERRORS),
+    common, identified = common_folder(folder), Identification.read(folder / IDENTIFICATION)
+    errors: ErrorTables = read_json(folder / ERRORS)
+    metrics: Metrics = {
+        **errors,
         "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
-        "parameters": {name: x["parameters"] for name, x in identified.items() if "parameters" in x},
-        "first_guesses": {name: x["first_guess"] for name, x in identified.items() if "first_guess" in x},
-        **{key: value for key, value in more.items() if value},
+        "parameters": {name: result.parameters for name, result in identified.items()},
+        "first_guesses": {name: result.first_guess for name, result in identified.items() if result.first_guess},
         **resources_used(folder, stages),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
     }
+    law: LawContent | None = None if run.law is None else read_if_there(folder / LAW_FILE) or None
+    if law is not None:
+        metrics["law"] = {**law, "against": "sysid" if "sysid" in identified else "simulation"}
+    if reconstruction := read_if_there(folder / RECONSTRUCTION):
+        metrics["reconstruction"] = reconstruction
+    if run.control is not None and (control := read_if_there(folder / CONTROL)):
+        metrics["control"] = control
+    if run.shapes and (shapes := read_if_there(folder / SHAPES)):
+        metrics["shapes"] = shapes
+    if registered := read_if_there(common / REGISTRATION):
+        metrics["placement"] = placement(registered, identified)
+    if run.mesh_check is not None and (check := read_if_there(folder / MESH_CHECK)):
+        metrics["mesh_check"] = check
+    if run.timing and (times := read_if_there(folder / TIMES)):
+        metrics["seconds_per_test_trajectory"] = times["seconds"]
+    if "noise_mm" in (truth := read_if_there(common / TRUTH)):
+        metrics["noise_mm"] = truth["noise_mm"]
+    return metrics
 
 
-def placement(registered: Mapping[str, Any], identified: Mapping[str, Any]) -> dict[str, float]:
+def placement(registered: Mapping[str, RegistrationSummary], identified: Mapping[str, Identification]) -> Placed:
     """Largest residual of the registration of a trial [mm], and the identified rotation of the markers [degrees]."""
-    turns = [math.hypot(*model["placement"]["turn"]) for model in identified.values() if model.get("placement")]
-    rms = max((fit["rms_mm"] for fit in registered.values()), default=0.0)
-    return {"rms_mm": rms, "turned_deg": math.degrees(max(turns, default=0.0))} if registered else {}
+    placed = [result.placement for result in identified.values() if result.placement is not None]
+    turned = max((math.hypot(*one["turn"]) for one in placed), default=0.0)
+    return {"rms_mm": max(fit["rms_mm"] for fit in registered.values()), "turned_deg": math.degrees(turned)}
 
 
 def true_contact(run: RunSettings) -> dict[str, float]:
@@ -190,31 +200,32 @@ class RunReader:
     def report(self) -> RunReport:
         """Returns all data of the page."""
         run, body, trials = self.run, self.body, self.trials
-        identification = read_if_there(self.folder / IDENTIFICATION)
-        law = {} if run.law is None else read_if_there(self.folder / LAW_FILE)
+        identification = Identification.read(self.folder / IDENTIFICATION)
+        metrics = collect_metrics(self.folder, run)
+        material = read_if_there(self.common / TRUTH).get("material", {})
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
         assert run.tip is not None
-        names = {name for model in identification.values() for name in model.get("parameters", {})}
+        names = {name for result in identification.values() for name in result.parameters}
         histories = {model: read_if_there(self.folder / training_file(model)).get("epochs") for model in LEARNED}
         return RunReport(
-            metrics=collect_metrics(self.folder, run),
+            metrics=metrics,
             settings=run,
             mesh=body.mesh,
             fixed=body.fixed_vertices,
             tip=np.empty(0, np.int64) if trials.labels else select_vertices(body.mesh, **run.tip.arguments()),
             chambers=self._driven_chambers(),
             tendons=_routes(body),
-            obstacles=ObstacleSurface.of(body, identification.get("sysid", {}).get("parameters")),
+            obstacles=ObstacleSurface.of(body, identification.get("sysid", Identification()).parameters),
             moved={name: {key: x[:, row] for key, x in moved.items()} for row, name in enumerate(trials.names)},
             trials=trials,
             film=self.film,
             driven=self.driven,
             recordings=self.recordings(*self._at_rest()),
             identification=identification,
-            law=law,
-            **(self._stretches(law) if law else {}),
+            **(self._stretches(metrics["law"]) if "law" in metrics else {}),
             start=configured_parameters(build_simulator(run, run.simulation, payload_at=run.payload_at), sorted(names)),
-            truth={**read_if_there(self.common / TRUTH).get("material", {}), **true_contact(run)},
+            truth={name: value for name, value in material.items() if name != "model"} | true_contact(run),
+            true_material=material.get("model", "corotated"),
             training={model: epochs for model, epochs in histories.items() if epochs},
             followed=self._followed(),
         )
@@ -227,7 +238,7 @@ class RunReader:
         """
         dataset, run = self.dataset, self.run
         bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
-        errors = read_json(self.folder / ERRORS)
+        errors: ErrorTables = read_json(self.folder / ERRORS)
         with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
             rolled = tuple(map(str, file.attrs["names"]))
             test = [name for name in rolled if self.scaled is None or name not in self.scaled.names]
@@ -241,7 +252,8 @@ class RunReader:
             spread, known = (*shape[:2], len(owners(dataset.labels))), [m for m in models if f"{m}_spread" in file]
             positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
             spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in known}
-        half_widths = half_widths_of(dataset, test, errors, positions, spreads)
+        calibrated = errors["intervals"]["models"] if "intervals" in errors else {}
+        half_widths = half_widths_of(dataset, test, calibrated, positions, spreads)
         unseen = None if run.markers is None else marker_view_of(run.markers, dataset.labels, dataset.sets).unseen
         rows = dataset.rows(test)
         times, target = dataset.times[rows], dataset.observed[rows]
@@ -293,7 +305,7 @@ class RunReader:
         dataset, scaled, quantity = self.dataset, self.scaled, driving_quantity(self.run)
         if quantity is None or quantity.name not in dataset.inputs:
             return None
-        values: dict[str, Any] = {}
+        values: dict[str, FloatArray] = {}
         for trials in filter(None, (dataset, scaled)):
             values |= dict(zip(trials.names, trials.inputs[quantity.name], strict=True))
         return Driven(
@@ -318,10 +330,11 @@ class RunReader:
         beside = [] if self.run.fixed is not None else [*markers.reference]
         known: dict[str, Any] = {**markers.tracked, **markers.reference}
         nominal = {label: np.add(place, moved.get(label, 0.0)) for label, place in known.items()}
-        quality, registered = (read_json(self.common / name) for name in (QUALITY, REGISTRATION))
+        quality = TypeAdapter(dict[str, Quality]).validate_python(read_json(self.common / QUALITY))
+        registered: dict[str, RegistrationSummary] = read_json(self.common / REGISTRATION)
         return Recordings(quality, registered, nominal, beside, mesh)
 
-    def _stretches(self, law: Mapping[str, Any]) -> dict[str, Any]:
+    def _stretches(self, law: LawContent) -> dict[str, Any]:
         """Principal stretches at the centres of the cells, for the section on the law.
 
         Where markers are observed, the test trials are the body of the film, which is simulated.

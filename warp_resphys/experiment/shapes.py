@@ -7,7 +7,6 @@ simulated trials of a run (`experiment.simulate`).
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from ..io.resuming import StageContext
 from ..io.safe_files import read_json, write_json
 from ..learning.metrics import marker_errors, summarise
 from ..mesh.selection import select_vertices
+from ..report.data import ShapeErrors
 from ..settings.body import BodySettings, SimulatorSettings
 from ..settings.mesh import PlaceSettings
 from ..settings.played import ShapeSettings
@@ -82,7 +82,7 @@ def check_shape(shape: ShapeSettings) -> None:
             raise InputError("held.at selects fixed vertices only: hang the weight on vertices that can move.")
 
 
-def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSettings) -> dict[str, Any]:
+def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSettings) -> ShapeErrors:
     """Result of a shape, which its target holds or inflates, and releases."""
     target, mesh = _target(settings, shape), build_body(BodySettings.of(shape)).mesh
     seen = vertices_in(target.body.mesh, mesh).to(target.rest_positions)
@@ -102,7 +102,7 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
             q = simulator.rollout(start, settings.data.steps * substeps, None, values).q[::substeps, 0]
             errors[model] = summarise([marker_errors(q.cpu().numpy(), observed)])["mean"]
     moved = 1e3 * float(np.linalg.norm(observed - mesh.vertices, axis=-1).max())
-    result: dict[str, Any] = {"vertices": len(mesh.vertices), "moved_mm": moved, "errors_mm": errors}
+    result: ShapeErrors = {"vertices": len(mesh.vertices), "moved_mm": moved, "errors_mm": errors}
     if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
         result["outside"] = share_outside(principal_stretches(mesh, observed), *law["stretches"])
     return result

@@ -18,7 +18,7 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from filelock import FileLock, Timeout
 
@@ -224,7 +224,14 @@ def finished_record(run_dir: str | Path, name: str) -> dict[str, Any]:
     return record
 
 
-def resources_used(run_dir: str | Path, names: Sequence[str]) -> dict[str, Any]:
+class Resources(TypedDict):
+    """Resources that the stages of a run used."""
+
+    seconds: dict[str, float]  # by stage
+    peak_memory_gib: float | None  # largest of the stages
+
+
+def resources_used(run_dir: str | Path, names: Sequence[str]) -> Resources:
     """Returns durations [s] and the largest peak of memory [GiB] of finished stages, for `metrics.json`."""
     paths = {name: _record(Path(run_dir), name) for name in names}
     records = {name: read_json(path) for name, path in paths.items() if path.is_file()}

@@ -12,11 +12,18 @@ import numpy as np
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.parts import Parts, TrialPart
-from .error_tables import ComparedModels, amplitudes, counted
+from .error_tables import ComparedModels, ErrorTables, amplitudes, counted
 from .evaluation import rollout_parts
 from .identification.identification import Identification
-from .identification.sensitivity import Sensitivity, free_fits, left_out_changes, parameter_spread, sensitivities
-from .intervals import LEVEL, Intervals, coverage, predicted_trials, rest_places
+from .identification.sensitivity import (
+    FreeFit,
+    Sensitivity,
+    free_fits,
+    left_out_changes,
+    parameter_spread,
+    sensitivities,
+)
+from .intervals import LEVEL, Intervals, IntervalTable, ModelIntervals, coverage, predicted_trials, rest_places
 from .observed_motions import ObservedMotions
 from .residuals.correction import Learned
 from .without_physics import without_physics
@@ -82,12 +89,12 @@ class Comparison:
         """Parts of the tested trials, and of those of the calibration, by model, after they were rolled out."""
 
         def cut(model: str, names: Sequence[str], label: str) -> list[TrialPart]:
-            own = self.models[model]
-            made = own.simulator, self.motions, names, own.learned, own.identified
+            used = self.models[model]
+            made = used.simulator, self.motions, names, used.learned, used.identified
             return rollout_parts(*made, self.parts.batch, self.filmed, f"{label}{model}")
 
         tested = {model: cut(model, self.names, "") for model in self.models}
-        with_intervals = [model for model, own in self.models.items() if own.has_intervals]
+        with_intervals = [name for name, model in self.models.items() if model.has_intervals]
         calibrating = {model: cut(model, self.calibration, "calibration_") for model in with_intervals}
         self.parts.run([*chain(*tested.values(), *calibrating.values())])
         return tested, calibrating
@@ -95,8 +102,8 @@ class Comparison:
     def _in_order(self, model: str, name: str) -> Any:
         """An array of the roll-outs of a model, (R, ...) in the order of the tested trials."""
         parts = self._rolled_out[0][model]
-        order = [own for part in parts for own in part.names]
-        rows = [order.index(own) for own in self.names]
+        order = [trial for part in parts for trial in part.names]
+        rows = [order.index(trial) for trial in self.names]
         if name == "observed":
             return self.parts.joined(parts, name, self.motions.trials.observed.shape[1])[rows]
         return np.concatenate([self.parts.read(part, name) for part in parts])[rows]
@@ -152,30 +159,37 @@ class Comparison:
         """Variances (R, T, M) of markers and rigid bodies due to the parameters [m^2], by model."""
         return self._spreads(self.groups["1"], self._linear)
 
-    def errors(self) -> dict[str, Any]:
+    def errors(self) -> ErrorTables:
         """Returns all that errors.json has: tables, baselines, displacements, free fits and intervals."""
         test, (_, plain, missing) = self.groups["1"], self._without_physics
-        networks = {name: own.learned for name, own in self.models.items() if own.learned is not None}
-        left = {name: self._in_order(name, "left") for name, own in networks.items() if own.range_ is not None}
+        networks = {name: model.learned for name, model in self.models.items() if model.learned is not None}
+        left = {name: self._in_order(name, "left") for name, learned in networks.items() if learned.range_ is not None}
         compared = ComparedModels(
             self.motions, self.train, self.groups, self.simulated, left, self.reconstructed, self.horizons
         )
-        content = compared.errors() | {"baselines": plain} | ({"missing_baselines": missing} if missing else {})
+        content = compared.errors()
+        content["baselines"] = plain
+        if missing:
+            content["missing_baselines"] = missing
         sideways = dict(zip(self.names, self._in_order([*self.models][-1], "sideways").tolist(), strict=True))
         if known := {name: sideways[name] for name in test if math.isfinite(sideways[name])}:
             content["sideways_mm"] = known
-        return content | self._free_fits() | (self._intervals() if self.calibration else {})
+        if any((fits := self._free_fits()).values()):
+            content["free_fits"] = fits
+        if self.calibration and (intervals := self._intervals())["models"]:
+            content["intervals"] = intervals
+        return content
 
-    def _free_fits(self) -> dict[str, Any]:
-        """Entry ``free_fits``, by model; empty if nothing could be fitted."""
+    def _free_fits(self) -> dict[str, list[FreeFit]]:
+        """Returns what would remain of the errors if something were free, by model."""
         names, fits = self.groups["1"], {}
         observed = dict(zip(names, counted(self.motions, self.train, names), strict=True))
-        for model, own in self._linear.items():
+        for model, linear in self._linear.items():
             predicted = dict(zip(names, self.simulated[model][: len(names)], strict=True))
-            fits[model] = free_fits(self.motions.trials, observed, predicted, own)
-        return {"free_fits": fits} if any(fits.values()) else {}
+            fits[model] = free_fits(self.motions.trials, observed, predicted, linear)
+        return fits
 
-    def _intervals(self) -> dict[str, Any]:
+    def _intervals(self) -> IntervalTable:
         """Prediction intervals by model and their coverage of the tested trials, see `intervals`.
 
         Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`). The
@@ -188,13 +202,13 @@ class Comparison:
         learned = [row for row, name in enumerate(names) if name in self.train]
         observed[learned, motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
         linear = self._linearised(names, uncertain=True)
-        changes = {m: left_out_changes(dataset, names, self.models[m].identified, own) for m, own in linear.items()}
+        changes = {m: left_out_changes(dataset, names, self.models[m].identified, x) for m, x in linear.items()}
         simulated, *_ = without_physics(motions, names, self.train, left_out=True)
-        for model, own in self._rolled_out[1].items():
+        for model, parts in self._rolled_out[1].items():
             change = changes.get(model)
-            simulated[model] = self.parts.joined(own, "observed", dataset.observed.shape[1])
+            simulated[model] = self.parts.joined(parts, "observed", dataset.observed.shape[1])
             simulated[model] += 0.0 if change is None else change
-        spreads, models = self._spreads(names, linear, left_out=True), dict[str, Any]()
+        spreads, models = self._spreads(names, linear, left_out=True), dict[str, ModelIntervals]()
         for model in (model for model in simulated if model in self.simulated):
             trials = predicted_trials(dataset, names, simulated[model], observed, spreads.get(model))
             if (intervals := Intervals.calibrated(trials, rest)) is None:
@@ -208,4 +222,4 @@ class Comparison:
                 models[model]["without_spread"] = alone.plain()
         without = any(change is not None for change in changes.values())
         split = "left_out" if without else "training" if learned else "validation"
-        return {"intervals": {"level": LEVEL, "calibrated_on": split, "models": models}} if models else {}
+        return {"level": LEVEL, "calibrated_on": split, "models": models}

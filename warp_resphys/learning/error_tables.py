@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
@@ -11,8 +11,37 @@ from ..data.rigid_bodies import angles, as_markers, corners_of, owners
 from ..data.trials import STATIC, Trials
 from ..io.arrays import FloatArray, IntArray
 from .evaluation import first_frame
-from .metrics import errors_per_marker, marker_errors, summarise, summarise_trajectories
+from .identification.sensitivity import FreeFit
+from .intervals import IntervalTable
+from .metrics import ErrorSummary, TrialErrors, errors_per_marker, marker_errors, summarise, summarise_trajectories
 from .observed_motions import ObservedMotions
+
+
+class RangeExits(TypedDict):
+    """Roll-outs of a model that left the training range."""
+
+    left: int  # their number
+    first_s: dict[str, float]  # time at which each left, by trial
+
+
+class ErrorTables(TypedDict, total=False):
+    """Content of errors.json."""
+
+    errors_mm: dict[str, ErrorSummary]  # by model
+    per_trajectory: list[TrialErrors]
+    errors_vs_reconstruction_mm: dict[str, ErrorSummary]  # by model
+    per_marker: dict[str, dict[str, float | None]]  # mean [mm] by model and marker; None where a roll-out diverged
+    orientations_deg: dict[str, dict[str, float | None]]  # mean by model and rigid body
+    horizons: dict[str, dict[str, ErrorSummary]]  # by duration [s] and model
+    phases: dict[str, dict[str, ErrorSummary]]  # by phase of the inputs and model
+    range: dict[str, RangeExits]  # by model with a network
+    scales: dict[str, dict[str, ErrorSummary]]  # by scale of the inputs and model
+    scales_range: dict[str, dict[str, RangeExits]]
+    baselines: dict[str, str]  # settings of the models without physics, in words
+    missing_baselines: dict[str, str]  # why one is missing
+    sideways_mm: dict[str, float]  # of the markers at first, by trial
+    free_fits: dict[str, list[FreeFit]]  # by model
+    intervals: IntervalTable
 
 
 @dataclass(frozen=True)
@@ -37,8 +66,8 @@ class ComparedModels:
     reconstructed: FloatArray | None = None
     horizons: Sequence[float] = ()
 
-    def errors(self) -> dict[str, Any]:
-        """Returns all tables, as in errors.json."""
+    def errors(self) -> ErrorTables:
+        """Returns the tables that depend on the roll-outs alone."""
         dataset, names = self.motions.trials, self.groups["1"]
         every, count = [name for group in self.groups.values() for name in group], len(names)
         points = counted(self.motions, self.train, every)
@@ -50,7 +79,7 @@ class ComparedModels:
             test["reconstruction"] = self.reconstructed
         errors = {model: _errors(x, observed, first) for model, x in test.items()}
         sizes = {name: 1e3 * size for name, size in amplitudes(dataset, names).items()}
-        content: dict[str, Any] = {
+        content: ErrorTables = {
             "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
             "per_trajectory": [
                 {**row, "amplitude_mm": sizes[row["name"]]} for row in summarise_trajectories(tuple(names), errors)
@@ -65,39 +94,42 @@ class ComparedModels:
             content["per_marker"] = {model: errors_per_marker(x, seen, labels) for model, x in test.items()}
         if bodies := corners_of(dataset.labels):
             content["orientations_deg"] = {
-                model: {name: _mean_angle(x[:count, :, own], points[:count, :, own]) for name, own in bodies.items()}
+                model: {name: _mean_angle(x[:count, :, at], points[:count, :, at]) for name, at in bodies.items()}
                 for model, x in self.simulated.items()
             }
-        by_time = self._by_horizon(test, observed) | self._by_phase(test, observed)
-        return content | by_time | self._by_scale(models, observed)
+        if horizons := self._by_horizon(test, observed):
+            content["horizons"] = horizons
+        if phases := self._by_phase(test, observed):
+            content["phases"] = phases
+        return content | self._by_scale(models, observed)
 
-    def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
-        """Entry ``horizons``: errors of the first seconds, by duration and model; empty without any."""
+    def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
+        """Returns the errors of the first seconds by duration and model."""
         found = {}
         for seconds in self.horizons:
             frames = slice(round(seconds / self.motions.trials.time_step) + 1)
             errors = {m: _errors(x[:, frames], observed[:, frames], [0] * len(observed)) for m, x in test.items()}
             found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
-        return {"horizons": found} if found else {}
+        return found
 
-    def _by_phase(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
-        """Entry ``phases``: errors by phase of the inputs and model; empty without inputs."""
+    def _by_phase(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
+        """Returns the errors by phase of the inputs and model; empty without inputs."""
         names = self.groups["1"]
         at, seen = phases_of(self.motions.trials, names), np.isfinite(observed[: len(names)]).all(-1).any(-1)
         frames = {phase: (at == phase) & seen for phase in PHASES}
-        found = {
+        return {
             phase: {
-                model: summarise(marker_errors(x[k, own], observed[k, own]) for k, own in enumerate(rows) if own.any())
+                model: summarise(marker_errors(x[k, at], observed[k, at]) for k, at in enumerate(rows) if at.any())
                 for model, x in test.items()
             }
             for phase, rows in frames.items()
             if rows.any()
         }
-        return {"phases": found} if found else {}
 
-    def _by_scale(self, models: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, Any]:
-        """Entries of trials that left the training range, and of scaled inputs."""
-        dataset, count, content = self.motions.trials, len(self.groups["1"]), dict[str, Any]()
+    def _by_scale(self, models: Mapping[str, FloatArray], observed: FloatArray) -> ErrorTables:
+        """Returns the entries on trials that left the training range, and on scaled inputs."""
+        dataset, count = self.motions.trials, len(self.groups["1"])
+        content: ErrorTables = {}
         at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(self.groups)}
         ranges = {
             scale: {m: _range(steps[rows], self.groups[scale], dataset.time_step) for m, steps in self.left.items()}
@@ -111,7 +143,8 @@ class ComparedModels:
                 scale: {m: summarise(_errors(x[rows], observed[rows], first)) for m, x in models.items()}
                 for scale, rows in at.items()
             }
-            content |= {"scales_range": ranges} if self.left else {}
+            if self.left:
+                content["scales_range"] = ranges
         return content
 
 
@@ -129,8 +162,9 @@ def amplitudes(dataset: Trials, names: Sequence[str]) -> dict[str, float]:
     sizes = dict[str, float]()
     for name, row in zip(names, dataset.rows(names), strict=True):
         frames = slice(1 if dataset.begin_of(name) == STATIC else None)
-        shown, held = (as_markers(own, dataset.labels) for own in (dataset.observed[row, frames], dataset.held[row]))
-        sizes[name] = float(np.sqrt(np.nanmean(np.square(shown - held).sum(-1))))
+        places = (dataset.observed[row, frames], dataset.held[row])
+        moved, before = (as_markers(x, dataset.labels) for x in places)
+        sizes[name] = float(np.sqrt(np.nanmean(np.square(moved - before).sum(-1))))
     return sizes
 
 
@@ -143,7 +177,7 @@ def _mean_angle(simulated: FloatArray, observed: FloatArray) -> float | None:
     """
     seen = np.asarray(np.isfinite(observed).all(axis=(-2, -1)))
     off = np.degrees(angles(observed, simulated))
-    means = [own[at].mean() for own, at in zip(off, seen, strict=True) if at.any()]
+    means = [angle[at].mean() for angle, at in zip(off, seen, strict=True) if at.any()]
     return float(np.mean(means)) if means and np.isfinite(means).all() else None
 
 
@@ -152,6 +186,6 @@ def _errors(simulated: FloatArray, observed: FloatArray, first: Sequence[int]) -
     return [marker_errors(x[start:], y[start:]) for x, y, start in trials]
 
 
-def _range(left: IntArray, names: Sequence[str], step: float) -> dict[str, Any]:
+def _range(left: IntArray, names: Sequence[str], step: float) -> RangeExits:
     gone = {name: float(step * at) for name, at in zip(names, left, strict=True) if at >= 0}
     return {"left": len(gone), "first_s": gone}

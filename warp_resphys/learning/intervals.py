@@ -13,7 +13,7 @@ parameters, which grows outside of the training. The sizes of the parts are thos
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,32 @@ _LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level
 _LEAST: Final = 1e-3  # of the mean variance: part that is always there
 _PENALTY: Final = 1e-3  # of the negative log-likelihood, for each part as large as the mean variance
 _SMALLEST: Final = -12.0  # logarithm of a part over the mean variance
+
+
+class PlainIntervals(TypedDict):
+    """`Intervals` as JSON data."""
+
+    factor: list[float]
+    variance: list[float]
+
+
+class ModelIntervals(TypedDict, total=False):
+    """Prediction intervals of a model in errors.json; over folds, without `PlainIntervals`."""
+
+    factor: list[float]
+    variance: list[float]
+    coverage: float  # share of the coordinates inside their interval
+    half_width_mm: float  # mean
+    by_trial: dict[str, float]  # coverage
+    without_spread: PlainIntervals  # for robots, which do not know the variance due to the parameters
+
+
+class IntervalTable(TypedDict):
+    """Prediction intervals in errors.json."""
+
+    level: float
+    calibrated_on: str
+    models: dict[str, ModelIntervals]
 
 
 @dataclass(frozen=True)
@@ -137,12 +163,12 @@ class Intervals:
         times = np.zeros(moved.shape[:-1]) if since is None else np.asarray(since)
         return np.asarray(np.sqrt(_parts(moved, times, spread) @ variance) * np.array(self.factor))
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> PlainIntervals:
         """Returns the intervals as JSON data."""
         return {"factor": list(self.factor), "variance": list(self.variance)}
 
     @classmethod
-    def from_plain(cls, plain: Mapping[str, Any] | None) -> "Intervals | None":
+    def from_plain(cls, plain: PlainIntervals | ModelIntervals | None) -> "Intervals | None":
         """Returns the intervals that `plain` wrote; None without any, as in summaries of folds."""
         return cls(tuple(plain["factor"]), tuple(plain["variance"])) if plain and "variance" in plain else None
 
@@ -163,12 +189,8 @@ class Intervals:
         return inside, width[seen]
 
 
-def coverage(covered: Mapping[str, tuple[FloatArray, FloatArray]]) -> dict[str, Any]:
-    """Summarises trials with equal weight, from `Intervals.covered`; those without a seen marker are left out.
-
-    Returns:
-        ``coverage``, the share of the coordinates inside their interval, also ``by_trial``; the mean ``half_width_mm``.
-    """
+def coverage(covered: Mapping[str, tuple[FloatArray, FloatArray]]) -> ModelIntervals:
+    """Summarises trials with equal weight, from `Intervals.covered`; those without a seen marker are left out."""
     seen = {name: (float(x.mean()), float(w.mean())) for name, (x, w) in covered.items() if len(x)}
     inside, widths = np.mean([*seen.values()], axis=0)
     by_trial = {name: share for name, (share, _) in seen.items()}
@@ -255,7 +277,7 @@ def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:
 
 def intervals_of_each_other(
     dataset: Trials, names: Sequence[str], simulated: Sequence[FloatArray], spreads: Sequence[FloatArray] | None
-) -> dict[str, Any] | None:
+) -> ModelIntervals | None:
     """Coverage of intervals of which each trial's are calibrated on the others; None if some cannot be calibrated.
 
     Args:
@@ -277,7 +299,7 @@ def intervals_of_each_other(
 def half_widths_of(
     dataset: Trials,
     names: Sequence[str],
-    errors: Mapping[str, Any],
+    intervals: Mapping[str, ModelIntervals],
     simulated: Mapping[str, FloatArray],
     spreads: Mapping[str, FloatArray],
 ) -> dict[str, FloatArray]:
@@ -286,18 +308,18 @@ def half_widths_of(
     Args:
         dataset: with the trials.
         names: names of R trials.
-        errors: content of errors.json.
+        intervals: by model, as in errors.json.
         simulated: (R, T, M, 3) [m] by model.
         spreads: (R, T, M) variances due to the parameters [m^2], by model.
     """
-    known = {m: Intervals.from_plain(own) for m, own in errors.get("intervals", {}).get("models", {}).items()}
+    known = {model: Intervals.from_plain(plain) for model, plain in intervals.items()}
     since = since_change(dataset, names)
     return {
-        model: own.half_widths(
+        model: of_model.half_widths(
             as_markers(simulated[model], dataset.labels), rest_places(dataset), since, spreads.get(model)
         )
-        for model, own in known.items()
-        if own is not None and model in simulated
+        for model, of_model in known.items()
+        if of_model is not None and model in simulated
     }
 
 

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, TypedDict
+from typing import Final, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,14 @@ class ErrorSummary(TypedDict):
     std: float | None
     trajectories: int
     diverged: int
+
+
+class TrialErrors(TypedDict):
+    """Errors of the models in a test trial."""
+
+    name: str
+    errors_mm: dict[str, float | None]  # mean by model; None where the roll-out diverged
+    amplitude_mm: NotRequired[float]  # root mean square displacement of the observed points
 
 
 class Gain(NamedTuple):
@@ -187,15 +195,12 @@ def summarise(errors: Iterable[NDArray[np.float64]]) -> ErrorSummary:
 
 def summarise_trajectories(
     names: Sequence[str], errors: Mapping[str, Iterable[NDArray[np.float64]]]
-) -> list[dict[str, Any]]:
+) -> list[TrialErrors]:
     """Returns `per_trajectory` of `metrics.json`: the mean error of every model on every trajectory.
 
     Args:
         names: R names of the trajectories.
         errors: For each model R arrays (T,), or one (R, T) [mm].
-
-    Returns:
-        R entries `{"name": ..., "errors_mm": {model: mean [mm], or None where the roll-out diverged}}`.
 
     Raises:
         InputError: A model has a different number of trajectories than names.

@@ -24,7 +24,7 @@ from ..settings.mesh import PlaceSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .parameters import split_name
-from .placement import PlacedMarkers, placement_of
+from .placement import PlacedMarkers, PlainPlacements, placement_of
 from .release import begin_inputs, estimate_release
 from .replay import Replay, Start, later
 from .trial_batch import TrialBatch
@@ -44,7 +44,7 @@ class Identified:
 
     parameters: Mapping[str, float] = field(default_factory=dict)
     own: Mapping[str, float] = field(default_factory=dict)
-    placement: Mapping[str, Any] | None = None
+    placement: PlainPlacements | None = None
 
     @classmethod
     def of(cls, parameters: "Identified | Mapping[str, float] | None") -> "Identified":

@@ -9,12 +9,11 @@ All of these are nuisance parameters with a normal prior around zero (`identific
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
-from typing_extensions import override
+from typing_extensions import TypedDict, override
 
 from ..data.markers import Markers, Observation
 from ..io.arrays import FloatArray
@@ -82,6 +81,22 @@ class Accuracy:
         return math.sqrt(variance) * self.directions(like)
 
 
+class PlainPlacement(TypedDict):
+    """A `Placement` as JSON data."""
+
+    offsets: dict[str, list[float]]  # (3,) by marker
+    shift: list[float]
+    turn: list[float]
+    centre: list[float]
+
+
+class PlainPlacements(PlainPlacement, total=False):
+    """The common placement as JSON data, and those of sessions."""
+
+    sessions: dict[str, PlainPlacement]
+    new_session: list[list[float]]  # `Accuracy.of_new_session`
+
+
 @dataclass(frozen=True)
 class Placement:
     """Marker places on the body, and the frame of the recordings.
@@ -116,10 +131,11 @@ class Placement:
         markers, rotations = DisplacedMarkers.split(points)
         return self.apply(markers + (rotations @ self.offsets[..., None])[..., 0]), rotations
 
-    def plain(self, labels: Sequence[str]) -> dict[str, Any]:
+    def plain(self, labels: Sequence[str]) -> PlainPlacement:
         """Returns the placement as JSON data."""
-        rest = {"shift": self.shift.tolist(), "turn": self.turn.tolist(), "centre": self.centre.tolist()}
-        return {"offsets": dict(zip(labels, self.offsets.tolist(), strict=True)), **rest}
+        offsets = dict(zip(labels, self.offsets.tolist(), strict=True))
+        shift, turn, centre = (x.tolist() for x in (self.shift, self.turn, self.centre))
+        return {"offsets": offsets, "shift": shift, "turn": turn, "centre": centre}
 
     @classmethod
     def none(cls, count: int, centre: torch.Tensor) -> "Placement":
@@ -128,14 +144,14 @@ class Placement:
         return cls(centre.new_zeros(count, 3), zero, zero, centre)
 
     @classmethod
-    def from_plain(cls, plain: Mapping[str, Any], labels: Sequence[str]) -> "Placement":
+    def from_plain(cls, plain: PlainPlacement, labels: Sequence[str]) -> "Placement":
         """Returns the placement that `plain` wrote."""
         offsets = torch.tensor([plain["offsets"][label] for label in labels], dtype=torch.float64)
-        rest = (torch.tensor(plain[key], dtype=torch.float64) for key in ("shift", "turn", "centre"))
-        return cls(offsets, *rest)
+        frame = (torch.tensor(x, dtype=torch.float64) for x in (plain["shift"], plain["turn"], plain["centre"]))
+        return cls(offsets, *frame)
 
 
-def placement_of(plain: Mapping[str, Any], labels: Sequence[str], session: str = "") -> Placement:
+def placement_of(plain: PlainPlacements, labels: Sequence[str], session: str = "") -> Placement:
     """Returns the placement of a session from `Nuisances.plain`; the common one for a session that is not known."""
     return Placement.from_plain(plain.get("sessions", {}).get(session, plain), labels)
 

@@ -1,6 +1,7 @@
 """The page of the marker ablation: a box plot, a table, and the method of reconstruction."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 from ..io.arrays import FloatArray
 from ..settings.run import RunSettings
 from .figures import new_figure, use_logarithm
-from .page import Canvas, Cell, PageTable, Part, Row, Text, write_page
+from .page import Canvas, Cell, PageTable, Part, Row, Text, Usage, write_page
 from .wording import NO_BREAK_SPACE, TONES, number_text
 
 _COLUMNS: Final[Mapping[str, str]] = {
@@ -24,20 +25,42 @@ _COLUMNS: Final[Mapping[str, str]] = {
 }
 
 
+@dataclass(frozen=True)
+class MarkerErrors:
+    """Errors [mm] of the draws of a number of markers."""
+
+    markers: int
+    median_mm: float
+    lower_quartile_mm: float
+    upper_quartile_mm: float
+    interquartile_range_mm: float
+    largest_mm: float
+    misfit_median_mm: float  # at the markers
+    errors_mm: Sequence[float]  # of each draw
+
+
+class AblationMetrics(Usage, total=False):
+    """Content of metrics.json of a marker ablation."""
+
+    uncorrected_mm: float
+    by_markers: list[dict[str, Any]]  # `MarkerErrors`
+
+
 def write_ablation_report(
-    path: Path, metrics: Mapping[str, Any], settings: RunSettings, *, vertices: int, surface: int, free: int
+    path: Path, metrics: AblationMetrics, settings: RunSettings, *, vertices: int, surface: int, free: int
 ) -> None:
     """Writes the page, see `write_page`.
 
     Args:
         path: The page's file, such as `report.html`.
-        metrics: `uncorrected_mm`, `by_markers` (a row a number of markers), resources and versions.
+        metrics: Of the run.
         settings: The run's configuration.
         vertices: Number of vertices of the mesh.
         surface: Number of vertices on its surface.
         free: Number of surface vertices that are not clamped.
     """
-    rows, uncorrected, ablation = metrics["by_markers"], metrics["uncorrected_mm"], settings.ablation
+    rows = [MarkerErrors(**row) for row in metrics["by_markers"]]
+    uncorrected, ablation = metrics["uncorrected_mm"], settings.ablation
     assert ablation is not None
     caption = (
         f"Mean distance of all {vertices} vertices from the target over the {settings.data.steps} steps of one "
@@ -50,17 +73,17 @@ def write_ablation_report(
         f"{number_text(uncorrected)}{NO_BREAK_SPACE}mm off on average. The sets are drawn from the {free} surface "
         "vertices that are not clamped."
     )
-    if more := [str(row["markers"]) for row in rows if row["markers"] > free]:
+    if more := [str(row.markers) for row in rows if row.markers > free]:
         note += (
             f" Sets of {', '.join(more)} markers exceed these, and are drawn from all {surface} surface vertices, as "
             "published."
         )
-    medians = "; ".join(f"{row['markers']}: {number_text(row['median_mm'])} mm" for row in rows)
+    medians = "; ".join(f"{row.markers}: {number_text(row.median_mm)} mm" for row in rows)
     alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
     how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
 
     def sections(canvas: Canvas) -> Iterator[Part]:
-        boxes = marker_boxes({row["markers"]: np.array(row["errors_mm"]) for row in rows}, uncorrected)
+        boxes = marker_boxes({row.markers: np.array(row.errors_mm) for row in rows}, uncorrected)
         yield Part("", [canvas.figure("marker_ablation", boxes, alt, caption), ablation_table(rows, note)])
         yield Part("How it was reconstructed", [Text(how)])
 
@@ -93,9 +116,9 @@ def marker_boxes(errors: Mapping[int, FloatArray], uncorrected: float) -> Figure
     return figure
 
 
-def ablation_table(rows: Sequence[Mapping[str, Any]], note: str = "") -> PageTable:
+def ablation_table(rows: Sequence[MarkerErrors], note: str = "") -> PageTable:
     """Returns the errors by number of markers."""
-    body = [Row(str(row["markers"]), [Cell(number_text(row[key])) for key in _COLUMNS]) for row in rows]
+    body = [Row(str(row.markers), [Cell(number_text(getattr(row, key))) for key in _COLUMNS]) for row in rows]
     return PageTable("Markers", [*_COLUMNS.values()], body, note)
 
 
@@ -108,7 +131,7 @@ def _how_reconstructed(modes: int | None, regularisation: float) -> str:
     ).format(number_text(regularisation), free)
 
 
-def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
+def verdict(rows: Sequence[MarkerErrors], uncorrected: float) -> str:
     """Returns the number of markers needed for the published thresholds, and the uncorrected error [mm], in words."""
     needed = _markers_below(rows, "median_mm", 0.1)
     text = (
@@ -123,7 +146,7 @@ def verdict(rows: Sequence[Mapping[str, Any]], uncorrected: float) -> str:
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def _markers_below(rows: Sequence[Mapping[str, Any]], key: str, threshold: float) -> int | None:
+def _markers_below(rows: Sequence[MarkerErrors], key: str, threshold: float) -> int | None:
     """The smallest number of markers from which on a value stays below a threshold."""
-    above = [int(row["markers"]) for row in rows if not row[key] < threshold]
-    return min((int(row["markers"]) for row in rows if int(row["markers"]) > max(above, default=0)), default=None)
+    above = max((row.markers for row in rows if not getattr(row, key) < threshold), default=0)
+    return min((row.markers for row in rows if row.markers > above), default=None)

@@ -11,18 +11,19 @@ from ..io.arrays import FloatArray
 from ..settings.control import ControlSettings
 from . import figures
 from .body_motions import plane_axes
-from .data import FollowedPath, RunReport
+from .data import ControlResults, FollowedPath, RunReport, TrackingErrors
 from .page import Canvas, Cell, Items, PageTable, Part, Row, Text
 from .wording import MODELS, NONE, TONES, compared_controllers, controller_name, controller_words, mm_text, number_text
 
-_LINES: Final[Mapping[str, Any]] = {"open": (0, (4, 2)), "receding": "-"}  # By beginning of a controller's name.
+# By beginning of a controller's name.
+_LINES: Final[Mapping[str, str | tuple[int, tuple[int, int]]]] = {"open": (0, (4, 2)), "receding": "-"}
 _COLUMNS: Final = 5  # Of followed paths.
 
 
 def control_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Returns the section; None where nothing is controlled, or no simulation plays the robot."""
-    metrics, control = data.metrics.get("control") or {}, data.settings.control
-    if not metrics or control is None:
+    metrics, control = data.metrics.get("control"), data.settings.control
+    if metrics is None or control is None:
         return None
     blocks: list[Any] = [Text(_task(control), "control"), tracking_table(metrics["tracking"])]
     slowest = max(control.seconds)
@@ -83,12 +84,12 @@ def _task(control: ControlSettings) -> str:
     )
 
 
-def tracking_table(tracking: Mapping[str, Any]) -> PageTable:
+def tracking_table(tracking: Mapping[str, Mapping[str, TrackingErrors]]) -> PageTable:
     """Returns the errors of the controllers by the duration of the paths."""
     first = next(iter(tracking.values()))
-    best = min(first, key=lambda controller: float(first[controller]["mean_mm"]))
+    best = min(first, key=lambda controller: first[controller]["mean_mm"])
 
-    def cell(errors: Mapping[str, Any] | None) -> Cell:
+    def cell(errors: TrackingErrors | None) -> Cell:
         if errors is None:
             return Cell(NONE)
         return Cell(number_text(errors["mean_mm"]), beside=f"at most {number_text(errors['max_mm'])}")
@@ -101,7 +102,7 @@ def tracking_table(tracking: Mapping[str, Any]) -> PageTable:
     return PageTable("Mean error of the point [mm]", [f"Paths in {float(speed):g} s" for speed in tracking], rows)
 
 
-def _facts(metrics: Mapping[str, Any]) -> list[str]:
+def _facts(metrics: ControlResults) -> list[str]:
     facts = []
     for model, reduced in metrics["reduced"].items():
         window, whole = mm_text(reduced["window_error_mm"]), mm_text(reduced["whole_error_mm"])

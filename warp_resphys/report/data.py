@@ -4,22 +4,116 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import NotRequired, TypedDict
 
 import numpy as np
 
 from ..data.obstacle_surface import ObstacleSurface
+from ..data.recordings.marker_quality import Quality
+from ..data.registration import RegistrationSummary
+from ..energies.catalogue import LawContent
 from ..io.arrays import FloatArray, IntArray
 from ..learning.baselines import BASELINES
+from ..learning.error_tables import ErrorTables
+from ..learning.identification.search import Identification
 from ..learning.metrics import PublishedError, mean_distance, published_errors
 from ..mesh.chambers import Chamber
 from ..mesh.volume_mesh import Mesh
 from ..settings.data_kinds import ReleaseFromLoad
 from ..settings.run import RunSettings
 from ..stepping.quantity import Quantity
+from .page import Usage
 from .wording import MODELS
 
 Errors = Mapping[str, Sequence[float | None]]  # Of each model on the same held-out trials [mm]; None: it diverged.
+
+
+class KeptWeights(TypedDict):
+    """The weights of a network that were kept."""
+
+    selection: str
+    epoch: int
+    validation_rollout_error_mm: float | None
+
+
+class UsedLaw(LawContent):
+    """The law of a run in metrics.json."""
+
+    against: str  # model that it is compared with
+
+
+class Placed(TypedDict):
+    """Marker places of all trials."""
+
+    rms_mm: float  # largest residual of the registration of a trial
+    turned_deg: float  # identified rotation of the markers
+
+
+class MeshCheck(TypedDict, total=False):
+    """Content of mesh_check.json, where two values are without and with the finer mesh."""
+
+    model: str
+    cells: list[int]
+    vertices: list[int]
+    trials: list[str]
+    errors_mm: list[float | None]
+    moved_mm: float | None  # distance between the two simulations
+    failed: str  # why nothing is known
+
+
+class ShapeErrors(TypedDict):
+    """Errors on another body, in shapes.json."""
+
+    vertices: int
+    moved_mm: float
+    errors_mm: dict[str, float | None]  # by model
+    outside: NotRequired[float]  # share of cells and states outside of the stretches of the law's training
+
+
+class TrackingErrors(TypedDict):
+    """Distances of a controlled point from its paths."""
+
+    mean_mm: float
+    max_mm: float
+    motions_mm: dict[str, float]  # mean by motion
+
+
+class ReducedErrors(TypedDict, total=False):
+    """Errors of a reduced model."""
+
+    modes: int
+    window_s: float
+    window_error_mm: float
+    window_motion_mm: float
+    window_relative: float
+    whole_error_mm: float
+
+
+class ControlResults(TypedDict):
+    """Content of control.json."""
+
+    tracking: dict[str, dict[str, TrackingErrors]]  # by duration of the paths [s] and controller
+    command_ms: dict[str, dict[str, float]]  # `median` and `largest_of_20` of the computing times, by controller
+    planned_mm: dict[str, dict[str, list[float]]]  # before and after corrections, by model and motion
+    reduced: dict[str, ReducedErrors]  # by model
+    linear_validation_mm: float
+
+
+class Metrics(ErrorTables, Usage, total=False):
+    """Content of metrics.json, of a split or of all folds."""
+
+    networks: dict[str, KeptWeights]  # by model
+    parameters: dict[str, Mapping[str, float]]  # identified values, by model
+    first_guesses: dict[str, Mapping[str, float]]
+    law: UsedLaw
+    # `mean_mm` and `max_mm`, distances between reconstructed and observed points of the training trials, by model
+    reconstruction: dict[str, dict[str, float]]
+    control: ControlResults
+    shapes: dict[str, ShapeErrors]
+    placement: Placed
+    mesh_check: MeshCheck
+    noise_mm: float  # mean distance by which noise moves the markers of a simulated laboratory
+    folds: dict[str, "Metrics"]  # by the trial that a fold leaves out
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +191,8 @@ class Driven:
 class Recordings:
     """Quality of the recordings, and their registration on the body, by trial."""
 
-    quality: Mapping[str, Any]  # as in quality.json
-    registered: Mapping[str, Any]  # `rms_mm`, `outliers`, and by label `positions` [m], `residual_mm` and `shift_mm`.
+    quality: Mapping[str, Quality]
+    registered: Mapping[str, RegistrationSummary]
     nominal: Mapping[str, FloatArray]  # (3,) [m] nominal positions at rest, by label.
     beside: Collection[str]  # Labels of markers that stand beside the body.
     mesh: Mesh  # The body at rest.
@@ -106,7 +200,7 @@ class Recordings:
     @property
     def worst(self) -> str:
         """Name of the trial that fits worst, which is drawn."""
-        return max(self.registered, key=lambda trial: float(self.registered[trial]["rms_mm"]))
+        return max(self.registered, key=lambda trial: self.registered[trial]["rms_mm"])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,7 +217,7 @@ class FollowedPath:
 class RunReport:
     """Data of the page of a run, of a fold, or over the folds."""
 
-    metrics: Mapping[str, Any]  # Content of `metrics.json`, of a split or of all folds.
+    metrics: Metrics  # Of a split or of all folds.
     settings: RunSettings
     mesh: Mesh  # The undeformed body.
     fixed: IntArray  # Clamped vertices.
@@ -137,13 +231,14 @@ class RunReport:
     film: Film | None = None  # Motion of the bodies in one of them.
     driven: Driven | None = None  # Inputs of all trials.
     recordings: Recordings | None = None  # Quality and registration of all trials.
-    identification: Mapping[str, Any] = field(default_factory=dict)  # Content of `identification.json`.
-    law: Mapping[str, Any] = field(default_factory=dict)  # Content of `law.json`.
+    identification: Mapping[str, Identification] = field(default_factory=dict)  # By model.
     stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # Least and largest, by kind of trial.
     outside: float | None = None  # Share of cells and states of the test trials outside of the law's training.
     start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.
-    truth: Mapping[str, Any] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
-    training: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)  # Epochs, by learned model.
+    truth: Mapping[str, float] = field(default_factory=dict)  # Values of the simulated laboratory, by parameter.
+    true_material: str = "corotated"  # Model of its material.
+    # Records of `learning.residuals.training.EpochTrainer.history`, by learned model; None: not finite.
+    training: Mapping[str, Sequence[Mapping[str, float | None]]] = field(default_factory=dict)
     followed: Sequence[FollowedPath] = ()  # Driven paths of the group `control`.
     pages: Mapping[str, str] = field(default_factory=dict)  # Address of each fold's page, by its test trial.
 
@@ -178,12 +273,12 @@ def other_trials(settings: RunSettings) -> tuple[str, ...]:
     return tuple(settings.data.others) if isinstance(settings.data, ReleaseFromLoad) else ()
 
 
-def folds_in(metrics: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def folds_in(metrics: Metrics) -> list[Metrics]:
     """Returns the metrics of each fold, or those of a split alone."""
-    return list(metrics.get("folds", {}).values()) or [metrics]
+    return [*metrics.get("folds", {}).values()] or [metrics]
 
 
-def trial_errors(metrics: Mapping[str, Any], others: Collection[str] = (), outside: bool = False) -> Errors:
+def trial_errors(metrics: Metrics, others: Collection[str] = (), outside: bool = False) -> Errors:
     """Returns the errors on each held-out trial [mm], by model that all folds have; None where a roll-out diverged.
 
     Args:
@@ -197,7 +292,7 @@ def trial_errors(metrics: Mapping[str, Any], others: Collection[str] = (), outsi
     return {model: [row["errors_mm"][model] for row in rows] for model in models}
 
 
-def grouped_errors(metrics: Mapping[str, Any], settings: RunSettings) -> dict[str, Errors]:
+def grouped_errors(metrics: Metrics, settings: RunSettings) -> dict[str, Errors]:
     """Returns the errors on the held-out trials by the title of their group: as in training, then with other loads."""
     others = other_trials(settings)
     groups = {title: trial_errors(metrics, others, at > 0) for at, title in enumerate(settings.test_titles)}
@@ -208,7 +303,7 @@ def grouped_errors(metrics: Mapping[str, Any], settings: RunSettings) -> dict[st
     return {f"{count} test trial{'s' * (count != 1)}": errors} if errors else {}
 
 
-def untrained(metrics: Mapping[str, Any]) -> set[str]:
+def untrained(metrics: Metrics) -> set[str]:
     """Returns the models of which no fold kept an epoch of training, so that their learned force is zero."""
     epochs: dict[str, int] = Counter()
     for fold in folds_in(metrics):
@@ -217,7 +312,7 @@ def untrained(metrics: Mapping[str, Any]) -> set[str]:
     return {model for model, count in epochs.items() if not count}
 
 
-def missing_baselines(metrics: Mapping[str, Any]) -> dict[str, str]:
+def missing_baselines(metrics: Metrics) -> dict[str, str]:
     """Returns why predictions without physics are missing, by model."""
     return {model: why for fold in folds_in(metrics) for model, why in fold.get("missing_baselines", {}).items()}
 

@@ -6,11 +6,11 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..io.arrays import FloatArray
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import listed, number_of
 from ..learning.metrics import median_filter
 from . import figures
-from .data import RunReport, grouped_errors
+from .data import MeshCheck, RunReport, grouped_errors
 from .page import Canvas, Part, Text
 from .sections import model_table, numbers
 from .wording import MODELS, TONES, largest_text, mm_text, number_text, unbroken
@@ -35,7 +35,7 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         of = "marker" if data.sees_markers else "vertex"
         reached = "; ".join(f"{MODELS[model].name} reaches {largest_text(e)}" for model, e in trials.errors_mm.items())
         alt = f"Mean {of} error of the models over time, on a logarithmic axis. {reached}."
-        panels: dict[str, Any] = {"": slice(None)}
+        panels: dict[str, BoolArray | slice] = {"": slice(None)}
         if len(grouped_errors(metrics, data.settings)) > 1:
             inside = np.array([name not in data.others for name in trials.names])
             by_load = zip(data.settings.test_titles, (inside, ~inside), strict=True)
@@ -62,7 +62,7 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Error over time" if trials.moves else "Each marker", blocks) if blocks else None
 
 
-def mesh_text(check: Mapping[str, Any]) -> str:
+def mesh_text(check: MeshCheck) -> str:
     """Returns sentences on what a finer mesh changes, from `mesh_check.json`."""
     if "failed" in check:
         return f"The error of the mesh is not known: {check['failed']}"
@@ -82,7 +82,7 @@ def error_over_time(
     times: FloatArray,
     of: str = "vertex",
     window: float | None = None,
-    panels: Mapping[str, Any] | None = None,
+    panels: Mapping[str, BoolArray | slice] | None = None,
 ) -> Figure:
     """Draws each model's mean error over time and, for the main models, the range of the trials.
 
@@ -151,7 +151,7 @@ def training_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Training", blocks) if blocks else None
 
 
-def training_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
+def training_curves(records: Sequence[Mapping[str, float | None]]) -> Figure:
     """Draws the losses and, where they were recorded, the validation roll-out error and the learning rate.
 
     Args:

@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 
 from ..data.registration import root_mean_square
 from ..data.rigid_bodies import as_markers, corners_of, owners
+from ..learning.identification.search import Identification
 from ..learning.parameters import own_name, split_name
+from ..learning.placement import PlainPlacement
 from ..settings.learning import RangeSettings
 from . import figures
 from .data import RunReport
@@ -54,22 +56,22 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         PageTable(MODELS[name].name, columns, parameter_rows(result, data.start, data.truth))
         for name, result in identified.items()
     ]
-    blocks += [table for result in identified.values() if (table := own_table(result)) is not None]
+    blocks += [table for result in identified.values() if (table := trials_table(result)) is not None]
     ranges = {} if data.settings.identify is None else data.settings.identify.parameters
     uncertain = list(filter(None, (uncertainty_text(name, result, ranges) for name, result in identified.items())))
     notes = []
     if uncertain:
         notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
     if data.truth:
-        model = data.truth.get("model", "corotated").replace("_", " ")
+        model = data.true_material.replace("_", " ")
         notes.append(f"The true values are those of the simulated laboratory, whose material is {model}.")
     blocks += [Text(" ".join(notes), note=True)] if notes else []
     blocks += [Text(text) for text in uncertain]
-    placed = {name: result["placement"] for name, result in identified.items() if result.get("placement")}
+    placed = {name: result.placement for name, result in identified.items() if result.placement is not None}
     markers = data.settings.markers
     lengths = {} if markers is None else {name: body.length for name, body in markers.rigid_bodies.items()}
     blocks += [Text(placement_text(name, placement, lengths)) for name, placement in placed.items()]
-    if histories := {name: result["history"] for name, result in identified.items() if any(result["history"])}:
+    if histories := {name: result.history for name, result in identified.items() if any(result.history)}:
         alt = "Loss of the identification over its evaluations, with a line for each start, on a logarithmic axis."
         caption = (
             "Lowest loss so far over the evaluations, with a line for each start; the kept start is bold. The loss "
@@ -87,7 +89,7 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     figure = figures.new_figure(2.6)
     panels = list(figure.subplots(1, len(histories), sharey=True, squeeze=False).flat)
     for axes, (name, starts) in zip(panels, histories.items(), strict=True):
-        ends = [record["loss"] for start in starts for record in start if record["loss"] is not None]
+        ends = [record["loss"] for start in starts for record in start]
         for start in filter(None, starts):
             losses = np.fmin.accumulate(np.array([record["loss"] for record in start], dtype=np.float64))
             best = bool(ends) and losses[-1] <= min(ends)
@@ -102,24 +104,24 @@ def loss_histories(histories: Mapping[str, Sequence[Sequence[Mapping[str, float]
     return figure
 
 
-def parameter_rows(identified: Mapping[str, Any], start: Mapping[str, float], truth: Mapping[str, Any]) -> list[Row]:
+def parameter_rows(identified: Identification, start: Mapping[str, float], truth: Mapping[str, float]) -> list[Row]:
     """Returns a row for each parameter: values of data sheet, identification and truth if known; if at a bound."""
-    deviations = (identified.get("uncertainty") or {}).get("deviation", {})
     rows = []
-    for parameter, value in identified["parameters"].items():
+    for parameter, value in identified.parameters.items():
         whole, owner = split_name(parameter)
         words, unit, factor = parameter_wording(whole)
         words += f", {owner}" * bool(owner)
-        cells = [Cell(digits(start.get(parameter), factor)), identified_cell(value, factor, deviations.get(parameter))]
+        known = identified_cell(value, factor, identified.deviation.get(parameter))
+        cells = [Cell(digits(start.get(parameter), factor)), known]
         cells += [Cell(digits(truth.get(parameter, truth.get(whole)), factor))] if truth else []
-        cells.append(Cell("yes" if parameter in identified["at_bounds"] else ""))
+        cells.append(Cell("yes" if parameter in identified.at_bounds else ""))
         rows.append(Row(f"{words} [{unit}]" if unit else words, cells))
     return rows
 
 
-def own_table(identified: Mapping[str, Any]) -> PageTable | None:
+def trials_table(identified: Identification) -> PageTable | None:
     """Returns the values of single trials and sessions, with their standard deviations; None if there are none."""
-    values, deviations = identified.get("own", {}), identified.get("own_deviation", {})
+    values, deviations = identified.own, identified.own_deviation
     if not values:
         return None
     parameters = list(dict.fromkeys(split_name(name)[0] for name in values))
@@ -174,7 +176,7 @@ def digits(value: float | None, factor: float, deviation: float | None = None) -
     return text.replace("-", MINUS) if float(text) else text.lstrip("-")
 
 
-def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, float]) -> str:
+def placement_text(name: str, placed: PlainPlacement, lengths: Mapping[str, float]) -> str:
     """Returns a sentence on the identified displacements of markers and recordings from their nominal positions.
 
     The angle of a rigid body is the root mean square displacement of its points over its length [m].
@@ -182,7 +184,7 @@ def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, f
     labels, offsets = [*placed["offsets"]], np.array([*placed["offsets"].values()])
     away = dict(zip(owners(labels), 1e3 * np.linalg.norm(as_markers(offsets, labels), axis=1), strict=True))
     furthest = max(away, key=lambda label: away[label])
-    shift, turn = (math.hypot(*placed[key]) for key in ("shift", "turn"))
+    shift, turn = math.hypot(*placed["shift"]), math.hypot(*placed["turn"])
     text = (
         f"{MODELS[name].name}, identified with the parameters: markers are displaced from their nominal positions, "
         f"{furthest} the most, by {away[furthest]:.1f} mm; the recordings are shifted by {1e3 * shift:.1f} mm and "
@@ -195,19 +197,19 @@ def placement_text(name: str, placed: Mapping[str, Any], lengths: Mapping[str, f
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[str, RangeSettings]) -> str:
+def uncertainty_text(name: str, identified: Identification, ranges: Mapping[str, RangeSettings]) -> str:
     """Returns sentences on the parameters of a model that the data do not determine; empty without uncertainties."""
-    uncertainty = identified.get("uncertainty")
-    if not uncertainty:
+    uncertainty = identified.uncertainty
+    if uncertainty is None:
         return ""
-    names = list(identified["parameters"])
+    names = list(identified.parameters)
     words = {parameter: in_sentence(parameter) for parameter in names}
-    largest = max(abs(weight) for weight in uncertainty["poorest"].values())
-    along = " with ".join(words[p] for p, weight in uncertainty["poorest"].items() if abs(weight) > 0.4 * largest)
-    share = 100.0 * uncertainty["poorest_deviation"]
+    largest = max(abs(weight) for weight in uncertainty.poorest.values())
+    along = " with ".join(words[p] for p, weight in uncertainty.poorest.items() if abs(weight) > 0.4 * largest)
+    share = 100.0 * uncertainty.poorest_deviation
     known = f"{along} is least certain ({share:.2g} % of the range)."
     text = f"{MODELS[name].name}: {known if share < _WHOLE else f'the data do not constrain {along}: set a prior.'}"
-    correlation = np.array(uncertainty["correlation"], dtype=np.float64)
+    correlation = np.array(uncertainty.correlation, dtype=np.float64)
     tied = [
         f"{words[names[i]]} and {words[names[j]]} (correlation {correlation[i, j]:+.2f})".replace("-", MINUS)
         for j in range(len(names))
@@ -216,7 +218,7 @@ def uncertainty_text(name: str, identified: Mapping[str, Any], ranges: Mapping[s
     ]
     text += f" The data do not separate {', '.join(tied)}." if tied else ""
     unknown = list[str]()
-    for parameter, deviation in uncertainty["deviation"].items():
+    for parameter, deviation in uncertainty.deviation.items():
         prior = ranges[parameter].prior if parameter in ranges else None
         if prior is not None and ranges[parameter].per == "all" and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)

@@ -14,13 +14,13 @@ import numpy as np
 import scipy.optimize
 import torch
 
-from ..energies.catalogue import make_material
+from ..energies.catalogue import LawContent, make_material
 from ..io.arrays import FloatArray
 from ..learning.identification.law import VISCOSITIES
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from . import figures
-from .data import RunReport
+from .data import RunReport, UsedLaw
 from .identification_section import Wording, identified_cell, parameter_wording, within_sentence
 from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text
 from .sections import BEYOND
@@ -73,12 +73,12 @@ ACROSS: Final = (0.0, 1.0, 0.0)
 
 def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Returns the law, whether it is used, what the trials determine of it, and the classes that were tried."""
-    law, settings = data.law, data.settings.law
-    if not law or settings is None:
+    whole, settings = data.metrics.get("law"), data.settings.law
+    if whole is None or settings is None:
         return None
-    constants = {name: value for name, value in law["constants"].items() if not name.startswith(_NOT_OF_A_LAW)}
-    law = {**law, "constants": constants}
-    blocks: list[Block] = [Text(unbroken(law_text(data.metrics["law"])), "law-use"), _terms_table(law)]
+    constants = {name: value for name, value in whole["constants"].items() if not name.startswith(_NOT_OF_A_LAW)}
+    law: UsedLaw = {**whole, "constants": constants}
+    blocks: list[Block] = [Text(unbroken(law_text(law)), "law-use"), _terms_table(law)]
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
     blocks += [Text(" ".join(notes), note=True)] if law.get("deviation") else []
     said = (not_needed_text(law, settings), outside_text(data))
@@ -87,17 +87,17 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Law of the material", [*blocks, *_classes(law)])
 
 
-def law_text(law: Mapping[str, Any]) -> str:
+def law_text(law: UsedLaw) -> str:
     """Returns a sentence on whether the identified law of metrics.json is used, and why."""
-    checked, base = law["validation"], model_words(law.get("against", "simulation"))
-    where = f"{checked.get('split', 'validation')} trials ({', '.join(checked['trials'])})"
+    checked, base = law["validation"], model_words(law["against"])
+    where = f"{checked['split']} trials ({', '.join(checked['trials'])})"
     head = f"The identified law is {'used' if law['accepted'] else 'not used'}"
     tail = ""
-    if law.get("file"):
+    if "file" in law:
         head = f"The law of {law['file']} is used as it is"
         there = law.get("accepted_there", True)
         tail = "" if there else " The run that identified it did not use it: it was not clearly closer there."
-    law_error, base_error = (_share(checked[key]) for key in ("law", "below"))
+    law_error, base_error = _share(checked["law"]), _share(checked["below"])
     return (
         f"{head}: its root mean square error on the {where} is {law_error} of the motion's amplitude, that of {base} "
         f"{base_error}.{tail}"
@@ -118,7 +118,7 @@ def wording(name: str) -> tuple[Wording, str]:
     return parameter_wording(name), ""
 
 
-def _terms_table(law: Mapping[str, Any]) -> PageTable:
+def _terms_table(law: LawContent) -> PageTable:
     rows = []
     known = {**law["constants"], **law.get("parameters", {})}
     bounds = [name for name in law.get("at_bounds", ()) if name in known]
@@ -145,7 +145,7 @@ def outside_text(data: RunReport) -> str:
     )
 
 
-def not_needed_text(law: Mapping[str, Any], settings: LawSettings) -> str:
+def not_needed_text(law: LawContent, settings: LawSettings) -> str:
     """Returns a sentence on the terms of the library that the law does not have; empty if it has all of them."""
     constants = law["constants"]
     names = [name for name in settings.terms if name not in constants]
@@ -166,8 +166,8 @@ def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
     """Moduli at small strains: of the law, of the simulator that it replaces, and of a simulated target."""
     law = small_strain(constants)
     columns: dict[str, SmallStrain | None] = {"Law": law}
-    below = data.identification.get("sysid", {}).get("parameters", {})
     start = data.settings.simulation
+    below = data.identification["sysid"].parameters if "sysid" in data.identification else {}
     if "youngs_modulus" in below or "poissons_ratio" in below:
         changed = {name: below[name] for name in ("youngs_modulus", "poissons_ratio") if name in below}
         columns["SysID"] = small_strain_of(MaterialSettings.model_validate({**start.parameters, **changed}))
@@ -239,7 +239,7 @@ def drawn_stretches(ranges: Mapping[str, tuple[float, float]]) -> FloatArray:
     return np.unique(np.append(np.linspace(max(low - margin, 0.2), high + margin, _POINTS), 1.0))
 
 
-def _classes(law: Mapping[str, Any]) -> list[Block]:
+def _classes(law: LawContent) -> list[Block]:
     """Returns the classes that were tried, with their errors."""
     tried = law.get("classes", ())
     if not tried:

@@ -26,7 +26,7 @@ from . import figures
 from .body_motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES, ComparedMotion, hangs, without_diverged
 from .data import Film, RunReport, at_times, shown_markers, spread
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
-from .page import Block, Canvas, Drawn, Part, ViewInSpace
+from .page import Block, Canvas, Drawn, Part, ShownModel, ViewInSpace
 from .render import Pixels, draw, write_film
 from .wording import MODELS, TONES, shown_models, unbroken
 
@@ -184,9 +184,12 @@ def view_in_space(name: str, motion: ComparedMotion, shown: Sequence[str], capti
         simulated = np.stack([finite(q, mesh.vertices) for q in motion.positions.values()])
     means = mean_distance(simulated, np.broadcast_to(target, simulated.shape))  # (B, F) [mm]
     largest, shares = _error_shares(simulated[:, :, compared], target[:, compared], places)
-    models = [
+    models: list[ShownModel] = [
         {
-            **{"name": MODELS[model].name, **TONES[model]._asdict(), "shown": model in shown},
+            "name": MODELS[model].name,
+            "light": TONES[model].light,
+            "dark": TONES[model].dark,
+            "shown": model in shown,
             "largest": float(f"{most:.4g}"),
             "means": [float(f"{mean:.4g}") if np.isfinite(mean) else None for mean in by_frame],
         }

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypedDict, TypeVar
 
 from markupsafe import Markup
 
@@ -145,6 +145,27 @@ class Drawn:
         return cls(path.stem, caption, alt, _address(path.read_bytes(), kind))
 
 
+class Usage(TypedDict, total=False):
+    """Resources that a run used, and what it was made with, in metrics.json."""
+
+    seconds: dict[str, float]  # wall time by stage
+    peak_memory_gib: float | None
+    seconds_per_test_trajectory: dict[str, dict[str, float]]  # `mean` and `std` by model
+    versions: Mapping[str, str]
+    device: str
+
+
+class ShownModel(TypedDict):
+    """A model of a view, also for the script of the page."""
+
+    name: str
+    light: str  # colour on a light page
+    dark: str
+    shown: bool  # at first
+    largest: float  # error [mm]
+    means: list[float | None]  # error in each frame [mm]; None after it diverged
+
+
 @dataclass(frozen=True)
 class ViewInSpace:
     """An interactive view of bodies in motion, with the data that the script of the page reads."""
@@ -153,7 +174,7 @@ class ViewInSpace:
     caption: str
     alt: str  # Description.
     payload: Markup
-    models: Sequence[Mapping[str, Any]]  # `name`, `light` and `dark` colour, and whether it is `shown` at first.
+    models: Sequence[ShownModel]
     frames: int
     speed: float  # Initial speed, over the real one.
     observed: str  # "markers" or "vertices".
@@ -214,7 +235,7 @@ def write_page(
     sections: Callable[[Canvas], Iterable[Part | None]],
     run: RunSettings,
     verdict: Sequence[str],
-    metrics: Mapping[str, Any],
+    metrics: Usage,
 ) -> None:
     """Draws the sections and writes their page, with the files of its figures in `figures/` beside it.
 
@@ -226,7 +247,7 @@ def write_page(
         sections: Yields the sections, drawn on a canvas; None for those with nothing to show.
         run: Settings, with the title.
         verdict: Sentences below the title.
-        metrics: `seconds` by stage, `peak_memory_gib`, `versions` and `device`.
+        metrics: Of the run.
 
     Raises:
         DataFileError: A file could not be written.
@@ -295,7 +316,7 @@ def _finished(parts: Sequence[Part]) -> Iterator[Part]:
         yield replace(part, blocks=blocks)
 
 
-def _times(metrics: Mapping[str, Any]) -> Iterator[Part]:
+def _times(metrics: Usage) -> Iterator[Part]:
     """Yields the section on computing times and memory; nothing without times."""
     if seconds := metrics.get("seconds"):
         stages = {**seconds, "Sum, also of stages that ran at once": sum(seconds.values())}

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from ..io.arrays import FloatArray
 from ..io.errors import listed
 from ..io.safe_files import read_array, read_hdf5
+from ..learning.identification.search import Identification
 from ..learning.parameters import TILTS
 from ..pictures.seen import NEUTRAL
 from ..settings.run import RunSettings
 from .identification_section import parameter_rows
-from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, write_page
+from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
 from .verdict import counted
 from .wording import NONE, TONES, number_text, share_text
 
@@ -67,6 +68,13 @@ class PictureResult:
         return float("nan") if value is None else value
 
 
+class PictureMetrics(Usage, total=False):
+    """Content of metrics.json of a run with pictures."""
+
+    poses: list[dict[str, Any]]  # `PictureResult`
+    parameters: Mapping[str, float]  # identified
+
+
 def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
     """Returns what is best, by how much and on how many poses, and advice; of poses of the training without others."""
     shown = [result for result in results if result.tested] or results
@@ -98,9 +106,9 @@ def _mean(results: Sequence[PictureResult], model: str) -> float:
 
 def write_pictures_report(
     path: Path,
-    metrics: Mapping[str, Any],
+    metrics: PictureMetrics,
     run: RunSettings,
-    identified: Mapping[str, Any],
+    identified: Identification,
     start: Mapping[str, float],
     outlines: Path,
     picture: Callable[[str, int], NDArray[np.uint8]],
@@ -109,7 +117,7 @@ def write_pictures_report(
 
     Args:
         path: of the page.
-        metrics: of the run, with `poses`.
+        metrics: of the run.
         run: its configuration.
         identified: the identification.
         start: values of the data sheet.

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from ..io.errors import number_of
 from .body_section import body_section, paths_section
 from .control_section import control_section
-from .data import RunReport, folds_in, trial_errors
+from .data import Metrics, RunReport, folds_in, trial_errors
 from .error_section import error_section, training_section
 from .identification_section import identification_section
 from .law_section import law_section
@@ -99,7 +99,7 @@ def _what_is_measured(data: RunReport) -> str:
     return unbroken(" ".join([text, *_contributions(data.metrics), *learned]))
 
 
-def _contributions(metrics: Mapping[str, Any]) -> list[str]:
+def _contributions(metrics: Metrics) -> list[str]:
     """Sentences on how bodies were held, and on the contribution of noise to the errors, if known."""
     notes = []
     if sideways := {trial: mm for fold in folds_in(metrics) for trial, mm in fold.get("sideways_mm", {}).items()}:
@@ -113,7 +113,7 @@ def _contributions(metrics: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def range_table(metrics: Mapping[str, Any], trials: Sequence[str]) -> PageTable | None:
+def range_table(metrics: Metrics, trials: Sequence[str]) -> PageTable | None:
     """Returns how many roll-outs left the training range, and when the first one did; None where it is not known.
 
     Args:

@@ -2,16 +2,28 @@
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from ..data.recordings.marker_quality import QUALITY_COLUMNS, quality_table
+from ..data.registration import RegistrationSummary
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PUBLISHED_WINDOWS_MM, published_errors
+from ..learning.identification.sensitivity import FreeFit
+from ..learning.metrics import PUBLISHED_WINDOWS_MM, ErrorSummary, PublishedError, published_errors
 from ..settings.run import RunSettings
 from .body_picture import registration_picture
-from .data import Driven, Errors, RunReport, folds_in, grouped_errors, missing_baselines, untrained
+from .data import (
+    Driven,
+    Errors,
+    Metrics,
+    RunReport,
+    ShapeErrors,
+    folds_in,
+    grouped_errors,
+    missing_baselines,
+    untrained,
+)
 from .page import Canvas, Cell, Drawn, Items, PageTable, Part, Row, Text
 from .verdict import error_cell, interval_text
 from .wording import (
@@ -35,7 +47,7 @@ _ALIKE, _STEADY = 0.3, 0.9  # range of gains that are alike, over their mean; le
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}
 
 
-def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
+def details_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     """Returns the errors of all models with their deviations and intervals, beside those that were published.
 
     With two groups of test trials, each has a column; published errors are of trials as in training.
@@ -69,7 +81,7 @@ def details_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
     return PageTable("All models [mm]", list(columns), rows)
 
 
-def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dict[str, tuple[str, str]]:
+def published_beside(published: Mapping[str, PublishedError], models: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Returns the published errors by our model with which they are compared."""
     renamed = {theirs: ours for ours, theirs in _PUBLISHED_BESIDE.items() if ours in models}
     return {renamed.get(model, model): published_parts(error) for model, error in published.items()}
@@ -78,7 +90,7 @@ def published_beside(published: Mapping[str, Any], models: Sequence[str]) -> dic
 def model_table(
     head: str,
     rows: Mapping[str, Mapping[str, Cell]],
-    errors: Mapping[str, Mapping[str, Any]],
+    errors: Mapping[str, ErrorSummary],
     note: str = "",
     pages: Mapping[str, str] | None = None,
     small: Mapping[str, str] | None = None,
@@ -132,7 +144,7 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Trial by trial", tables) if tables else None
 
 
-def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven | None) -> list[PageTable]:
+def rest_table(fits: Mapping[str, Sequence[FreeFit]], driven: Driven | None) -> list[PageTable]:
     """Returns a table of what could explain the remaining error of the model that has the least; empty without fits."""
     means = {model: fmean(row["as_is_mm"] for row in rows) for model, rows in fits.items() if rows}
     model = min(means, key=lambda name: means[name], default="")
@@ -140,7 +152,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven |
     if not shown:
         return []
 
-    def left(row: Mapping[str, Any], key: str) -> Cell:
+    def left(row: FreeFit, key: str) -> Cell:
         if key not in row["left_mm"]:
             return Cell(NONE)
         value = row["values"].get(key)
@@ -162,7 +174,7 @@ def rest_table(fits: Mapping[str, Sequence[Mapping[str, Any]]], driven: Driven |
     return [PageTable("What could explain the remaining error", columns, body, note)]
 
 
-def gain_text(fits: Sequence[Mapping[str, Any]], driven: Driven) -> str:
+def gain_text(fits: Sequence[FreeFit], driven: Driven) -> str:
     """Returns what refitted gains suggest; empty with fewer than three inputs, or where they remove little error."""
     known = [row for row in fits if "scale" in row["values"] and row["name"] in driven.values]
     sizes = np.array([float(np.abs(driven.values[row["name"]]).max()) for row in known])
@@ -191,7 +203,7 @@ def horizons_section(data: RunReport, canvas: Canvas) -> Part | None:
     return None if table is None else Part(title, [table])
 
 
-def horizon_table(metrics: Mapping[str, Any], published: Mapping[str, Mapping[str, Any]]) -> PageTable | None:
+def horizon_table(metrics: Metrics, published: Mapping[str, Mapping[str, PublishedError]]) -> PageTable | None:
     """Returns the errors over the first seconds of the roll-outs, with published ones below; None without any.
 
     Both the metrics' `horizons` and the published errors are by seconds and model.
@@ -223,7 +235,7 @@ def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Registration", [drawn, residual_table(recordings.registered), *([mountings] if mountings else [])])
 
 
-def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
+def mounting_table(residuals: Mapping[str, RegistrationSummary]) -> PageTable | None:
     """Returns how the mountings of rigid bodies differ between the trials that show them at rest; None without any."""
     mounted = {trial: fit["mounting"] for trial, fit in residuals.items() if "mounting" in fit}
     if not mounted:
@@ -239,13 +251,13 @@ def mounting_table(residuals: Mapping[str, Any]) -> PageTable | None:
     return PageTable("Mounting", columns, rows, note)
 
 
-def residual_table(residuals: Mapping[str, Any]) -> PageTable:
+def residual_table(residuals: Mapping[str, RegistrationSummary]) -> PageTable:
     """Returns the residuals of the registration [mm] by trial and marker, or the largest of many markers and trials."""
     labels = list(dict.fromkeys(label for fit in residuals.values() for label in fit["residual_mm"]))
     head, last = "Residual [mm]", "Root mean square"
     note = "Distance of each marker at rest from its nominal position after the rigid motion that fits best."
 
-    def cell(fit: Mapping[str, Any], label: str) -> Cell:
+    def cell(fit: RegistrationSummary, label: str) -> Cell:
         value = fit["residual_mm"].get(label)
         return Cell(NONE if value is None else f"{value:.2f}", "left out" if label in fit["outliers"] else "")
 
@@ -267,18 +279,17 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
     if data.recordings is None:
         return None
     quality = data.recordings.quality
-    warnings = [f"{trial}: {warning}" for trial, result in quality.items() for warning in result["warnings"]]
-    longest = next(iter(quality.values()))["longest_gap_filled"]
+    warnings = [f"{trial}: {warning}" for trial, result in quality.items() for warning in result.warnings]
+    longest = next(iter(quality.values())).longest_gap_filled
     note = (
         f"Gaps of up to {longest} frames are filled. Longer ones, given in frames, are masked: they do not count in "
         "losses and errors."
     )
     tables = []
     for trial, result in quality.items():
-        release = result["release_frame"]
-        summary = f"{trial}: {result['frames']} frames at {result['rate_hz']:g} Hz"
-        summary += "" if release is None else f", released in frame {release:.1f}"
-        rows = [Row(label, [*map(Cell, cells)]) for label, cells in quality_table(result["markers"]).items()]
+        summary = f"{trial}: {result.frames} frames at {result.rate_hz:g} Hz"
+        summary += "" if result.release_frame is None else f", released in frame {result.release_frame:.1f}"
+        rows = [Row(label, [*map(Cell, cells)]) for label, cells in quality_table(result.markers).items()]
         tables.append(PageTable("Marker", [*QUALITY_COLUMNS], rows, summary=summary, unfolded=len(quality) == 1))
     listed = Items(warnings) if warnings else Text("No warnings.")
     return Part("Quality of the recordings", [listed, *tables, Text(note, note=True)])
@@ -286,7 +297,7 @@ def quality_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Returns the errors on other bodies, and where the law is outside of the stretches that it was learned at."""
-    shapes: Mapping[str, Any] = data.metrics.get("shapes", {})
+    shapes = data.metrics.get("shapes", {})
     if not shapes:
         return None
     note = (
@@ -300,15 +311,15 @@ def shapes_section(data: RunReport, canvas: Canvas) -> Part | None:
     return Part("Other bodies of the same material", [shapes_table(shapes, note), *texts])
 
 
-def shapes_table(shapes: Mapping[str, Any], note: str = "") -> PageTable:
+def shapes_table(shapes: Mapping[str, ShapeErrors], note: str = "") -> PageTable:
     """Returns the errors by body and model, and the shares of the uncorrected simulator's error that are removed."""
     models, rows = [model for model in MODELS if any(model in r["errors_mm"] for r in shapes.values())], []
     for name, result in shapes.items():
         errors, cells = result["errors_mm"], []
         for model in models:
             error, base = errors.get(model), errors["simulation"]
-            removed = error is not None and base and model in ("sysid", "law")
-            below = f"removes {share_text(1.0 - error / base)}" if removed else ""
+            removes = error is not None and base and model in ("sysid", "law")
+            below = f"removes {share_text(1.0 - error / base)}" if removes and error is not None and base else ""
             cells.append(Cell(number_text(error) if model in errors else NONE, below))
         rows.append(Row(name, cells, small=f"{result['vertices']} vertices, moves by {result['moved_mm']:.3g} mm"))
     return PageTable("Error on other bodies [mm]", [MODELS[model].name for model in models], rows, note)

@@ -8,13 +8,13 @@ import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from statistics import fmean
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from ..learning.baselines import BASELINES
 from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
-from .data import Errors, folds_in, grouped_errors, missing_baselines, untrained
+from .data import Errors, Metrics, folds_in, grouped_errors, missing_baselines, untrained
 from .identification_section import in_sentence, with_unit
 from .page import Cell, PageTable, Row
 from .wording import mm_text, model_words, number_text, share_text, unbroken
@@ -76,7 +76,7 @@ def best_pair(known: Known) -> tuple[str, str]:
     return best_of(known, CORRECTED), best_of(known, [model for model in _RANKED if model not in CORRECTED])
 
 
-def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTable:
+def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     """Returns the mean errors, with a column for each group of test trials and each factor of the inputs.
 
     Of the models without physics, the best one of each column is shown. The metrics are of a split or of folds.
@@ -90,7 +90,7 @@ def results_table(metrics: Mapping[str, Any], settings: RunSettings) -> PageTabl
         if float(scale) != 1.0:
             title = f"inputs \N{MULTIPLICATION SIGN} {float(scale):g}"
             columns[title] = {model: Cell(number_text(summary["mean"])) for model, summary in errors.items()}
-            means = {m: errors[m]["mean"] for m in BASELINES if m in errors and errors[m]["mean"] is not None}
+            means = {m: mean for m in BASELINES if m in errors and (mean := errors[m]["mean"]) is not None}
             plain[title] = min(means, key=means.__getitem__, default="")
     last = next(reversed(groups.values()), {})
     best, mark = best_of(known_errors(last, idle), _RANKED), "best beyond the training" if len(groups) > 1 else "best"
@@ -138,7 +138,7 @@ def less_error(best: str, second: str, share: float) -> str:
     return f"{name} has {share_text(share)} less error than {other}"
 
 
-def verdict(metrics: Mapping[str, Any], settings: RunSettings) -> list[str]:
+def verdict(metrics: Metrics, settings: RunSettings) -> list[str]:
     """Returns a sentence on what is best, by how much and on how many trials, and at most two sentences of advice."""
     groups, idle = [*grouped_errors(metrics, settings).values()], untrained(metrics)
     if not groups or not {*_RANKED} & groups[-1].keys():
@@ -215,7 +215,7 @@ def _failed(errors: Errors, known: Known, idle: Collection[str]) -> Iterator[Dou
             yield Doubt(f"no epoch of the training of {model_words(model)} lowered the validation error", use)
 
 
-def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, groups: int) -> Iterator[Doubt]:
+def _doubts(metrics: Metrics, settings: RunSettings, known: Known, groups: int) -> Iterator[Doubt]:
     """Yields reasons not to rely on the best corrected simulator yet, the worst one first."""
     model, _ = best_pair(known)
     folds, count = folds_in(metrics), len(next(iter(known.values()), ()))
@@ -226,17 +226,18 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
         yield Doubt(text, "check the positions and axes of the markers")
     if (rms := max((placement["rms_mm"] for placement in placed), default=0.0)) > error:
         yield Doubt(f"the markers at rest fit their positions to {mm_text(rms)} only", "measure the positions again")
-    checks = [fold["mesh_check"] for fold in folds if "moved_mm" in fold.get("mesh_check", {})]
-    base = checks[0]["model"] if checks and model in ("law", "resphys") else "simulation"  # that the model improves
-    if checks and model in known and base in known:
-        moved, gained = fmean(check["moved_mm"] for check in checks), fmean(known[base]) - error
+    checks = [fold["mesh_check"] for fold in folds if "mesh_check" in fold]
+    moves = [moved for check in checks if (moved := check.get("moved_mm")) is not None]
+    base = checks[0]["model"] if moves and model in ("law", "resphys") else "simulation"  # that the model improves
+    if moves and model in known and base in known:
+        moved, gained = fmean(moves), fmean(known[base]) - error
         if moved > gained:
             text = f"a finer mesh moves the markers by {mm_text(moved)}"
             yield Doubt(f"{text}, but {model_words(model)} gains {mm_text(gained)}", "refine the mesh first")
     if 0 < count < LEAST_TRIALS:
         few = f"{_NUMBERS[count]} trial{'s are' if count > 1 else ' is'}"
         yield Doubt(f"{few} too few for an interval", "test on five trials or more")
-    left = sum(len(fold.get("range", {}).get(model, {}).get("first_s", ())) for fold in folds)
+    left = sum(len(fold["range"][model]["first_s"]) for fold in folds if model in fold.get("range", {}))
     if groups == 1 and 2 * left > count:
         trials = f"{left} of {count} trials leave" if count > 1 else "the trial leaves"
         yield Doubt(f"{trials} the training range", "train on trials that reach as far")
@@ -250,11 +251,11 @@ def _doubts(metrics: Mapping[str, Any], settings: RunSettings, known: Known, gro
         yield Doubt(f"{where}{doubt.fact}", doubt.remedy)
 
 
-def _bounds(metrics: Mapping[str, Any], settings: IdentifySettings | None) -> Iterator[Doubt]:
+def _bounds(metrics: Metrics, settings: IdentifySettings | None) -> Iterator[Doubt]:
     """Yields identified parameters at a bound or at their first guess."""
     for model, group in _GROUPS.items():
         ranges = (None if settings is None else getattr(settings, group)) or {}
-        start, values = (metrics.get(key, {}).get(model, {}) for key in ("first_guesses", "parameters"))
+        start, values = (metrics.get("first_guesses", {}).get(model, {}), metrics.get("parameters", {}).get(model, {}))
         for name, limits in ((name, limits) for name, limits in ranges.items() if name in values):
             key, close = f"identify.{group}.{name}", _CLOSE * (limits.upper - limits.lower)
             ends = {end: getattr(limits, end) for end in ("lower", "upper")}

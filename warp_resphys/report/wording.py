@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..learning.baselines import BASELINES
-from ..learning.metrics import PublishedError
+from ..learning.metrics import ErrorSummary, PublishedError
 from ..settings.control import ControlSettings
 
 NO_BREAK_SPACE: Final = "\u00a0"
@@ -107,7 +107,7 @@ def shown_models(positions: Collection[str]) -> list[str]:
     return [model for group in groups for model in [m for m in group if m in positions][:1]]
 
 
-def models_in_figures(errors: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def models_in_figures(errors: Mapping[str, ErrorSummary]) -> list[str]:
     """Returns the models that figures show: of those without physics only the one of least mean error."""
     plain = [model for model in BASELINES if model in errors]
     best = min(plain, key=lambda model: np.inf if (e := errors[model]["mean"]) is None else e, default="")
@@ -155,7 +155,7 @@ def largest_text(errors: NDArray[np.float64]) -> str:
     return mm_text(float(values.max())) if len(values) and np.isfinite(values).all() else "infinity (it diverged)"
 
 
-def error_parts(summary: Mapping[str, Any]) -> tuple[str, str]:
+def error_parts(summary: ErrorSummary) -> tuple[str, str]:
     """Returns a mean and its "± deviation", if there is one, with the same decimals."""
     mean, std = summary["mean"], summary["std"]
     if mean is None:

@@ -2,12 +2,13 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import torch
 from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
 
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
@@ -23,8 +24,11 @@ from ..io.errors import DataFileError, InputError, listed, number_of
 from ..io.resuming import finished_record, planned
 from ..io.safe_files import read_checkpoint, write_checkpoint
 from ..io.settings import Settings, packages_of, parse
+from ..learning.error_tables import ErrorTables
+from ..learning.identification.uncertainty import Uncertainty
 from ..learning.intervals import LEVEL, Intervals
-from ..learning.placement import PlacedMarkers, Placement
+from ..learning.metrics import ErrorSummary
+from ..learning.placement import PlacedMarkers, Placement, PlainPlacement
 from ..learning.residuals.correction import Learned, Range
 from ..learning.residuals.networks import NextState, restore
 from ..mesh.volume_mesh import Mesh
@@ -44,7 +48,7 @@ _NEEDED: Final = {"simulation": "identify", "sysid": "identify", "sysid_elastic"
 _NETWORK: Final = "network."
 _REGION: Final = "region."
 _PLAIN: Final = (  # fields that are written unchanged
-    *("name", "model", "settings", "material", "parameters", "uncertainty", "payload_at", "markers", "labels", "sets"),
+    *("name", "model", "settings", "material", "parameters", "payload_at", "markers", "labels", "sets"),
     *("placement", "filters", "sees_payload", "told_of_base", "seen", "level", "errors_mm"),
 )
 
@@ -68,13 +72,13 @@ class Description:
     # identified values by name, see `learning.parameters`
     parameters: Mapping[str, float] = field(default_factory=dict)
     # standard deviations and correlations of the parameters, if identification estimated them
-    uncertainty: Mapping[str, Any] | None = None
+    uncertainty: Uncertainty | None = None
     payload_at: PlaceSettings | None = None  # the vertices that a payload hangs on; None for none
     markers: MarkerSettings | None = None  # settings of the markers; None if every vertex is observed
     labels: tuple[str, ...] = ()  # of the M markers
     sets: tuple[tuple[int, ...], ...] = ()  # groups of markers, by their numbers
     bound: torch.Tensor | None = None  # (M, 3) positions of the markers on the undeformed body [m]
-    placement: Mapping[str, Any] | None = None  # identified positions of the markers, in the form of `Placement.plain`
+    placement: PlainPlacement | None = None  # identified positions of the markers
     # the network, with its input range and the frame of its forces; None for a simulator alone
     learned: Learned | None = None
     filters: tuple[float, ...] = ()  # time constants of the filtered inputs that the network takes [s]
@@ -85,7 +89,7 @@ class Description:
     seen: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = field(default_factory=dict)
     intervals: Intervals | None = None  # half-widths of the markers' prediction intervals, at `level`
     level: float = LEVEL  # nominal coverage of the intervals
-    errors_mm: Mapping[str, Any] = field(default_factory=dict)  # of the model in the test trials, as in errors.json
+    errors_mm: ErrorSummary | None = None  # of the model in the test trials
 
     def simulator(self, device: torch.device, on_failure: str) -> Simulator:
         """Builds the simulator."""
@@ -133,7 +137,7 @@ class Description:
         vertices = f"{len(self.mesh.vertices)} vertices"
         lines = [f"Robot {self.name}, {self.model}: {vertices}, {seen}, steps of {1e3 * time_step:g} ms", *inputs]
         lines += [f"  identified {name}: {value:.6g}" for name, value in self.parameters.items()]
-        if self.errors_mm.get("mean") is not None:
+        if self.errors_mm is not None and self.errors_mm["mean"] is not None:
             lines.append(f"  mean error in the test trials: {self.errors_mm['mean']:.3g} mm")
         return "\n".join(lines)
 
@@ -153,6 +157,7 @@ class Description:
         metadata: dict[str, Any] = {key: getattr(self, key) for key in _PLAIN}
         metadata["packages"] = packages_of([self.settings, self.material, self.markers, self._network()])
         metadata["intervals"] = None if self.intervals is None else self.intervals.plain()
+        metadata["uncertainty"] = None if self.uncertainty is None else asdict(self.uncertainty)
         tensors = {"vertices": torch.from_numpy(self.mesh.vertices), "cells": torch.from_numpy(self.mesh.cells)}
         tensors |= {f"{_REGION}{name}": torch.from_numpy(cells) for name, cells in self.mesh.regions.items()}
         tensors |= {} if self.bound is None else {"bound": self.bound}
@@ -184,6 +189,7 @@ class Description:
             fields[key] = None if fields[key] is None else parse(kind, fields[key], key)
         for key in ("labels", "filters", "told_of_base"):
             fields[key] = None if fields[key] is None else tuple(fields[key])
+        fields["uncertainty"] = TypeAdapter(Uncertainty | None).validate_python(fields["uncertainty"])
         fields["sets"] = tuple(tuple(members) for members in fields["sets"])
         fields["seen"] = {key: (tuple(low), tuple(high)) for key, (low, high) in fields["seen"].items()}
         regions = {name.removeprefix(_REGION): x.numpy() for name, x in tensors.items() if name.startswith(_REGION)}
@@ -246,10 +252,9 @@ def describe(folder: Path, model: str) -> Description:
     kind, _ = experiment.sources(model)
     kind = "simulation" if kind == "identified" and settings.identify is None else kind
     simulator, dataset = experiment.simulator(kind), experiment.trials
-    identified = experiment.identification(model)
-    errors = read_if_there(folder / ERRORS)
-    intervals = errors.get("intervals", {"level": LEVEL, "models": {}})
-    own = intervals["models"].get(model, {})
+    identified = experiment.identified(model)
+    errors: ErrorTables = read_if_there(folder / ERRORS)
+    calibrated = errors["intervals"]["models"].get(model, {}) if "intervals" in errors else {}
     learned, actuation = experiment.learned(model), settings.actuation
     base = None if learned is None else experiment.motions.base_movement_mask(simulator)
     moved = dataset.contact_at(dataset.names, simulator.body, dataset.time_step)
@@ -259,14 +264,14 @@ def describe(folder: Path, model: str) -> Description:
         settings=experiment.settings_of(kind),
         material=experiment.material_of(kind),
         mesh=simulator.body.mesh,
-        parameters=identified.get("parameters", {}),
-        uncertainty=identified.get("uncertainty"),
+        parameters=identified.parameters,
+        uncertainty=identified.uncertainty,
         payload_at=settings.payload_at,
         markers=settings.markers,
         labels=dataset.labels,
         sets=dataset.sets,
         bound=None if dataset.bound is None else torch.from_numpy(dataset.bound),
-        placement=identified.get("placement"),
+        placement=identified.placement,
         learned=learned,
         filters=actuation.filter_time_constants,
         sees_payload=model in LEARNED and (actuation.sees_payload or model == SIMFREE),
@@ -275,7 +280,7 @@ def describe(folder: Path, model: str) -> Description:
             name: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist()))
             for name, x in {**dataset.inputs, **moved}.items()
         },
-        intervals=Intervals.from_plain(own.get("without_spread", own)),
-        level=intervals["level"],
-        errors_mm=errors.get("errors_mm", {}).get(model, {}),
+        intervals=Intervals.from_plain(calibrated.get("without_spread", calibrated)),
+        level=errors["intervals"]["level"] if "intervals" in errors else LEVEL,
+        errors_mm=errors.get("errors_mm", {}).get(model),
     )

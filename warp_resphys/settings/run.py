@@ -47,8 +47,8 @@ def filled(values: Any) -> Any:
     for group in ("target", "laboratory"):
         part = values.get(group)
         if isinstance(part, Mapping):
-            direct = {key for key, value in part.items() if key not in keys and not isinstance(value, Mapping)}
-            constants = {key: part[key] for key in direct} if group == "target" else {}
+            direct = {key: x for key, x in part.items() if key not in keys and not isinstance(x, Mapping)}
+            constants = direct if group == "target" else {}
             material = _mapping(part.get("material", {}))
             if constants and material is not None:
                 part = {key: value for key, value in part.items() if key not in constants}

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypedDict
 
 import numpy as np
 import warp as wp
@@ -18,6 +18,9 @@ from ..io.safe_files import read_json, write_json
 from ..io.settings import Count, Natural, Settings, Some, Word, setting
 from ..report.page import PageTable
 from ..settings.performed import Labels, different
+
+if TYPE_CHECKING:
+    from ..environments.tasks import Reach
 
 _SEED: Final = 1000  # of the test episodes
 _PREVIEWS: Final = 3  # goals ahead that a scripted policy may aim at
@@ -91,6 +94,13 @@ def train_policy(settings: Policies, folder: Path) -> None:
     show(PageTable.plain(title, ["policy", *worlds], rows), f"Actions a second while learning: {rates}.", wrote)
 
 
+class _Errors(TypedDict):
+    """Errors of a policy in a world."""
+
+    mean_mm: float | None  # up to the failure of a robot
+    failed: int  # number of robots
+
+
 @dataclass(frozen=True)
 class _Policy:
     """A policy and its errors."""
@@ -98,11 +108,11 @@ class _Policy:
     group: str  # name of policies that differ in their seed alone
     act: Callable[..., NDArray[np.float32]]
     asked: Mapping[str, Any]  # settings that it was trained with
-    errors: dict[str, dict[str, Any]] = field(default_factory=dict)  # by world
+    errors: dict[str, _Errors] = field(default_factory=dict)  # by world
 
 
 def _policies(
-    settings: Policies, run: Path, reaches: Mapping[str, Any]
+    settings: Policies, run: Path, reaches: "Mapping[str, Reach | None]"
 ) -> tuple[dict[str, _Policy], dict[str, list[float]]]:
     """Scripted and trained policies by name, and actions a second of the training by model."""
     from ..environments.making import make_vector
@@ -162,10 +172,11 @@ def _test(policies: Mapping[str, _Policy], environments: Mapping[str, Any], path
             }
             write_json(path, kept)
     for name, world in every:
-        policies[name].errors[world] = {key: kept[name][world][key] for key in ("mean_mm", "failed")}
+        known = kept[name][world]
+        policies[name].errors[world] = {"mean_mm": known["mean_mm"], "failed": known["failed"]}
 
 
-def _text(errors: Sequence[Mapping[str, Any]]) -> str:
+def _text(errors: Sequence[_Errors]) -> str:
     """Mean error of policies that differ in their seed, lowest and highest of them, and number of failed robots."""
     means = [error["mean_mm"] for error in errors if error["mean_mm"] is not None]
     failures = sum(error["failed"] for error in errors)

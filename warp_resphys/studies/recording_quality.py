@@ -157,7 +157,7 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
         save_png(figure, partial)
     if len(trials) > 1:
         compare_base(trials, still, settings.largest_distortion)
-    table = quality_table(asdict(result)["markers"])
+    table = quality_table(result.markers)
     heads = ["marker", *(column.lower() for column in QUALITY_COLUMNS)]
     lines = [aligned([heads, *([label, *cells] for label, cells in table.items())])]
     seconds = result.frames / result.rate_hz

@@ -92,8 +92,8 @@ class TwinEstimator(ABC, Generic[B]):
 
         A force that is as large in all modes bends the body less in the faster ones, by the square of their frequency.
         """
-        h, known = self.time_step, self.robot.description.errors_mm.get("mean")
-        error = _SIMULATOR * self.size if known is None else 1e-3 * float(known)
+        h, known = self.time_step, self.robot.description.errors_mm
+        error = _SIMULATOR * self.size if known is None or known["mean"] is None else 1e-3 * known["mean"]
         less = (frequencies.min() / frequencies) ** 2
         shape, force = _UNKNOWN * self.size / reach * less, error / reach * less
         shaken = force * frequencies * np.sqrt(frequencies.min() * h / (2.0 * np.pi))

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -35,10 +35,10 @@ class Packet:
 
     time: float  # [s]
     # positions (3,) [m] by name, NaN where a marker is not seen; empty without a frame
-    markers: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Mapping[str, Any] = field(default_factory=dict)  # commands by name, in SI units
+    markers: Mapping[str, ArrayLike] = field(default_factory=dict)
+    inputs: Mapping[str, ArrayLike] = field(default_factory=dict)  # commands by name, in SI units
     # times [s] and commands to come; None leaves the last plan
-    plan: Sequence[tuple[float, Mapping[str, Any]]] | None = None
+    plan: Sequence[tuple[float, Mapping[str, ArrayLike]]] | None = None
 
     @classmethod
     def of_text(cls, text: str | bytes) -> Self:
@@ -97,7 +97,7 @@ def recorded_packets(robot: Robot, path: str | Path) -> Iterator[Packet]:
         bodies = markers.rigid_bodies.items()
         recording = with_corners(recording, {name: own.length for name, own in bodies if name in recording.labels})
     driven = [name for name in robot.inputs if name in robot.description.seen]
-    commands: Iterator[Mapping[str, Any]] = iter([{}] * len(recording.positions))
+    commands: Iterator[Mapping[str, ArrayLike]] = iter([{}] * len(recording.positions))
     if recording.actuation is not None and driven:
         parts, width = robot.inputs[driven[0]].parts, recording.actuation.shape[1]
         if len(driven) > 1 or width != len(parts):

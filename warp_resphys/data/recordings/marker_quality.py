@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
@@ -51,8 +50,9 @@ class MarkerQuality:
     longest_gap_frames: int
     masked_frames: int  # in gaps that are too long to be filled, or at either end
     jumps: tuple[Jump, ...]  # in the order of time
-    noise_mm: float  # standard deviation of one coordinate, see `noise_level`
-    drift_mm: float | None  # between the median places in the first and last tenth of the frames; None if it may move
+    noise_mm: float | None  # standard deviation of one coordinate, see `noise_level`; None if too little is seen
+    # between the median places in the first and last tenth of the frames; None if it may move, or is never seen
+    drift_mm: float | None
 
     @property
     def warnings(self) -> list[str]:
@@ -67,7 +67,7 @@ class MarkerQuality:
             largest = max(self.jumps, key=lambda jump: jump.mm)
             often = "once," if len(self.jumps) == 1 else f"{len(self.jumps)} times, farthest"
             warnings.append(f"{self.label} jumps {often} by {largest.mm:.2f} mm, in frame {largest.frame}.")
-        if self.drift_mm is not None and self.drift_mm > max(_MUCH_DRIFT_MM, 5.0 * self.noise_mm):
+        if self.drift_mm is not None and self.drift_mm > max(_MUCH_DRIFT_MM, 5.0 * (self.noise_mm or 0.0)):
             warnings.append(f"{self.label} should not move and drifts by {self.drift_mm:.2f} mm.")
         return warnings
 
@@ -115,12 +115,12 @@ def quality(
             stop - start for start, stop in runs(~seen) if stop - start > longest_gap or start == 0 or stop == frames
         ]
         path, drift = recording.positions[seen, column], None
-        if label in still:
+        if label in still and len(path):
             part = max(1, round(_DRIFT_PART * len(path)))
-            ends = [np.median(end, axis=0) for end in (path[:part], path[-part:])] if len(path) else [np.nan, np.nan]
+            ends = [np.median(end, axis=0) for end in (path[:part], path[-part:])]
             drift = _MILLI * float(np.linalg.norm(ends[1] - ends[0]))
         counts = (len(hidden), max(hidden, default=0), sum(masked), tuple(jumps[label]))
-        noise_mm = _MILLI * float(noise[column])
+        noise_mm = _MILLI * float(noise[column]) if np.isfinite(noise[column]) else None
         markers.append(MarkerQuality(label, label in still, float(seen.mean()), *counts, noise_mm, drift))
     warnings = [
         f"From frame {frame} on, {label} stands where {other} was: check the labels."
@@ -135,16 +135,15 @@ def quality(
 QUALITY_COLUMNS = ("Seen", "Gaps", "Longest", "Masked", "Jumps", "Noise [mm]", "Drift [mm]")
 
 
-def quality_table(markers: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
-    """Returns the cells of `QUALITY_COLUMNS` by marker, from the markers in the content of quality.json."""
+def quality_table(markers: Sequence[MarkerQuality]) -> dict[str, list[str]]:
+    """Returns the cells of `QUALITY_COLUMNS` by marker."""
     return {
-        marker["label"]: [
-            f"{100.0 * marker['seen']:.1f} %",
-            *(str(marker[key]) for key in ("gaps", "longest_gap_frames", "masked_frames")),
-            f"{len(marker['jumps'])}"
-            + (f" ({max(jump['mm'] for jump in marker['jumps']):.2f} mm)" if marker["jumps"] else ""),
-            "" if marker["noise_mm"] is None or np.isnan(marker["noise_mm"]) else f"{marker['noise_mm']:.4f}",
-            "" if marker["drift_mm"] is None else f"{marker['drift_mm']:.3f}",
+        marker.label: [
+            f"{100.0 * marker.seen:.1f} %",
+            *map(str, (marker.gaps, marker.longest_gap_frames, marker.masked_frames)),
+            f"{len(marker.jumps)}" + (f" ({max(j.mm for j in marker.jumps):.2f} mm)" if marker.jumps else ""),
+            "" if marker.noise_mm is None else f"{marker.noise_mm:.4f}",
+            "" if marker.drift_mm is None else f"{marker.drift_mm:.3f}",
         ]
         for marker in markers
     }

@@ -21,13 +21,19 @@ from ...io.errors import InputError
 from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
-from ...learning.identification.search import first_points, search_parameters, shown
+from ...learning.identification.search import Identification, first_points, search_parameters, shown
 from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
 from ...report.identification_section import parameter_rows
-from ...report.pictures_page import PictureResult, distance_table, picture_verdict, write_pictures_report
+from ...report.pictures_page import (
+    PictureMetrics,
+    PictureResult,
+    distance_table,
+    picture_verdict,
+    write_pictures_report,
+)
 from ...settings.pictures import PictureData
 from ...settings.run import RunSettings
 from ...settings.stage_keys import SIMULATOR, StageSettings
@@ -136,7 +142,12 @@ class _Plan:
         cameras: (4, 4) of poses whose standing cameras were chosen in the identification, by name and lens.
     """
 
-    def __init__(self, settings: StageSettings, run_dir: Path, cameras: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self,
+        settings: StageSettings,
+        run_dir: Path,
+        cameras: Mapping[str, Mapping[str, list[list[float]]]] | None = None,
+    ) -> None:
         self.settings, self.data, self.poses = settings, settings.data, SeenPoses(settings, run_dir)
         self._cameras = {
             name: {lens: torch.tensor(camera, dtype=torch.float64) for lens, camera in by_lens.items()}
@@ -343,7 +354,7 @@ def report_pictures(context: StageContext) -> None:
     assert data is not None
     settings = StageSettings.reading(run, *SIMULATOR, "simulation", "seed", "data")
     poses = SeenPoses(settings, context.run_dir)
-    identified = read_json(context.run_dir / IDENTIFICATION)["sysid"]
+    identified = Identification.from_plain(read_json(context.run_dir / IDENTIFICATION)["sysid"])
     start = dict(run.simulation.constants)
     for name in data.train:
         material, constants = data.poses[name].material or "", poses.material(name).constants
@@ -359,7 +370,7 @@ def report_pictures(context: StageContext) -> None:
     )
 
 
-def picture_metrics(folder: Path, run: RunSettings) -> dict[str, Any]:
+def picture_metrics(folder: Path, run: RunSettings) -> PictureMetrics:
     """Returns the content of metrics.json."""
     data = run.pictures
     assert data is not None
@@ -378,8 +389,8 @@ def print_pictures(run: RunSettings, folder: Path) -> None:
     metrics = picture_metrics(folder, run)
     write_json(folder / METRICS, metrics)
     results = [PictureResult(**row) for row in metrics["poses"]]
-    identified = read_json(folder / IDENTIFICATION)["sysid"]
-    material = {name: v for name, v in identified["parameters"].items() if split_name(name)[0] not in _PLACED}
-    rows = parameter_rows({**identified, "parameters": material}, {}, {})
+    identified = Identification.from_plain(read_json(folder / IDENTIFICATION)["sysid"])
+    material = {name: v for name, v in identified.parameters.items() if split_name(name)[0] not in _PLACED}
+    rows = parameter_rows(replace(identified, parameters=material), {}, {})
     values = (f"{row.head}: {row.cells[1].text} {row.cells[1].beside}" for row in rows)
     show(run.heading, distance_table(results), *values, *picture_verdict(results), f"Report: {folder / REPORT}")

@@ -14,9 +14,9 @@ import numpy as np
 
 from ...data.base_motion import at_times, check_steps
 from ...data.input_response import NO_INPUT
-from ...data.recordings.marker_quality import quality
+from ...data.recordings.marker_quality import Quality, quality
 from ...data.recordings.processing import smooth
-from ...data.registration import root_mean_square, unit_vector
+from ...data.registration import RegistrationSummary, root_mean_square, unit_vector
 from ...data.rigid_bodies import angles, as_markers, corners_of, motion_between, owners
 from ...data.trials import RESTING, SLACK, UNDER_INPUTS, Trials, evenly
 from ...io.arrays import FloatArray
@@ -57,11 +57,13 @@ def import_recordings(context: StageContext) -> None:
     driven = [row for row, trial in enumerate(recorded.trials) if not trial.is_released]
     hidden = {*driven} - {*(evenly(driven, _SHOWN) if driven else [])}
     shown = {name: row for row, name in enumerate(names) if row not in hidden}
-    write_json(context.run_dir / QUALITY, {name: _quality(recorded, row) for name, row in shown.items()})
+    write_json(context.run_dir / QUALITY, {name: asdict(_quality(recorded, row)) for name, row in shown.items()})
     registrations = {name: _registration(recorded, row, shifts[row]) for name, row in shown.items()}
     for name, row in shown.items():
-        registrations[name] |= {"mounting": mountings[name]} if mountings[name] else {}
-        registrations[name] |= {} if verticals is None else {"vertical_deg": _angle(verticals[row], -gravity)}
+        if mountings[name]:
+            registrations[name]["mounting"] = mountings[name]
+        if verticals is not None:
+            registrations[name]["vertical_deg"] = _angle(verticals[row], -gravity)
     write_json(context.run_dir / REGISTRATION, registrations)
 
 
@@ -151,14 +153,14 @@ def _bound(recorded: RegisteredTrials, offsets: FloatArray, training: Container[
 
 def _mountings(
     recorded: RegisteredTrials, bound: FloatArray, offsets: FloatArray, training: Container[str]
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, dict[str, dict[str, float]]]:
     """Distance [mm] and angle [degrees] of the mountings of rigid bodies in each trial from those of all, by trial.
 
     Raises:
         InputError: a rigid body was remounted between two trials.
     """
     trials = recorded.trials
-    mountings: dict[str, dict[str, Any]] = {trial.name: {} for trial in trials}
+    mountings: dict[str, dict[str, dict[str, float]]] = {trial.name: {} for trial in trials}
     for name, corners in corners_of(recorded.tracked).items():
         shown = [row for row, trial in enumerate(trials) if recorded.shows_places[row] and trial.has(name)]
         nominal, places = recorded.nominal[corners], recorded.nominal[corners] + offsets[shown][:, corners]
@@ -335,8 +337,8 @@ def _motion(
     return motion
 
 
-def _quality(recorded: RegisteredTrials, row: int) -> dict[str, Any]:
-    """Content of quality.json on a trial; its warnings are logged for released trials."""
+def _quality(recorded: RegisteredTrials, row: int) -> Quality:
+    """Quality of a trial; its warnings are logged for released trials."""
     measured, trial = recorded.measured[row], recorded.trials[row]
     still = [*recorded.markers.reference] if recorded.moving[row].base is None else []
     positions = as_markers(measured.positions, measured.labels)
@@ -348,10 +350,10 @@ def _quality(recorded: RegisteredTrials, row: int) -> dict[str, Any]:
     elif found.warnings:
         remarks = number_of(len(found.warnings), "remark")
         log.info("import: %s: %s on its quality in the report", found.source.name, remarks)
-    return asdict(found)
+    return found
 
 
-def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> dict[str, Any]:
+def _registration(recorded: RegisteredTrials, row: int, shifts: FloatArray) -> RegistrationSummary:
     """Content of registration.json on a trial, in millimetres but for positions in the frame of the body [m]."""
     markers, fit, tracked = recorded.markers, recorded.registrations[row], recorded.tracked
     # Places of the tracked markers of a loaded body are not known, and do not concern the registration.

@@ -19,7 +19,7 @@ from ...io.errors import ConvergenceError
 from ...io.parts import Checkpoint
 from ..observed_motions import ObservedMotions
 from ..parameters import Bounds, Limits, configured_parameters, own_name, split_name
-from ..placement import Accuracy
+from ..placement import Accuracy, PlainPlacements
 from ..replay import Replay, Start
 from .misfit import Misfit
 from .search import Identification, first_points, refined_searches, search_parameters
@@ -136,7 +136,8 @@ def _joined(rounds: Sequence[Identification], guess: Mapping[str, float], accura
         return found
     like = torch.zeros(len(found.placement["offsets"]), 3, dtype=torch.float64)
     expected = accuracy.of_new_session(like, len(sessions)).tolist()
-    return replace(found, placement={**found.placement, "new_session": expected})
+    placement: PlainPlacements = {**found.placement, "new_session": expected}
+    return replace(found, placement=placement)
 
 
 def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identification:

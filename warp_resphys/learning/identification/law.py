@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from ...dynamics.simulator import Simulator
-from ...energies.catalogue import law_content, unit_of
+from ...energies.catalogue import LawTest, TriedClass, law_content, unit_of
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import Material
 from ...io.arrays import FloatArray
@@ -50,7 +50,7 @@ class IdentifiedLaw:
         parameters: other identified parameters.
         deviation: standard deviations of constants and parameters; empty if they are not known.
         at_bounds: names of those that ended on a bound.
-        validation: trials that the law was tested on, and errors with it and without.
+        validation: errors on the trials that the law was tested on.
         model: name of the material's class.
         groups: groups of terms besides the modulus; this and what follows is None of a law that was known.
         loss: of the identification.
@@ -65,11 +65,11 @@ class IdentifiedLaw:
     parameters: Mapping[str, float]
     deviation: Mapping[str, float]
     at_bounds: Sequence[str]
-    validation: Mapping[str, Any]
+    validation: LawTest
     model: str = ConvexMaterial.model
     groups: Sequence[str] | None = None
     loss: float | None = None
-    classes: Sequence[Mapping[str, Any]] | None = None
+    classes: Sequence[TriedClass] | None = None
     stretches: Sequence[float] | None = None
     trials: Sequence[str] = ()
 

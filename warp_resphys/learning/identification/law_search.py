@@ -20,7 +20,7 @@ from pydantic import TypeAdapter
 from ...data.rigid_bodies import independent
 from ...data.trials import evenly
 from ...dynamics.simulator import Simulator
-from ...energies.catalogue import make_material
+from ...energies.catalogue import LawContent, LawTest, TriedClass, make_material
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
 from ...io.errors import InputError
@@ -69,7 +69,7 @@ def identify_law(
     validation: Sequence[str] = (),
     settings: LawSettings | None = None,
     seconds: float | None = None,
-    known: Mapping[str, Any] | None = None,
+    known: LawContent | None = None,
     kept: Checkpoint | None = None,
 ) -> IdentifiedLaw:
     """Identifies the law of a material from observed motions, and tests it on others.
@@ -86,7 +86,7 @@ def identify_law(
         validation: names of the validation trials.
         settings: terms, relaxation times and evaluations; the defaults of the class if None.
         seconds: duration of the trials that may be learned from [s]; None for the part that `motions` learns from.
-        known: ``model`` and ``constants`` of a law beside which the parameters are identified; None to identify a law.
+        known: law beside which the parameters are identified; None to identify a law.
         kept: see `identify`.
 
     Raises:
@@ -205,7 +205,10 @@ class _LawSearch:
             deviation={n: deviation[old] for n, old in best.names.items() if old in deviation},
             at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
             loss=best.found.loss,
-            classes=[{**asdict(tried), "validation": x} for tried, x in zip(classes, scores, strict=True)],
+            classes=[
+                TriedClass(groups=[*tried.groups], constants=tried.constants, residual=tried.residual, validation=score)
+                for tried, score in zip(classes, scores, strict=True)
+            ],
             stretches=stretches_in(
                 self.motions, trials, self.simulator(best.law.constants), best.others, self.identified
             ),
@@ -213,7 +216,7 @@ class _LawSearch:
             **self._tested(best.score),
         )
 
-    def beside(self, law: Mapping[str, Any]) -> IdentifiedLaw:
+    def beside(self, law: LawContent) -> IdentifiedLaw:
         """Identifies the parameters beside a known law, which is used in any case."""
         constants = {**law["constants"], **self.mass}
         simulator = self.simulator(constants, law["model"])
@@ -237,7 +240,7 @@ class _LawSearch:
         shared = {name: self.base.tensor([value]) for name, value in self.identified.parameters.items()}
         counting = replace(self.base, solver=replace(self.base.settings, on_failure="count"))
         below, split = self._scores(counting, shared)[0], "validation" if self.validation else "training"
-        errors = {"trials": list(self.checked), "split": split, "law": score.error, "below": below.error}
+        errors = LawTest(trials=[*self.checked], split=split, law=score.error, below=below.error)
         return {"accepted": score.beats(below), "validation": errors}
 
     def scores(self, laws: Sequence[Mapping[str, float]], others: Mapping[str, float] | None = None) -> list[Score]:

@@ -9,14 +9,13 @@ the values with the least sum of squares, prior included (Golub and Pereyra, SIA
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 
 from ...io.arrays import FloatArray
 from ...stepping.rollout import sample
-from ..placement import Accuracy, Placement, by_placement
+from ..placement import Accuracy, Placement, PlainPlacements, by_placement
 from ..replay import Replay, Start
 
 _FURTHEST, _TRIED = 3.0, 61  # largest delay, in expected deviations, and number of delays from which the search begins
@@ -44,12 +43,14 @@ class Nuisances:
     common: Placement | None = None
     moves: Mapping[str, FloatArray] = field(default_factory=dict)
 
-    def plain(self, labels: Sequence[str]) -> dict[str, Any] | None:
+    def plain(self, labels: Sequence[str]) -> PlainPlacements | None:
         """Returns the placements as JSON data: the common one, and those of the named `sessions`; None without any."""
         if self.common is None:
             return None
-        named = {session: placement.plain(labels) for session, placement in self.sessions.items() if session}
-        return self.common.plain(labels) | ({"sessions": named} if named else {})
+        placements: PlainPlacements = {**self.common.plain(labels)}
+        if named := {session: placement.plain(labels) for session, placement in self.sessions.items() if session}:
+            placements["sessions"] = named
+        return placements
 
 
 class NuisanceFit:

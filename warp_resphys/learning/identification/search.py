@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress
+from ...io.safe_files import read_json
 from ...linalg.least_squares import Point, UnitBox, minimise
 from ..observed_motions import Identified, ObservedMotions
 from .misfit import BoundedMisfit, Misfit
@@ -70,9 +72,14 @@ class Identification(Identified):
         return {key: value for key, value in asdict(self).items() if value or key not in of_trials}
 
     @staticmethod
-    def from_plain(plain: Mapping[str, Any]) -> "Identification":
+    def from_plain(plain: Any) -> "Identification":
         """Returns the identification that `plain` wrote."""
         return _PLAIN.validate_python(plain)
+
+    @classmethod
+    def read(cls, path: Path) -> "dict[str, Identification]":
+        """Returns the identifications in identification.json by model; empty without a file."""
+        return {name: cls.from_plain(plain) for name, plain in read_json(path).items()} if path.is_file() else {}
 
 
 _PLAIN = TypeAdapter(Identification)

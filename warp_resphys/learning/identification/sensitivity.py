@@ -10,7 +10,7 @@ the actuator did.
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -154,7 +154,7 @@ def parameter_spread(
         Means (R, T, M) over the coordinates, of markers and of the positions of rigid bodies [m^2]; None if the
         uncertainty of the parameters is not known.
     """
-    uncertainty, placement = identified.uncertainty, identified.placement or {}
+    uncertainty, placement = identified.uncertainty, identified.placement
     if uncertainty is None:
         return None
     ranges = np.array([*uncertainty.ranges.values()])
@@ -173,7 +173,9 @@ def parameter_spread(
         moved = as_markers(np.einsum("eTmc,ei->iTmc", slopes, root), trials.labels)
         spread[row, : moved.shape[1]] = np.nan_to_num(np.square(moved).sum(0).mean(-1))
         places = linear[name].by_placement
-        if "sessions" in placement and session not in placement["sessions"] and places is not None:
+        if placement is None or places is None:
+            continue
+        if "sessions" in placement and session not in placement["sessions"]:
             moved = as_markers(places @ np.array(placement["new_session"]), trials.labels, -3)
             spread[row, : len(moved)] += np.nan_to_num(np.square(moved).sum(-1).mean(-1))
     return spread
@@ -214,12 +216,21 @@ def left_out_changes(
     return changes if used else None
 
 
+class FreeFit(TypedDict):
+    """Mean error of a trial [mm], and what would remain of it if something were free, see `free_fits`."""
+
+    name: str
+    as_is_mm: float
+    left_mm: dict[str, float]
+    values: dict[str, float]
+
+
 def free_fits(
     trials: Trials,
     observed: Mapping[str, FloatArray],
     simulated: Mapping[str, FloatArray],
     linear: Mapping[str, Sensitivity],
-) -> list[dict[str, Any]]:
+) -> list[FreeFit]:
     """Returns what would remain of the errors of trials if something were free, by trial.
 
     The keys of ``left_mm`` and ``values`` are: ``scale`` of the inputs (its change) and their ``zero`` (in their unit),

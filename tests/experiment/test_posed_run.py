@@ -11,7 +11,8 @@ from support.played_run import check_robots
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.io.safe_files import read_array, read_hdf5, read_json
-from warp_resphys.report.identification_section import own_table
+from warp_resphys.learning.identification.search import Identification
+from warp_resphys.report.identification_section import trials_table
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh, ShippedArm
 from warp_resphys.stepping.inputs import Inputs
@@ -115,7 +116,7 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     monday, friday = (found["placement"]["sessions"][session]["offsets"] for session in ("monday", "friday"))
     further, other = (friday[marker][2] - monday[marker][2] for marker in ("M2", "M3"))
     assert further - other == pytest.approx(-4e-3, abs=1.2e-3)  # The frame of a session may be shifted, too.
-    table = own_table(found)
+    table = trials_table(Identification.from_plain(found))
     assert [row.head for row in table.rows] == ["weak", "strong", "second"]
     with read_hdf5(folder / "rollouts.h5", "rollouts") as file:  # A new trial has a gain that is not known.
         assert 1e3 * np.sqrt(read_array(file, "sysid_spread").max()) > 1.0

@@ -20,6 +20,7 @@ from ..energies.pressure import PRESSURE, Pressure
 from ..energies.strings import Strings
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.bodies import Body
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.selection import select_cells, select_vertices
@@ -220,3 +221,14 @@ def build_contact(settings: BodySettings) -> Contact:
         own = dict(obstacle)
         obstacles[name] = _SHAPES[own.pop("shape")](**own)
     return Contact(obstacles, **dict(settings.contact))
+
+
+def routes_of(body: Body) -> dict[str, FloatArray]:
+    """Returns (G, 3) guides of the body's tendons, and lines through its muscles [m], by name."""
+    routes: dict[str, FloatArray] = {}
+    for energy in body.energies:
+        if isinstance(energy, Tendons):
+            routes |= dict(zip(energy.names, energy.guides, strict=True))
+        elif isinstance(energy, Muscles):
+            routes |= energy.lines(body.mesh)
+    return routes

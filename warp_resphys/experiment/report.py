@@ -19,8 +19,6 @@ from ..data.registration import RegistrationSummary
 from ..data.rigid_bodies import as_markers, owners
 from ..data.trials import STATIC, Trials
 from ..energies.catalogue import LawContent
-from ..energies.muscles import Muscles
-from ..energies.tendons import Tendons
 from ..fem.bodies import Body
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray
@@ -37,7 +35,7 @@ from ..mesh.volume_mesh import Mesh
 from ..report.data import Driven, Film, FollowedPath, Metrics, Placed, Recordings, RunReport, TrialResults
 from ..report.wording import MODELS, models_in_figures
 from ..settings.run import RunSettings
-from .actuators import build_chambers, driving_quantity
+from .actuators import build_chambers, driving_quantity, routes_of
 from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
 from .experiment import LEARNED
 from .files import (
@@ -214,7 +212,7 @@ class RunReader:
             fixed=body.fixed_vertices,
             tip=np.empty(0, np.int64) if trials.labels else select_vertices(body.mesh, **run.tip.arguments()),
             chambers=self._driven_chambers(),
-            tendons=_routes(body),
+            tendons=routes_of(body),
             obstacles=ObstacleSurface.of(body, identification.get("sysid", Identification()).parameters),
             moved={name: {key: x[:, row] for key, x in moved.items()} for row, name in enumerate(trials.names)},
             trials=trials,
@@ -398,14 +396,3 @@ class RunReader:
             return mesh, {}
         moved = trials.positions[model][row, 0] - trials.bound
         return Mesh(film.positions[model][0], mesh.cells), dict(zip(trials.labels, moved, strict=True))
-
-
-def _routes(body: Body) -> dict[str, FloatArray]:
-    """(G, 3) guides of the body's tendons, and lines through its muscles [m], by name."""
-    routes: dict[str, FloatArray] = {}
-    for energy in body.energies:
-        if isinstance(energy, Tendons):
-            routes |= dict(zip(energy.names, energy.guides, strict=True))
-        elif isinstance(energy, Muscles):
-            routes |= energy.lines(body.mesh)
-    return routes

@@ -15,6 +15,8 @@ from ...fem.integration_points import principal_stretches
 from ...io.arrays import FloatArray
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay, Start
+from .law import LawClass
+from .search import Identification
 from .uncertainty import redundancy
 
 _CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
@@ -53,6 +55,17 @@ class Score:
         else:
             return self.error < _CLOSER * other.error
         return float(means.mean()) > _SIGNIFICANT * doubt
+
+
+@dataclass(frozen=True)
+class RefinedLaw:
+    """A law that is refined through the simulator."""
+
+    law: LawClass
+    others: dict[str, float]  # identified parameters that are not those of the material
+    names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
+    found: Identification
+    score: Score  # on the trials that laws are tested on
 
 
 @torch.no_grad()

@@ -41,7 +41,7 @@ from .law import (
     longest_side,
     strong_names,
 )
-from .law_scores import Score, scores_of, stretches_in
+from .law_scores import RefinedLaw, Score, scores_of, stretches_in
 from .misfit import Misfit
 from .search import Identification, first_points, once, refined_searches
 from .weak_form import KnownMotion, WeakForm
@@ -103,17 +103,6 @@ def identify_law(
     options = (settings or LawSettings(), seconds, kept)
     search = _LawSearch(simulator, motions, ranges, identified or Identified(), names, tuple(validation), *options)
     return search.run() if known is None else search.beside(known)
-
-
-@dataclass(frozen=True)
-class _Refined:
-    """A law that is refined through the simulator."""
-
-    law: LawClass
-    others: dict[str, float]  # identified parameters that are not those of the material
-    names: dict[str, str]  # of all identified parameters in `found`, by their names in the law
-    found: Identification
-    score: Score  # on the trials that laws are tested on
 
 
 @dataclass(frozen=True)
@@ -285,7 +274,7 @@ class _LawSearch:
         start = self.motions.start(replay)
         return KnownMotion(replay.trials.observed.transpose(0, 1), start.state.v, inputs)
 
-    def _enlarged(self, best: _Refined, classes: Sequence[LawClass]) -> _Refined:
+    def _enlarged(self, best: RefinedLaw, classes: Sequence[LawClass]) -> RefinedLaw:
         """Returns the best refined law of larger classes that balance the forces clearly better."""
         residual = min(law.residual for law in classes if law.refined_groups == best.law.refined_groups)
         for law in classes:
@@ -295,7 +284,7 @@ class _LawSearch:
                     best, residual = larger, law.residual
         return best
 
-    def _from_markers(self) -> list[_Refined]:
+    def _from_markers(self) -> list[RefinedLaw]:
         """Returns the classes that were tried through the simulator, the best last.
 
         The search begins with all groups of terms, and takes away those without which validation trials are as close:
@@ -332,7 +321,7 @@ class _LawSearch:
                 best = tried[-1]
         return [one for one in tried if one.law.constants != best.law.constants] + [best]
 
-    def _refine(self, law: LawClass, whole: bool = False) -> _Refined:
+    def _refine(self, law: LawClass, whole: bool = False) -> RefinedLaw:
         """Returns a law that is refined through the simulator, with the other identified parameters.
 
         Args:
@@ -356,7 +345,7 @@ class _LawSearch:
         names = strong_names(refined, self.shear)
         kept, beside = {n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others}
         score = self.scores([kept], beside)[0]
-        return _Refined(replace(law, constants=kept), beside, {**names, **{n: n for n in others}}, found, score)
+        return RefinedLaw(replace(law, constants=kept), beside, {**names, **{n: n for n in others}}, found, score)
 
     def _search(
         self,

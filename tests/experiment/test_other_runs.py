@@ -161,7 +161,7 @@ def test_a_crawler_shows_friction_and_stiffness_of_a_laboratory_that_lacks_nothi
     assert errors["sysid"] < 1.2 * metrics["noise_mm"] < 0.2 * errors["simulation"]
     check_robots(folder, tolerance=1e-7)
     robot = load(folder, "sysid")
-    begun = robot.begin(muscle_stress=[0.0, 0.0, 0.0]).body.q[0]
+    begun = robot.begin(muscle_stress=[0.0, 0.0, 0.0]).q[0]
     assert 0.0 < float((begun - robot.simulator.rest_positions).abs().max()) < 1e-4  # It lies where it lay.
     recordings = RunReader(folder, configured).recordings(robot.simulator.body.mesh, {})
     assert set(recordings.beside) == {label for label in recordings.nominal if label.startswith("Floor")} != set()
@@ -319,7 +319,7 @@ def test_limbs_that_swim_are_identified_by_their_shape(folder):
     assert factor == pytest.approx(FACTOR, rel=0.03)
     errors, by_marker = means(metrics), metrics["per_marker"]["sysid"]
     assert {label: value is None for label, value in by_marker.items()} == dict.fromkeys(tracked["fast"], False)
-    assert {"markers", "motion"} <= {path.stem for path in (run_folder / "figures").glob("*.png")}
+    assert {"paths_worst", "motion"} <= {path.stem for path in (run_folder / "figures").glob("*.png")}
     assert 3.0 * errors["sysid"] < errors["simulation"]
     assert errors["resphys"] < errors["sysid"] + 0.25 * NOISE  # nothing is left to learn
     check_robots(run_folder)

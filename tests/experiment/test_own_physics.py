@@ -88,7 +88,7 @@ def test_a_run_or_a_robot_without_the_package_says_so(folder, installed, tmp_pat
     file = tmp_path / "robot.safetensors"
     robot.save(file)
     assert read_checkpoint(file, "robot")[1]["packages"] == {"my-robot-physics": "0.1.0"}
-    moved = [warp_resphys.load(place).settle(magnetic_field=[0.04]).body.q for place in (folder, file)]
+    moved = [warp_resphys.load(place).settle(magnetic_field=[0.04]).q for place in (folder, file)]
     torch.testing.assert_close(*moved)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place != str(installed)])
     for place in (folder, file):

@@ -19,7 +19,7 @@ UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")
 
 @pytest.mark.slow
 def test_the_package_imports_without_the_modules_of_unix():
-    names = ["atomic", "decoding", "fan_out", "files", "kernel_cache", "machine", "stages"]
+    names = ["atomic", "decoding", "fan_out", "kernel_cache", "machine", "resuming", "safe_files"]
     program = f"""
 import sys
 import filelock

@@ -24,18 +24,17 @@ def _public(name: str) -> Any:
         return _version()
     if name in _PARTS:
         return import_module(f"{__name__}.{name}")
-    if name == "__all__" or name[:1] != "_":
+    if name == "__all__" or (name[:1] != "_" and importlib.util.find_spec(f"{__name__}.{name}") is None):
         with collector_paused():
             public = {key: value for key, value in vars(import_module(f"{__name__}.names")).items() if key[:1] != "_"}
         if name == "__all__":
             return [*public]
         if name in public:
             return public[name]
-    message = f"module {__name__!r} has no attribute {name!r}"
-    for part in _PARTS if name[:1] != "_" else ():
-        if hasattr(import_module(f"{__name__}.{part}"), name):
-            message += f": it is in {__name__}.{part}"
-    raise AttributeError(message)
+        for part in _PARTS:
+            if hasattr(import_module(f"{__name__}.{part}"), name):
+                raise AttributeError(f"module {__name__!r} has no attribute {name!r}: it is in {__name__}.{part}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")  # A module is imported by its statement.
 
 
 def __dir__() -> list[str]:

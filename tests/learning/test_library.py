@@ -218,6 +218,8 @@ def test_invalid_motions_are_refused(robot):
     with pytest.raises(wr.InputError, match="external_force has 2 time steps, but 3 are"):
         ObservedMotions.of(robot, q, start, wr.Inputs(external_force=torch.zeros(2, *q.shape[1:]).to(q)))
     motion = ObservedMotions.of(robot, q.numpy(), start)
+    with pytest.raises(wr.InputError, match="reconstruct them first"):
+        Fitting(robot, motion, None, motion.trials.names).samples(motion.trials.names)
     with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
         identify(robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match=r"a range is 200000\.0: give the smallest and the largest value"):

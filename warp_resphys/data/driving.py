@@ -1,4 +1,4 @@
-"""What acts on bodies during the trials of a dataset, and the phases of driven trials."""
+"""Inputs, base and obstacles that act on bodies during trials, and the phases of driven trials."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -34,7 +34,14 @@ Linear = Mapping[str, Mapping[str, Sensitivity]]  # derivatives by model and tri
 
 @dataclass(frozen=True)
 class Model:
-    """A simulator with identified parameters, and the network that corrects or replaces it, if any."""
+    """A simulator with identified parameters, and the network that corrects or replaces it, if any.
+
+    Attributes:
+        simulator: whose roll-outs are compared; failed steps are counted.
+        identified: its parameters and marker places.
+        learned: the network; None for the simulator alone.
+        has_intervals: whether prediction intervals are calibrated for it.
+    """
 
     simulator: Simulator
     identified: Identification = field(default_factory=Identification)

@@ -19,7 +19,7 @@ _LEAST_DECIMAL: Final = 1e-4  # Smaller numbers are written with a power of ten.
 
 
 class ComparedModel(NamedTuple):
-    """What a model is called."""
+    """Names of a model in tables and sentences."""
 
     name: str  # In tables and figures.
     meaning: str  # In small print below it.

@@ -15,6 +15,7 @@ import torch
 from ...data.trials import STATIC
 from ...dynamics.modes import RestStiffness
 from ...dynamics.simulator import Simulator
+from ...io.errors import InputError
 from ...io.progress import Progress
 from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
@@ -84,12 +85,12 @@ def fit_force(
 
 @dataclass(frozen=True)
 class Fitting:
-    """What a network is fitted to.
+    """Data of a fit: the simulator, the trials, their reconstructed forces, and options of the roll-outs.
 
     Attributes:
         simulator: whose force is learned, or which shows the network's states.
         motions: observed trials.
-        reconstructed: their states and forces.
+        reconstructed: their states and forces; None where the trials have the states of all vertices.
         train: names of the trials to learn from.
         validation: names of the trials that choose the weights.
         identified: parameters of the simulator.
@@ -163,7 +164,8 @@ class Fitting:
             rows = dataset.rows(names)
             q, v = (torch.as_tensor(field[rows], device=self.device) for field in (dataset.observed, dataset.velocity))
             return q, v, q.new_zeros(()).expand_as(q), torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool)
-        assert self.reconstructed is not None
+        if self.reconstructed is None:
+            raise InputError("the trials have no velocities of all vertices to learn from: reconstruct them first.")
         arrays = self.reconstructed.of(names, "q", "v", "force", "error")
         q, v, force, error = (torch.as_tensor(array, device=self.device) for array in arrays)
         return q, v, force, error[:, 1:].isfinite()

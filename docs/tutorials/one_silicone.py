@@ -51,7 +51,7 @@ print("\n".join(line for line in printed.splitlines() if "law" in line and "erro
 
 # %%
 law = json.loads(Path("runs/beam/law.json").read_text())
-for name, value in law["constants"].items():
+for name, value in law["parameters"].items():
     print(f"{name:18s} {value:12.4g} {law['units'][name]}")
 print(f"\nerror over the amplitude: {law['validation']['law']:.2g}, of SysID {law['validation']['below']:.2g}")
 

@@ -59,17 +59,17 @@ def task_of(
     start, inputs = simulator.rest_state(batch), Inputs()
     if not straight:
         start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
-    constants = {_MODULUS: simulator.tensor([law.constants[_MODULUS]])} if _MODULUS in law.constants else {}
+    parameters = {_MODULUS: simulator.tensor([law.values[_MODULUS]])} if _MODULUS in law.values else {}
     device = start.q.device
 
     def measure(steps: int = steps, inputs: Inputs = inputs) -> dict[str, float]:
         began = now(device)
         with torch.no_grad():
-            path = simulator.rollout(start, steps, inputs, constants)
+            path = simulator.rollout(start, steps, inputs, parameters)
         plain = now(device) - began
         q, v = (tensor.detach().clone().requires_grad_() for tensor in (start.q, start.v))
         force = q.new_zeros(steps, *q.shape).requires_grad_()
-        moduli = {name: value.clone().requires_grad_() for name, value in constants.items()}
+        moduli = {name: value.clone().requires_grad_() for name, value in parameters.items()}
         began = now(device)
         path = simulator.rollout(State(q, v), steps, inputs.replace(external_force=force), moduli)
         forward = now(device) - began

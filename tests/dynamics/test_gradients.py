@@ -88,7 +88,7 @@ def test_every_parameter_with_every_integrator(integrator, start):
 @pytest.mark.parametrize(
     "options",
     [
-        {"material": StableNeoHookean(**DAMPED.constants)},
+        {"material": StableNeoHookean(**DAMPED.values)},
         {"material": replace(DAMPED, poissons_ratio=-0.2)},
         {"solver": SolverSettings("quasi_newton", relative_tolerance=1e-12)},
         {"solver": SolverSettings("newton", relative_tolerance=1e-12, linear_solver="sparse")},

@@ -74,10 +74,10 @@ def test_an_energy_set_names_parameters_by_region_and_knows_its_memory():
     rest = torch.as_tensor(mesh.vertices)
     where = (body, DeviceCoordinates(body.coordinates, rest), rest, INTEGRATORS["bdf2"], 0.01)
     energies = EnergySet(place_energies(body, materials), *where)
-    assert energies.constants["tip_youngs_modulus"] == 2e5
+    assert energies.defaults["tip_youngs_modulus"] == 2e5
     assert {"root_density", "tip_density", "tendon_friction"} <= set(energies.parameters)
     given = {
-        name: energies.parameters[name].shaped(torch.as_tensor(v).double()) for name, v in energies.constants.items()
+        name: energies.parameters[name].shaped(torch.as_tensor(v).double()) for name, v in energies.defaults.items()
     }
     values, mass = energies.prepare({**given, "tip_density": torch.tensor([[500.0], [700.0]]).double()})
     volume = 0.02**3

@@ -192,7 +192,7 @@ class TestGradients:
                 state = simulator.static_equilibrium(pull(newtons), given, after=state)
             return (weights * simulator.step(state, pull(0.02), given).q).sum()
 
-        values = {name: torch.tensor([simulator.constants[name]]).double() for name in names}
+        values = {name: torch.tensor([simulator.defaults[name]]).double() for name in names}
         check_slopes(loss, values, {name: 1e-4 * float(values[name]) for name in names}, tolerance=1e-5)
 
 

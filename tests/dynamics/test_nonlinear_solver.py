@@ -28,7 +28,7 @@ def simulator(name="quasi_newton", material=MATERIAL, device="cpu", **settings):
 
 @pytest.mark.parametrize(("model", "start"), [("corotated", "twisted"), ("stable_neo_hookean", "bent")])
 def test_all_solvers_find_the_same_trajectory(model, start, device):
-    material = MATERIALS[model](**MATERIAL.constants)
+    material = MATERIALS[model](**MATERIAL.values)
     results = {}
     for name in SOLVERS:
         s = simulator(name, material, device=device, max_iterations=5000)

@@ -121,7 +121,7 @@ def test_boxes_that_are_glued_bend_like_one():
         torch.testing.assert_close(glued.q[0, i], glued.q[0, twin], rtol=0.0, atol=1e-15)
 
 
-def test_gradients_by_the_constants_of_a_region():
+def test_gradients_by_the_parameters_of_a_region():
     materials = {"beam": Corotated(3e5, 0.45, mass_damping=0.3), "cap": StableNeoHookean(1e5, 0.499, mass_damping=0.1)}
     simulator = Simulator(clamped(MESH), materials, relative_tolerance=1e-11, integrator="bdf2")
     weights = noise(1, simulator.body.n_vertices, 3)
@@ -130,7 +130,7 @@ def test_gradients_by_the_constants_of_a_region():
         return (weights * simulator.rollout(simulator.rest_state(), 3, parameters=given).q[-1]).sum()
 
     names = ("beam_youngs_modulus", "cap_poissons_ratio", "cap_mass_damping")
-    values = {name: torch.tensor([float(simulator.constants[name])], dtype=torch.float64) for name in names}
+    values = {name: torch.tensor([float(simulator.defaults[name])], dtype=torch.float64) for name in names}
     check_slopes(loss, values, {name: 1e-3 * float(value) for name, value in values.items()})
 
 

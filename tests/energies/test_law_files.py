@@ -15,27 +15,27 @@ SHIPPED = sorted(path.stem for path in (Path(wr.__file__).parent / "laws").glob(
 
 def written(folder, **changes):
     """A law.json as a run writes it."""
-    constants = {"density": 1100.0, "mass_damping": 3.0, "c10": 40e3, "bulk_1": 5e6, "prony_modulus_1": 8e3}
-    content = {"format": LAW_FORMAT, "model": "law", "constants": constants | {"prony_time_1": 0.1}}
+    parameters = {"density": 1100.0, "mass_damping": 3.0, "c10": 40e3, "bulk_1": 5e6, "prony_modulus_1": 8e3}
+    content = {"format": LAW_FORMAT, "model": "law", "parameters": parameters | {"prony_time_1": 0.1}}
     path = folder / "law.json"
     path.write_text(json.dumps(content | changes))
     return str(path)
 
 
-def test_the_material_of_a_run_has_its_constants_without_the_damping_of_the_robot(tmp_path):
+def test_the_material_of_a_run_has_its_parameters_without_the_damping_of_the_robot(tmp_path):
     material = wr.read_material(written(tmp_path))
     assert isinstance(material, wr.energies.ConvexMaterial)
-    assert material.constants["c10"] == 40e3
-    assert material.constants["density"] == 1100.0
-    assert material.constants["prony_time_1"] == 0.1
-    assert material.constants["mass_damping"] == 0.0
+    assert material.values["c10"] == 40e3
+    assert material.values["density"] == 1100.0
+    assert material.values["prony_time_1"] == 0.1
+    assert material.values["mass_damping"] == 0.0
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_silicone_of_the_package_is_stiff_as_silicones_are_and_says_where_it_comes_from(name):
     law, material = read_law(name), wr.read_material(name)
-    ogden = [value for key, value in material.constants.items() if key.startswith("ogden_")]
-    shear = 2.0 * (material.constants["c10"] + material.constants["c01"]) + sum(ogden)
+    ogden = [value for key, value in material.values.items() if key.startswith("ogden_")]
+    shear = 2.0 * (material.values["c10"] + material.values["c01"]) + sum(ogden)
     assert 10e3 < shear < 300e3
     assert {"deviation", "stretches", "data", "versions", "units"} <= law.keys()
     assert law["accepted"]
@@ -49,9 +49,9 @@ def test_there_are_silicones_and_an_unknown_one_is_refused_with_their_names():
         law_path("dragon_skin_99")
 
 
-NUMBER = r"constants\.c10 is .*: a law has a finite number there"
+NUMBER = r"parameters\.c10 is .*: a law has a finite number there"
 UNITS, STRETCHES = (
-    "units is .*: give the unit of each constant",
+    "units is .*: give the unit of each parameter",
     "stretches is .*: give the least and the largest stretch",
 )
 
@@ -59,13 +59,16 @@ UNITS, STRETCHES = (
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        *(("constants", {"c10": value, "bulk_1": 1e6}, NUMBER) for value in (True, "4e4", float("nan"))),
+        *(("parameters", {"c10": value, "bulk_1": 1e6}, NUMBER) for value in (True, "4e4", float("nan"))),
         *(("units", value, UNITS) for value in (None, "Pa")),
         *(
             ("stretches", pair, STRETCHES)
             for pair in ([True, 2.0], [1.1, 0.9], [0.0, 1.1], [0.9, math.inf], [0.9], 1.1)
         ),
-        *((key, value, "not a law of this version") for key, value in (("format", 0), ("constants", {}), ("model", 3))),
+        *(
+            (key, value, "not a law of this version")
+            for key, value in (("format", 0), ("parameters", {}), ("model", 3))
+        ),
     ],
 )
 def test_a_file_that_is_no_law_is_refused(tmp_path, key, value, message):

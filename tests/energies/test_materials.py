@@ -52,7 +52,7 @@ def test_gradients_by_every_coefficient(pose):
 
 
 @pytest.mark.slow
-def test_gradients_by_directions_and_constants_of_fibres():
+def test_gradients_by_directions_and_parameters_of_fibres():
     """Differences do not see jumps of the tangent's slope, nor of the modulus at the end of compression."""
     rows = [row for row in compared("twisted", fibres=FIBRES) if "fibre" in row.parameter]
     check_rows(rows, "fibre_azimuth_1", "fibre_tension_2", "fibre_slack_2", "fibre_toe_1", bound=1e-3)
@@ -81,35 +81,38 @@ class TestByName:
     def test_every_constant_by_its_name(self):
         fibre = {"azimuth": 0.3, "elevation": 0.2, "slack": 0.01, "toe": 0.05, "tension": 4e4, "stiffening": 1e4}
         fibre["compression"] = 2e3
-        constants = {"c10": C10, "bulk_1": 1e6, "shear_viscosity": 40.0}
+        parameters = {"c10": C10, "bulk_1": 1e6, "shear_viscosity": 40.0}
         given = {"ogden_m3": 5e3, "ogden_4": 3e4, "prony_modulus_1": 2e4, "prony_time_1": 0.03}
         given |= {f"fibre_{name}_1": value for name, value in fibre.items()}
-        made = make_material("law", **constants, **given)
+        made = make_material("law", **parameters, **given)
         terms = {"ogden": {-3: 5e3, 4: 3e4}, "prony": [(2e4, 0.03)], "fibres": [FibreFamily(**fibre)]}
-        direct = ConvexMaterial(**constants, **terms)
+        direct = ConvexMaterial(**parameters, **terms)
         assert isinstance(made, ConvexMaterial)
-        assert made.constants == direct.constants
+        assert made.values == direct.values
         assert made.law is direct.law
-        assert {"ogden_m3", "ogden_4", "fibre_compression_1", "prony_modulus_1"} <= made.constants.keys()
-        assert "stiffness_damping" not in made.constants
-        assert ConvexMaterial.from_constants(made.constants).constants == made.constants
+        assert {"ogden_m3", "ogden_4", "fibre_compression_1", "prony_modulus_1"} <= made.values.keys()
+        assert "stiffness_damping" not in made.values
+        assert ConvexMaterial.from_parameters(made.values).values == made.values
 
     @pytest.mark.parametrize(
-        ("constants", "message"),
+        ("parameters", "message"),
         [
-            ({"youngs_modulus": 1e5}, "no constant 'youngs_modulus': it has c10, .*, prony_modulus_1, .*fibre_azimuth"),
-            ({"stiffness_damping": 1e-3}, "no constant 'stiffness_damping'"),
+            (
+                {"youngs_modulus": 1e5},
+                "no parameter 'youngs_modulus': it has c10, .*, prony_modulus_1, .*fibre_azimuth",
+            ),
+            ({"stiffness_damping": 1e-3}, "no parameter 'stiffness_damping'"),
             ({"prony_ratio_1": 0.3, "prony_time_1": 0.1}, "prony has prony_time_1: give each branch"),
             ({"prony_modulus_1": 1e3}, "prony has prony_modulus_1: give each branch, numbered from 1"),
             ({"fibre_tension_1": 1e3}, "fibres has fibre_tension_1: give each family, numbered from 1"),
             ({"ogden_2": 1e3}, "exponent 2: give whole numbers from 3 up"),
-            ({"ogden_x": 1e3}, "no constant 'ogden_x'"),
+            ({"ogden_x": 1e3}, "no parameter 'ogden_x'"),
             ({"c10": "soft"}, "c10"),
         ],
     )
-    def test_what_is_no_law_is_refused(self, constants, message):
+    def test_what_is_no_law_is_refused(self, parameters, message):
         with pytest.raises(InputError, match=message):
-            make_material("law", **constants)
+            make_material("law", **parameters)
 
 
 CUBE = box_hexahedra((0.01, 0.01, 0.01), (1, 1, 1))
@@ -160,6 +163,6 @@ def test_gradients_by_every_constant_of_rubbers(material, start, names, device):
 
 
 @pytest.mark.parametrize(("name", "value"), [("c10", -1), ("bulk_modulus", 0)])
-def test_constants_out_of_range(name, value):
+def test_parameters_out_of_range(name, value):
     with pytest.raises(InputError, match=f"{name} is {value}: it must be positive, in Pa"):
         MooneyRivlin(**{name: float(value)})

@@ -58,13 +58,13 @@ class TestALawThatHelps:
         law = read_json(rubber / "law.json")
         assert law["accepted"]
         assert {"branches", "fibres"} <= {*law["groups"]}
-        constants = law["constants"]
-        along = np.cos(constants["fibre_azimuth_1"]) * np.cos(constants["fibre_elevation_1"])
+        parameters = law["parameters"]
+        along = np.cos(parameters["fibre_azimuth_1"]) * np.cos(parameters["fibre_elevation_1"])
         assert abs(along) > np.cos(np.radians(5.0))
-        assert constants["fibre_tension_1"] == pytest.approx(80e3, rel=0.3)
-        moduli = sum(value for name, value in constants.items() if name.startswith("prony_modulus"))
+        assert parameters["fibre_tension_1"] == pytest.approx(80e3, rel=0.3)
+        moduli = sum(value for name, value in parameters.items() if name.startswith("prony_modulus"))
         assert moduli == pytest.approx(0.3 * 2.0 * 44e3, rel=0.3)
-        assert all(value >= 0.0 for name, value in constants.items() if "azimuth" not in name and "elev" not in name)
+        assert all(value >= 0.0 for name, value in parameters.items() if "azimuth" not in name and "elev" not in name)
         sizes = [len(own["groups"]) for own in law["classes"]]
         assert sizes == sorted(sizes)
         assert law["classes"][0]["groups"] == []
@@ -85,11 +85,11 @@ class TestALawThatHelps:
     def test_another_run_takes_it(self, rubber, tmp_path):
         others = [word for word in RUBBER if not word.startswith("law.")]
         given = read_json(rubber / "law.json")
-        of_another_body = given["constants"] | {"mass_damping": 7.0, "density": 400.0}
-        (tmp_path / "other.json").write_text(json.dumps(given | {"constants": of_another_body}))
+        of_another_body = given["parameters"] | {"mass_damping": 7.0, "density": 400.0}
+        (tmp_path / "other.json").write_text(json.dumps(given | {"parameters": of_another_body}))
         folder = run_without_report(tmp_path, *others, f"law={tmp_path / 'other.json'}")
         law = read_json(folder / "law.json")
-        assert law["constants"] == given["constants"]
+        assert law["parameters"] == given["parameters"]
         assert law["accepted"]
         assert by_trial(folder)["twist 90°"]["law"] == pytest.approx(by_trial(rubber)["twist 90°"]["law"], rel=0.01)
         with pytest.raises(DataFileError, match=r"errors\.json is not a law of this version"):

@@ -156,8 +156,8 @@ class TestPicturesOfAFolder:
         modulus = identified(recorded / "run")["parameters"]["youngs_modulus@soft"]
         assert 100e3 < modulus < 180e3
         assert "no pose was kept back" in out
-        constants = read_law(str(recorded / "run" / "law_soft.json"))["constants"]
-        assert (constants["youngs_modulus"], constants["density"]) == (modulus, 1100.0)
+        parameters = read_law(str(recorded / "run" / "law_soft.json"))["parameters"]
+        assert (parameters["youngs_modulus"], parameters["density"]) == (modulus, 1100.0)
 
     @pytest.mark.slow
     def test_a_tag_shows_the_camera(self, recorded):
@@ -334,7 +334,7 @@ class TestRelease:
             cells = re.sub(r"<[^>]*>", " ", page.partition(name)[2].partition("</tr>")[0]).split()
             assert cells[-1] == true
         assert "Stiffness damping [ms]: " in out
-        assert read_json(run / "law.json")["constants"]["stiffness_damping"] == found["stiffness_damping"]
+        assert read_json(run / "law.json")["parameters"]["stiffness_damping"] == found["stiffness_damping"]
 
     @pytest.fixture(scope="class")
     @classmethod

@@ -150,7 +150,7 @@ def test_a_network_or_trainer_on_the_command_line_is_taken_whole(group, option):
     assert getattr(run, other) == getattr(settings("experiment=beam_synthetic"), other)
 
 
-def test_a_material_may_leave_out_its_model_and_its_constants_and_is_believed_or_not():
+def test_a_material_may_leave_out_its_model_and_its_parameters_and_is_believed_or_not():
     config = composed()
     for material in ({}, {"youngs_modulus": 2e5}, {"model": "stable_neo_hookean", "density": 1000.0}):
         check(composed("experiment=sopra") | {"simulation": material})

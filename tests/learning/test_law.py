@@ -10,7 +10,7 @@ import torch
 
 from warp_resphys import Body, InputError, Inputs, Simulator, SolverSettings, box_hexahedra, select_vertices
 from warp_resphys.energies import make_material
-from warp_resphys.learning.identification.law import _constants, fit_classes
+from warp_resphys.learning.identification.law import _parameters, fit_classes
 from warp_resphys.learning.identification.weak_form import KnownMotion, NormalEquations, WeakForm
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
@@ -34,9 +34,9 @@ CANDIDATES = [{name: unit} for name, unit in UNIT.items()]
 PULLS = [(0.3, 0.0, -0.2), (-0.2, 0.2, 0.05)]  # N
 
 
-def beam(constants, integrator="implicit_euler"):
-    """A beam of a law, all of whose constants are given."""
-    material = make_material("law", **constants)
+def beam(parameters, integrator="implicit_euler"):
+    """A beam of a law, all of whose parameters are given."""
+    material = make_material("law", **parameters)
     return Simulator(BODY, material, time_step=0.005, solver=TIGHT, integrator=integrator)
 
 
@@ -56,8 +56,8 @@ def released(sim, pulls, steps=12):
 
 def simulator(values, integrator="implicit_euler"):
     """A beam whose forces are linear in `values`, in the order of `UNIT`."""
-    constants = dict(zip(UNIT, values * np.array([*UNIT.values()]), strict=True))
-    return beam({**constants, **SHAPE, **REST}, integrator)
+    parameters = dict(zip(UNIT, values * np.array([*UNIT.values()]), strict=True))
+    return beam({**parameters, **SHAPE, **REST}, integrator)
 
 
 def residual_of(forces, target):
@@ -158,7 +158,7 @@ def classes(truth):
     sizes = [len(law.groups) for law in laws]
     assert sizes == sorted(sizes)
     assert laws[0].groups == ()
-    assert laws[0].constants.keys() == {"c10", "bulk_1"}
+    assert laws[0].parameters.keys() == {"c10", "bulk_1"}
     return {law.groups: law for law in laws}
 
 
@@ -166,9 +166,9 @@ def test_terms_that_the_beam_has_are_found_and_no_others():
     truth = {**NEO_HOOKEAN, "ogden_4": 20e3, "shear_viscosity": 30.0}
     laws = classes(truth)
     found = laws["elastic", "viscosity"]
-    assert found.constants == pytest.approx(truth, rel=1e-3)
+    assert found.parameters == pytest.approx(truth, rel=1e-3)
     assert found.residual < 1e-6
-    assert laws["viscosity",].constants["shear_viscosity"] == pytest.approx(30.0, rel=0.02)
+    assert laws["viscosity",].parameters["shear_viscosity"] == pytest.approx(30.0, rel=0.02)
     smaller = [law for groups, law in laws.items() if not {"elastic", "viscosity"} <= {*groups}]
     assert min(law.residual for law in smaller) > 100.0 * found.residual
     assert laws["viscosity",].residual < 0.1 * laws[()].residual
@@ -178,16 +178,16 @@ def test_a_branch_between_two_times_of_the_grid_is_one_branch():
     truth = {**NEO_HOOKEAN, "prony_modulus_1": 15e3, "prony_time_1": math.sqrt(TIMES[3] * TIMES[4])}
     laws = classes(truth)
     found = laws["branches",]
-    assert {name for name in found.constants if name.startswith("prony")} == {"prony_modulus_1", "prony_time_1"}
-    assert found.constants["prony_time_1"] == pytest.approx(truth["prony_time_1"], rel=0.05)
-    assert found.constants["prony_modulus_1"] == pytest.approx(15e3, rel=0.05)
+    assert {name for name in found.parameters if name.startswith("prony")} == {"prony_modulus_1", "prony_time_1"}
+    assert found.parameters["prony_time_1"] == pytest.approx(truth["prony_time_1"], rel=0.05)
+    assert found.parameters["prony_modulus_1"] == pytest.approx(15e3, rel=0.05)
     assert found.residual < 0.01 * laws[()].residual
 
 
 def test_neighbouring_relaxation_times_become_one_branch():
     branches = [{"prony_modulus_1": 1e5, "prony_time_1": time} for time in (0.01, 0.015, 0.1, 0.4)]
     candidates = [{"c10": 1e5}, {"bulk_1": 1e5}, *branches, {"shear_viscosity": 1e2}]
-    found = _constants(candidates, np.array([0.4, 20.0, 0.1, 0.3, 0.2, 1e-5, 0.5]))
+    found = _parameters(candidates, np.array([0.4, 20.0, 0.1, 0.3, 0.2, 1e-5, 0.5]))
     assert {name: found[name] for name in ("c10", "bulk_1", "shear_viscosity")} == pytest.approx(
         {"c10": 4e4, "bulk_1": 2e6, "shear_viscosity": 50.0}
     )

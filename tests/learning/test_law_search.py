@@ -1,4 +1,4 @@
-"""Laws: identified from observed motions, their scores on trials, and the constants that a refined law keeps."""
+"""Laws: identified from observed motions, their scores on trials, and the parameters that a refined law keeps."""
 
 import math
 from dataclasses import dataclass
@@ -89,16 +89,16 @@ class Refined:
 
 
 def search_from_markers(errors, guess=None, lost=()):
-    """Groups of the classes in the order of the search, the best last, and the constants that each began with.
+    """Groups of the classes in the order of the search, the best last, and the parameters that each began with.
 
-    Errors are those of the validation trials by group; a refinement finds the lost constants to be zero.
+    Errors are those of the validation trials by group; a refinement finds the lost parameters to be zero.
     """
     began = []
 
     def refine(law):
-        began.append(dict(law.constants))
-        kept = {name: value for name, value in law.constants.items() if not name.startswith(tuple(lost))}
-        kept["c10"] = 0.0 if "elastic" in law.groups else law.constants["c10"]  # as if other terms took its place
+        began.append(dict(law.parameters))
+        kept = {name: value for name, value in law.parameters.items() if not name.startswith(tuple(lost))}
+        kept["c10"] = 0.0 if "elastic" in law.groups else law.parameters["c10"]  # as if other terms took its place
         return Refined(LawClass(law.groups, kept, math.nan), Score((np.array([errors[law.groups] ** 2] * 2),)))
 
     settings = SimpleNamespace(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
@@ -129,10 +129,10 @@ def test_a_law_is_identified_from_observed_motions_and_simulates_on():
     law = identify_law(simulator, motions, train=motions.trials.names[:3], validation=["motion 3"], settings=settings)
     assert law.accepted
     assert law.groups == ("elastic", "viscosity")
-    assert {name: law.constants[name] for name in truth} == pytest.approx(truth, rel=0.05)
-    assert law.constants.get("c20", 0.0) < 200.0
+    assert {name: law.parameters[name] for name in truth} == pytest.approx(truth, rel=0.05)
+    assert law.parameters.get("c20", 0.0) < 200.0
     assert law.validation["law"] < 0.01 * law.validation["below"]
-    assert float(evaluate(law.simulator, motions, parameters=law.parameters).mean()) < 1e-5
+    assert float(evaluate(law.simulator, motions, parameters=law.others).mean()) < 1e-5
 
 
 def test_materials_of_regions_have_no_law():

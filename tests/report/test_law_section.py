@@ -44,20 +44,20 @@ def errors_on(trials, error, below):
 
 def law(**changes):
     """Content of law.json, and what metrics.json adds."""
-    constants = {"c10": 40e3, "bulk_1": 7e6, "ogden_3": 8e3, "prony_modulus_1": 20e3, "prony_time_1": 0.08}
+    parameters = {"c10": 40e3, "bulk_1": 7e6, "ogden_3": 8e3, "prony_modulus_1": 20e3, "prony_time_1": 0.08}
     own = {
         "model": "law",
         "accepted": True,
         "groups": ["elastic", "branches"],
-        "constants": constants,
+        "parameters": parameters,
         "units": {"c10": "Pa", "bulk_1": "Pa", "ogden_3": "Pa", "prony_modulus_1": "Pa", "prony_time_1": "s"},
-        "parameters": {},
+        "others": {},
         "deviation": {"c10": 400.0, "bulk_1": 6.5e6, "ogden_3": 100.0, "prony_modulus_1": 10.0, "prony_time_1": 1e-3},
         "at_bounds": ["prony_time_1"],
         "validation": errors_on(["80 g", "180 g"], 4.9e-5, 0.1025),
         "classes": [
-            {"groups": [], "constants": {"c10": 44e3, "bulk_1": 7e6}, "residual": 0.02, "validation": None},
-            {"groups": ["elastic", "branches"], "constants": constants, "residual": 0.003, "validation": 1.2e-4},
+            {"groups": [], "parameters": {"c10": 44e3, "bulk_1": 7e6}, "residual": 0.02, "validation": None},
+            {"groups": ["elastic", "branches"], "parameters": parameters, "residual": 0.003, "validation": 1.2e-4},
         ],
         "data": {"name": "own", "trials": ["0.05 kg"]},
         "against": "simulation",
@@ -130,9 +130,9 @@ def test_where_the_force_fades_out_the_law_remains():
 def test_stress_is_that_of_the_simulated_law(direction):
     """At stretches with free sides, the kernels' stress is along the load alone, and has the value of the curve."""
     azimuth = 0.0 if direction in (None, ALONG) else np.pi / 2.0
-    constants = {**TERMS, **({} if direction is None else {**FIBRES, "fibre_azimuth_1": azimuth})}
-    material = ConvexMaterial.from_constants(constants)
-    own = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in material.constants.items()}
+    parameters = {**TERMS, **({} if direction is None else {**FIBRES, "fibre_azimuth_1": azimuth})}
+    material = ConvexMaterial.from_parameters(parameters)
+    own = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in material.values.items()}
     law_of, module = material.law, wp.get_module(f"test_law.{material.law.name}")
     moduli = law_of.values(*(float(modulus) for modulus in material.moduli(own)))
 
@@ -142,7 +142,7 @@ def test_stress_is_that_of_the_simulated_law(direction):
         stress_out[wp.tid()] = stress
 
     for stretch in (0.85, 1.25):
-        (found,) = uniaxial_stress(constants, np.array([stretch]), direction)
+        (found,) = uniaxial_stress(parameters, np.array([stretch]), direction)
         sides = scipy.optimize.root(lambda s, x=stretch: stresses(stress_of, moduli, x, s)[1:], np.ones(2)).x
         expected = stresses(stress_of, moduli, stretch, sides)
         assert np.abs(expected[1:]).max() < 1e-6 * abs(expected[0])

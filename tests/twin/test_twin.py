@@ -66,7 +66,7 @@ def test_conditioning_is_that_of_normal_variables():
 
 def test_what_is_not_seen_is_forgotten(robot):
     """The force fades in a second, and parameters drift in ten, but never by more than was known before."""
-    stiff = float(robot.simulator.constants["youngs_modulus"])
+    stiff = float(robot.simulator.defaults["youngs_modulus"])
     estimator = Twin(robot, refine={"youngs_modulus": 0.1 * stiff}).estimator
     belief, count, h = estimator.begin({}), len(estimator.tangent.frequencies), robot.time_step
     belief = replace(belief, bias=np.ones(count), covariance=0.0 * belief.covariance)
@@ -212,7 +212,7 @@ def test_a_marker_that_slips_is_followed_to_its_new_place(robot, swing):
 
 
 def test_it_refines_a_parameter_as_it_runs(robot):
-    stiff = float(robot.simulator.constants["youngs_modulus"])
+    stiff = float(robot.simulator.defaults["youngs_modulus"])
     other = robot.with_parameters(youngs_modulus=1.2 * stiff)
     motion = other.rollout(other.begin(external_force=pull(robot, 0.5)), 80)
     frames = motion.q[:, 0].numpy()

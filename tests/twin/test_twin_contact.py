@@ -56,7 +56,7 @@ def followed(robot, motion):
 
 def test_a_twin_follows_a_body_that_lies_on_a_bar(robot):
     """The real beam is softer, is let go above the bar, and then pressed on it by a force unknown to the twin."""
-    real = robot.with_parameters(youngs_modulus=float(robot.description.material.constants["youngs_modulus"]) * 0.9)
+    real = robot.with_parameters(youngs_modulus=float(robot.description.material.values["youngs_modulus"]) * 0.9)
     pressed = force(robot, 0.0, 0.15, -0.3) * torch.linspace(0.0, 1.0, 80, dtype=torch.float64)[:, None, None]
     motion = real.rollout(real.begin(external_force=force(robot, 0.0, 0.1, 0.4)), external_force=pressed[:, None])
     twin, free = followed(robot, motion), robot.rollout(robot.begin(), 80).q[:, 0].numpy()

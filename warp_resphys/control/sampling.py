@@ -120,7 +120,7 @@ def check_reducible(robot: Robot) -> None:
 
 def _value(robot: Robot, name: str) -> torch.Tensor:
     """Values of a parameter."""
-    known = robot.parameters.get(name, robot.simulator.constants.get(name, 0.0))
+    known = robot.parameters.get(name, robot.simulator.defaults.get(name, 0.0))
     return torch.as_tensor(known, dtype=torch.float64)
 
 

@@ -73,7 +73,7 @@ class EnergySet:
     Attributes:
         parameters: parameters by name in the simulator.
         inputs: inputs by name.
-        constants: default values of the parameters by name.
+        defaults: default values of the parameters by name.
         counts: number of values of a parameter or an input per environment, by name.
         parts: names of the parts, such as tendons, with one value each, by the name of the parameter.
         memory: memory variables by name.
@@ -92,7 +92,7 @@ class EnergySet:
         self._bound: list[BoundEnergy] = []
         self.parameters: dict[str, Quantity] = {}
         self.inputs: dict[str, Quantity] = {}
-        self.constants: dict[str, Any] = {}
+        self.defaults: dict[str, Any] = {}
         self.counts: dict[str, int] = {}
         self.parts: dict[str, tuple[str, ...]] = {}
         self.memory: dict[str, Memory] = {}
@@ -108,7 +108,7 @@ class EnergySet:
                 raise InputError(f"two energies depend on {min(duplicates)}: rename one of their bodies or regions.")
             self.parameters |= parameters
             self.inputs |= inputs
-            self.constants |= {f"{prefix}{name}": value for name, value in energy.constants.items()}
+            self.defaults |= {f"{prefix}{name}": value for name, value in energy.defaults.items()}
             for q in (*energy.parameters, *energy.inputs):
                 self.counts[f"{prefix}{q.name}"] = energy.count_of(q)
                 if q in energy.parameters and energy.names and energy.count_of(q) == energy.count:

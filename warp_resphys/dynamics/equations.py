@@ -48,7 +48,7 @@ class EquationsOfMotion:
         coordinates: map from control vertices to all vertices.
         energies: the energies.
         parameters: parameters of the energies by name, and ``gravity``.
-        constants: default values of the parameters.
+        defaults: default values of the parameters.
         counts: number of values of an input or a parameter per environment, by name.
 
     Raises:
@@ -83,7 +83,7 @@ class EquationsOfMotion:
         where = (body, self.coordinates, self.rest_positions, self.method, time_step)
         self.energies = EnergySet(placed, *where)
         self.parameters: dict[str, Quantity] = {**self.energies.parameters, "gravity": _GRAVITY}
-        self.constants: dict[str, Any] = {**self.energies.constants, "gravity": [list(gravity)]}
+        self.defaults: dict[str, Any] = {**self.energies.defaults, "gravity": [list(gravity)]}
         self.counts = {**self.energies.counts, "gravity": 3}
         self._attached_mass = self.tensor(body.attached_mass)
         eliminated = np.union1d(body.fixed_vertices, body.coordinates.dependent)  # vertices without unknowns
@@ -119,7 +119,7 @@ class EquationsOfMotion:
             if name not in self.parameters:
                 raise InputError(f"{name!r} is not a parameter of this simulator: it has {', '.join(self.parameters)}.")
             self.parameters[name].check(value)
-        given = {**self.constants, **parameters}
+        given = {**self.defaults, **parameters}
         tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
         values, mass = self.energies.prepare(tensors)
         inertia, weight = mass.inertia + self._attached_mass, mass.weight + self._attached_mass

@@ -30,7 +30,7 @@ from .plausibility import mean_of
 NOTICED: Final = 0.07  # change of the deflection
 CHECKED: Final = 4  # equilibria of a simulator, as the first one is often that of its weight alone
 _LEAST: Final = 1e-7  # strain, below which rounding dominates
-_INCOMPRESSIBLE: Final = 0.5  # Poisson's ratio of materials without this constant
+_INCOMPRESSIBLE: Final = 0.5  # Poisson's ratio of materials without this parameter
 
 
 def warn_of_cells(body: Body, placed: Sequence[PlacedEnergy], q: FloatArray, values: Sequence[Values]) -> bool:
@@ -111,6 +111,6 @@ def _energies(solid: Solid, q: FloatArray, stiffness: FloatArray) -> FloatArray:
         square = np.square(np.einsum("qk,ckij->cqij", values, jumps)).sum((2, 3))
     trace = np.trace(strain, axis1=2, axis2=3)
     centred = points.points_per_cell > count > 1
-    poissons_ratio = mean_of(solid.material.constants.get("poissons_ratio", _INCOMPRESSIBLE)) if centred else 0.0
+    poissons_ratio = mean_of(solid.material.values.get("poissons_ratio", _INCOMPRESSIBLE)) if centred else 0.0
     varying = poissons_ratio * np.square(trace - trace.mean(1, keepdims=True))
     return np.array([(weights * part).sum() for part in (np.square(strain).sum((2, 3)), square, varying, 1.0)])

@@ -121,7 +121,7 @@ def _worst_cell(mesh: Mesh) -> tuple[int, float]:
 
 
 def _warn_of_material(material: Material, of: str) -> None:
-    stiffness, density = small_strain_stiffness(material), mean_of(material.constants["density"])
+    stiffness, density = small_strain_stiffness(material), mean_of(material.values["density"])
     if 0.0 < stiffness < SOFTEST or UNLIKELY[0] < stiffness < UNLIKELY[1]:
         kind = "softer than a gel" if stiffness < SOFTEST else "stiffer than any rubber"
         warn(f"Young's modulus{of} is {stiffness:.3g} Pa, {kind}: give moduli in Pa, as in 3e5 for a soft silicone.")
@@ -139,28 +139,28 @@ def check_weight(body: Body, material: Material, gravity: Sequence[float]) -> No
         InputError: the strain is too large, or the material resists no change of shape.
     """
     length = float(np.linalg.norm(np.ptp(np.asarray(body.mesh.vertices), axis=0)))
-    constants = material.constants
-    density, stiffness = mean_of(constants["density"]), small_strain_stiffness(material)
+    parameters = material.values
+    density, stiffness = mean_of(parameters["density"]), small_strain_stiffness(material)
     if stiffness <= 0.0:
         raise InputError("the material resists no change of shape: give it a coefficient of shear, such as c10.")
     strain = density * float(np.linalg.norm(gravity)) * length / stiffness
     if strain > _LARGEST_STRAIN:
         raise InputError(
             f"the mesh is {length:.3g} m across: with E = {1e-3 * stiffness:.3g} kPa its own weight would strain it by "
-            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(constants))} not "
+            f"{100.0 * strain:.0f} %; is its unit millimetres (mesh.units=mm), or that of {next(iter(parameters))} not "
             "Pa?"
         )
 
 
 def small_strain_stiffness(material: Material) -> float:
-    """Mean Young's modulus of a material at small strains [Pa]; three times the shear modulus if it has no constant."""
-    constants = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.constants.items()}
-    if "youngs_modulus" in constants:
-        return mean_of(constants["youngs_modulus"])
-    terms = zip(material.moduli(constants), material.curvature, material.rules, strict=True)
+    """Mean Young's modulus of a material at small strains [Pa]; three shear moduli if that is no parameter."""
+    parameters = {name: torch.as_tensor(value, dtype=torch.float64) for name, value in material.values.items()}
+    if "youngs_modulus" in parameters:
+        return mean_of(parameters["youngs_modulus"])
+    terms = zip(material.moduli(parameters), material.curvature, material.rules, strict=True)
     return 1.5 * sum(mean_of(modulus) * factor for modulus, factor, rule in terms if rule == "shape")
 
 
 def mean_of(value: Any) -> float:
-    """Mean of the values of a constant."""
+    """Mean of the values of a parameter."""
     return float(torch.as_tensor(value, dtype=torch.float64).detach().mean())

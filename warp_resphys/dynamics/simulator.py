@@ -66,7 +66,7 @@ class Simulator:
         inputs: inputs of the energies by name.
         counts: number of values of an input or a parameter per environment, by name.
         parts: names of the parts, such as tendons, for which a parameter may have values, by the parameter's name.
-        constants: default values of the parameters.
+        defaults: default values of the parameters.
         energies: all energies of the body as one (`dynamics.energy_set`).
     """
 
@@ -102,7 +102,7 @@ class Simulator:
         where = (self.gravity, self.time_step, self.integrator, self.settings, self.device, self.dtype)
         self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
         self.method, self.rest_positions, self.fixed = equations.method, equations.rest_positions, equations.fixed
-        self.parameters, self.constants, self.counts = equations.parameters, equations.constants, equations.counts
+        self.parameters, self.defaults, self.counts = equations.parameters, equations.defaults, equations.counts
         self.energies = equations.energies
         self.inputs, self.parts = self.energies.inputs, self.energies.parts
         self._checked_cells: list[bool] = []  # whether they are too coarse in the first equilibria

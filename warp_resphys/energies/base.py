@@ -3,7 +3,7 @@
 =================  =============  ===========================================================================
 class              one per        purpose
 =================  =============  ===========================================================================
-`Energy`           body           declares parameters (constants that can be identified) and inputs (functions
+`Energy`           body           declares parameters (which can be identified) and inputs (functions
                                   of time), and makes the other two
 `BoundEnergy`      simulator      turns parameters into values, begins and ends a step, declares its memory
 `Term`             batch          kernels on the points, and their arguments
@@ -136,15 +136,15 @@ class Energy(ABC):
         return tuple(str(number + 1) for number in range(self.count))
 
     @property
-    def constants(self) -> Mapping[str, Parameter]:
+    def defaults(self) -> Mapping[str, Parameter]:
         """Default values of the parameters."""
         return {quantity.name: getattr(self, name) for name, quantity in quantities_of(self).items()}
 
     def __post_init__(self) -> None:
         """Raises InputError for a parameter out of range."""
-        constants = self.constants
+        defaults = self.defaults
         for quantity in self.parameters:
-            quantity.check(constants[quantity.name])
+            quantity.check(defaults[quantity.name])
 
     @abstractmethod
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
@@ -168,16 +168,16 @@ class Energy(ABC):
         """Returns the energy on a simulator's device; overridden by energies with memory or values of a step."""
         return BoundEnergy(self, site)
 
-    def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Returns the values that follow from the parameters, computed once per roll-out.
 
         Args:
-            constants: (1 or B, 1 or n) parameters of all energies by name.
+            parameters: (1 or B, 1 or n) parameters of all energies by name.
 
         Raises:
             InputError: another number of values than `count`.
         """
-        return {quantity.name: self.per_part(quantity, constants[quantity.name]) for quantity in self.parameters}
+        return {quantity.name: self.per_part(quantity, parameters[quantity.name]) for quantity in self.parameters}
 
     def per_part(self, quantity: Quantity, values: torch.Tensor) -> torch.Tensor:
         """Returns (1 or B, `count_of`) values of a parameter, or an array parameter (1 or B, *shape) unchanged.

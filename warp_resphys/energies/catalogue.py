@@ -19,7 +19,7 @@ from .materials import MASS_DAMPING, Corotated, Gent, Material, MooneyRivlin, St
 MATERIALS: Final[dict[str, type[Material]]] = {
     kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial)
 }
-LAW_FORMAT: Final = 1
+LAW_FORMAT: Final = 2
 _LAWS: Final = Path(__file__).parents[1] / "laws"
 _UNITS: Final = {
     "density": "kg/m^3",
@@ -35,23 +35,23 @@ _UNITS: Final = {
 }
 
 
-def make_material(model: str = "corotated", **constants: Any) -> Material:
+def make_material(model: str = "corotated", **parameters: Any) -> Material:
     """Returns the named material.
 
     Args:
         model: its name, or for one of another package module and class, such as ``my_physics.Fung``.
-        constants: by name.
+        parameters: by name.
 
     Raises:
-        InputError: an unknown name, a constant that the material does not have, or a value out of range.
+        InputError: an unknown name, a parameter that the material does not have, or a value out of range.
     """
     if model in MATERIALS:
-        return MATERIALS[model].from_constants(constants)
+        return MATERIALS[model].from_parameters(parameters)
     if "." not in model:
         raise InputError(
             f"material model is {model!r}: choose one of {', '.join(MATERIALS)}, or give your own class as _target_."
         )
-    material: Material = imported(model, Material).from_constants(constants)
+    material: Material = imported(model, Material).from_parameters(parameters)
     return material
 
 
@@ -83,21 +83,21 @@ class TriedClass(TypedDict):
     """A class of laws that was tried."""
 
     groups: list[str]
-    constants: dict[str, float]
+    parameters: dict[str, float]
     residual: float | None  # of the weak form
     validation: float | None  # as `LawTest.law`
 
 
 class LawContent(TypedDict):
-    """Content of law.json; only the model and the constants of a law are needed to use it."""
+    """Content of law.json; only the model and the parameters of a law are needed to use it."""
 
     model: str
-    constants: dict[str, float]
+    parameters: dict[str, float]
     format: NotRequired[int]
-    units: NotRequired[dict[str, str]]  # by constant
+    units: NotRequired[dict[str, str]]  # by parameter
     accepted: NotRequired[bool]  # whether it helps on the trials that it was tested on
-    parameters: NotRequired[dict[str, float]]  # identified beside it
-    deviation: NotRequired[dict[str, float]]  # standard deviations of constants and parameters
+    others: NotRequired[dict[str, float]]  # parameters identified beside it
+    deviation: NotRequired[dict[str, float]]  # standard deviations of both
     at_bounds: NotRequired[list[str]]
     validation: NotRequired[LawTest]
     groups: NotRequired[list[str]]  # of terms, besides the modulus
@@ -110,10 +110,10 @@ class LawContent(TypedDict):
     accepted_there: NotRequired[bool]
 
 
-def law_content(model: str, constants: Mapping[str, float]) -> LawContent:
+def law_content(model: str, parameters: Mapping[str, float]) -> LawContent:
     """Returns the content of a law's file, see `read_law`."""
-    units = {name: unit_of(name) for name in constants}
-    return {"format": LAW_FORMAT, "model": model, "constants": dict(constants), "units": units}
+    units = {name: unit_of(name) for name in parameters}
+    return {"format": LAW_FORMAT, "model": model, "parameters": dict(parameters), "units": units}
 
 
 def read_law(name: str) -> LawContent:
@@ -128,18 +128,18 @@ def read_law(name: str) -> LawContent:
     path = law_path(name)
     content = read_json(path)
     known = content if isinstance(content, dict) else {}
-    constants, of_today = known.get("constants"), known.get("format") == LAW_FORMAT and known["format"] is not True
-    if not (of_today and isinstance(known.get("model"), str) and isinstance(constants, dict) and constants):
+    parameters, of_today = known.get("parameters"), known.get("format") == LAW_FORMAT and known["format"] is not True
+    if not (of_today and isinstance(known.get("model"), str) and isinstance(parameters, dict) and parameters):
         raise DataFileError(
             f"{path} is not a law of this version: give a law.json that a run with the group law has written."
         )
     units = known.get("units", {})
     if not isinstance(units, dict):
-        raise DataFileError(f"{path}: units is {units!r}: give the unit of each constant, or leave it out.")
-    for key, value in constants.items():
+        raise DataFileError(f"{path}: units is {units!r}: give the unit of each parameter, or leave it out.")
+    for key, value in parameters.items():
         if type(value) not in (int, float) or not math.isfinite(value):
             raise DataFileError(
-                f"{path}: constants.{key} is {value!r}: a law has a finite number there; identify it again."
+                f"{path}: parameters.{key} is {value!r}: a law has a finite number there; identify it again."
             )
         if (unit := units.get(key, unit_of(key))) != unit_of(key):
             raise DataFileError(f"{path}: units.{key} is {unit!r}: a law has {unit_of(key)!r} there.")
@@ -153,11 +153,11 @@ def read_law(name: str) -> LawContent:
             f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
         )
     absent = dict.fromkeys(("c10", "bulk_1"), 0.0) if known["model"] == ConvexMaterial.model else {}
-    return {**known, "model": known["model"], "constants": absent | constants}
+    return {**known, "model": known["model"], "parameters": absent | parameters}
 
 
 def unit_of(name: str) -> str:
-    """Unit of a constant of a law."""
+    """Unit of a parameter of a law."""
     words = {*name.split("_")}
     return next((unit for word, unit in _UNITS.items() if word in words), "Pa")
 
@@ -194,7 +194,7 @@ def read_material(name: str) -> Material:
 
     Raises:
         DataFileError: the file is missing, damaged or of another version.
-        InputError: a constant that the material does not have, or a value out of range.
+        InputError: a parameter that the material does not have, or a value out of range.
     """
     law = read_law(name)
-    return make_material(law["model"], **{key: x for key, x in law["constants"].items() if key != MASS_DAMPING})
+    return make_material(law["model"], **{key: x for key, x in law["parameters"].items() if key != MASS_DAMPING})

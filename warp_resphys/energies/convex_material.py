@@ -128,22 +128,23 @@ class ConvexMaterial(Material):
 
     @override
     @classmethod
-    def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
-        found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in constants}
-        ogden = {int(m[2]) * (-1 if m[1] else 1): constants[name] for name, m in found.items() if m}
-        return cls(**cls._arguments({name: value for name, value in constants.items() if not found[name]}), ogden=ogden)
+    def from_parameters(cls, parameters: Mapping[str, Any]) -> "Material":
+        found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in parameters}
+        ogden = {int(m[2]) * (-1 if m[1] else 1): parameters[name] for name, m in found.items() if m}
+        others = {name: value for name, value in parameters.items() if not found[name]}
+        return cls(**cls._arguments(others), ogden=ogden)
 
     @override
-    def viscosity(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        return constants["shear_viscosity"], constants["bulk_viscosity"]
+    def viscosity(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        return parameters["shear_viscosity"], parameters["bulk_viscosity"]
 
     @override
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns the coefficients, units of viscosity, Ogden's terms, and direction and constants of each family."""
-        moduli = [constants[name] for name in list(self.own_quantities())[:ISOTROPIC]]
+    def moduli(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Returns the coefficients, units of viscosity, Ogden's terms, and direction and parameters of each family."""
+        moduli = [parameters[name] for name in list(self.unnumbered())[:ISOTROPIC]]
         moduli += [torch.ones_like(moduli[0])] * 2
-        moduli += [constants[name] for name in self._ogden.values()]
-        for azimuth, elevation, *coefficients in self.group("fibres", constants):
+        moduli += [parameters[name] for name in self._ogden.values()]
+        for azimuth, elevation, *coefficients in self.group("fibres", parameters):
             level = elevation.cos()
             moduli += [level * azimuth.cos(), level * azimuth.sin(), elevation.sin(), *coefficients]
         return tuple(moduli)

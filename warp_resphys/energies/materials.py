@@ -31,7 +31,7 @@ from ..kernels.materials.density import density_law
 from ..stepping.quantity import Parameter, Quantity, parameter, quantities_of
 
 MASS_DAMPING: Final = "mass_damping"
-# constants of viscosity, whose names end so if they are those of a region
+# parameters of viscosity, whose names end so if they are those of a region
 VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
 PRONY_RATIOS: Final = ("prony_ratio", "prony_modulus")  # likewise, of relaxation, and of the times with their numbers
 PRONY_TIME: Final = "prony_time"
@@ -44,8 +44,8 @@ _ITEMS: Final = {"prony": "branch", "hysteresis": "slider", "fibres": "family"} 
 class Material(ABC):
     """An elastic material with Rayleigh damping, relaxation and hysteresis.
 
-    Elastic constants and density are numbers, (M,) tensors with one value per element, (B, 1) tensors with one value
-    per environment, or (B, M) tensors; damping constants are numbers or (B,) tensors. Every simulated quantity is
+    Elastic parameters and density are numbers, (M,) tensors with one value per element, (B, 1) tensors with one value
+    per environment, or (B, M) tensors; damping parameters are numbers or (B,) tensors. Every simulated quantity is
     differentiable by them.
     """
 
@@ -55,7 +55,7 @@ class Material(ABC):
     rules: ClassVar[tuple[str, ...]]
     # upper bound of each modulus' contribution to the tangent's eigenvalues at small strains
     curvature: ClassVar[tuple[float, ...]]
-    # constants of each item of a field that is a sequence, such as a branch or a family of fibres, by the field
+    # parameters of each item of a field that is a sequence, such as a branch or a family of fibres, by the field
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
         "prony": (Quantity("prony_ratio", "", 0.0, closed=True), PRONY_TIME_QUANTITY),
         "hysteresis": (Quantity("hysteresis_ratio", "", 0.0, closed=True), YIELD_STRAIN),
@@ -73,27 +73,27 @@ class Material(ABC):
     hysteresis: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Raises InputError for a constant outside its physical range."""
+        """Raises InputError for a parameter outside its physical range."""
         for group, quantities in self.groups.items():
             items = getattr(self, group)
             if not all(isinstance(item, Sequence) and len(item) == len(quantities) for item in items):
                 names = ", ".join(q.name.partition("_")[2] for q in quantities)
                 units = " and ".join(q.unit or "-" for q in quantities)
                 raise InputError(f"{group} is {items!r}: give a ({names}) for each {_ITEMS[group]}, {units}.")
-        constants = self.constants
-        for name, quantity in self.quantities.items():
-            quantity.check(constants[name])
+        values = self.values
+        for name, quantity in self.parameters.items():
+            quantity.check(values[name])
 
     @classmethod
-    def own_quantities(cls) -> dict[str, Quantity]:
-        """Returns the constants by name without those of groups, those of the law first."""
+    def unnumbered(cls) -> dict[str, Quantity]:
+        """Returns the parameters by name without those of groups, those of the law first."""
         known = quantities_of(cls)
         law = {f.name: replace(known[f.name], per="element") for f in fields(cls) if f.name in known and not f.kw_only}
         return {**law, **{name: quantity for name, quantity in known.items() if name not in law}}
 
     @property
     def numbered(self) -> dict[str, tuple[Quantity, Parameter]]:
-        """Constants of groups with their values: ``prony_ratio_1``, ``prony_time_1``, ..."""
+        """Parameters of groups with their values: ``prony_ratio_1``, ``prony_time_1``, ..."""
         return {
             f"{q.name}_{k}": (replace(q, name=f"{q.name}_{k}"), value)
             for group, quantities in self.groups.items()
@@ -102,32 +102,32 @@ class Material(ABC):
         }
 
     @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Constants by name, those of the law first."""
-        return {**self.own_quantities(), **{name: quantity for name, (quantity, _) in self.numbered.items()}}
+    def parameters(self) -> dict[str, Quantity]:
+        """Parameters by name, those of the law first."""
+        return {**self.unnumbered(), **{name: quantity for name, (quantity, _) in self.numbered.items()}}
 
     @property
-    def constants(self) -> dict[str, Parameter]:
-        """Values of the constants by name."""
-        known = {name: getattr(self, name) for name in self.own_quantities()}
+    def values(self) -> dict[str, Parameter]:
+        """Values of the parameters by name."""
+        known = {name: getattr(self, name) for name in self.unnumbered()}
         return {**known, **{name: value for name, (_, value) in self.numbered.items()}}
 
     @classmethod
-    def from_constants(cls, constants: Mapping[str, Any]) -> "Material":
-        """Returns the material with some constants by name, those of groups numbered from 1.
+    def from_parameters(cls, parameters: Mapping[str, Any]) -> "Material":
+        """Returns the material with some parameters by name, those of groups numbered from 1.
 
         Raises:
-            InputError: an unknown constant, a branch that is not whole, or a value out of range.
+            InputError: an unknown parameter, a branch that is not whole, or a value out of range.
         """
-        return cls(**cls._arguments(constants))
+        return cls(**cls._arguments(parameters))
 
     @classmethod
-    def _arguments(cls, constants: Mapping[str, Any]) -> dict[str, Any]:
-        """Returns the arguments of the class: constants, and the items of groups."""
-        known_quantities, values, groups = cls.own_quantities(), dict(constants), {}
+    def _arguments(cls, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the arguments of the class: parameters, and the items of groups."""
+        known_quantities, values, groups = cls.unnumbered(), dict(parameters), {}
         for group, quantities in cls.groups.items():
             names = {q.name for q in quantities}
-            present = {name for name in constants if re.sub(r"_[1-9]\d*$", "", name) in names}
+            present = {name for name in parameters if re.sub(r"_[1-9]\d*$", "", name) in names}
             count = len({re.findall(r"\d+$", name)[-1] for name in present if name not in names})
             items = [[f"{q.name}_{k}" for q in quantities] for k in range(1, 1 + count)]
             if present != {*chain.from_iterable(items)}:
@@ -140,26 +140,26 @@ class Material(ABC):
             if name not in known_quantities:
                 numbered = [f"{q.name}_1" for q in chain.from_iterable(cls.groups.values())]
                 known, model = ", ".join((*known_quantities, *numbered, "...")), cls.model or cls.__name__
-                raise InputError(f"{model} has no constant {name!r}: it has {known}")
+                raise InputError(f"{model} has no parameter {name!r}: it has {known}")
         return {**values, **groups}
 
-    def group(self, name: str, constants: Mapping[str, torch.Tensor]) -> list[tuple[torch.Tensor, ...]]:
-        """Returns the constants of each item of a group."""
+    def group(self, name: str, parameters: Mapping[str, torch.Tensor]) -> list[tuple[torch.Tensor, ...]]:
+        """Returns the parameters of each item of a group."""
         items = range(1, 1 + len(getattr(self, name)))
-        return [tuple(constants[f"{q.name}_{k}"] for q in self.groups[name]) for k in items]
+        return [tuple(parameters[f"{q.name}_{k}"] for q in self.groups[name]) for k in items]
 
-    def viscosity(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    def viscosity(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the Kelvin-Voigt retardation times of shear and bulk [s], (1 or B, 1) each."""
-        return (constants["stiffness_damping"],) * 2
+        return (parameters["stiffness_damping"],) * 2
 
     @abstractmethod
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns the law's moduli [Pa], (1 or B, 1 or M) each, from constants of that shape."""
+    def moduli(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Returns the law's moduli [Pa], (1 or B, 1 or M) each, from parameters of that shape."""
 
 
 @dataclass(frozen=True)
 class _Hookean(Material):
-    """A material with Young's modulus and Poisson's ratio as constants."""
+    """A material with Young's modulus and Poisson's ratio as parameters."""
 
     rules: ClassVar[tuple[str, ...]] = ("shape", "volume")
     curvature: ClassVar[tuple[float, ...]] = (2.0, 1.0)
@@ -168,9 +168,9 @@ class _Hookean(Material):
     poissons_ratio: Parameter = parameter(0.499, "poissons_ratio", "", lower=-1.0, upper=0.5)  # nu, between -1 and 0.5
 
     @override
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+    def moduli(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns the Lame constants mu and lambda."""
-        e, nu = constants["youngs_modulus"], constants["poissons_ratio"]
+        e, nu = parameters["youngs_modulus"], parameters["poissons_ratio"]
         return e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
 
@@ -195,15 +195,15 @@ class StableNeoHookean(_Hookean):
     curvature: ClassVar[tuple[float, ...]] = (4.0, 4.0, 1.0)
 
     @override
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+    def moduli(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns c10, c01 = 0 and lambda."""
-        mu, bulk = super().moduli(constants)
+        mu, bulk = super().moduli(parameters)
         return 0.5 * mu, torch.zeros_like(mu), bulk
 
 
 @dataclass(frozen=True)
 class MooneyRivlin(Material):
-    """Rubber with two elastic constants and a bulk modulus; at small strains mu is 2 (c10 + c01)."""
+    """Rubber with two elastic parameters and a bulk modulus; at small strains mu is 2 (c10 + c01)."""
 
     model = "mooney_rivlin"
     law = mooney_rivlin.LAW
@@ -215,18 +215,18 @@ class MooneyRivlin(Material):
     bulk_modulus: Parameter = parameter(44e6, "bulk_modulus", "Pa")  # [Pa]
 
     @override
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+    def moduli(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
         """Returns c10, c01 and lambda = K - 2/3 mu."""
-        c10, c01 = constants["c10"], constants["c01"]
-        return c10, c01, constants["bulk_modulus"] - 4.0 / 3.0 * (c10 + c01)
+        c10, c01 = parameters["c10"], parameters["c01"]
+        return c10, c01, parameters["bulk_modulus"] - 4.0 / 3.0 * (c10 + c01)
 
 
 @dataclass(frozen=True)
 class DensityMaterial(Material):
-    """A material given by Warp functions of F and the material's own constants, in their order [J/m^3].
+    """A material given by Warp functions of F and its parameters, in their order [J/m^3].
 
-    The functions may be nonlinear in the constants. `volume_energy` is integrated at fewer points, against locking: the
-    term that makes a material nearly incompressible belongs there.
+    The functions may be nonlinear in the parameters. `volume_energy` is integrated at fewer points, against locking:
+    the term that makes a material nearly incompressible belongs there.
 
     Attributes:
         energy_density: W(F: mat33d, p: a vector of float64).
@@ -247,16 +247,16 @@ class DensityMaterial(Material):
         cls.curvature = (0.0, 0.0, 2.0, 1.0, *(0.0,) * count)
 
     @abstractmethod
-    def lame(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the Lame constants at small strains, mu and lambda [Pa], from constants (1 or B, 1 or M)."""
+    def lame(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the Lame constants at small strains, mu and lambda [Pa], from parameters (1 or B, 1 or M)."""
 
     @override
-    def moduli(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns ones for both volumes, the Lame constants, and the constants of the functions."""
-        constants_of_law = [constants[f.name] for f in fields(self) if f.metadata and not f.kw_only]
-        volume = torch.ones_like(constants_of_law[0])
+    def moduli(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
+        """Returns ones for both volumes, the Lame constants, and the parameters of the functions."""
+        moduli_of_law = [parameters[f.name] for f in fields(self) if f.metadata and not f.kw_only]
+        volume = torch.ones_like(moduli_of_law[0])
         under_integrated = volume if self.volume_energy else torch.zeros_like(volume)
-        return volume, under_integrated, *self.lame(constants), *constants_of_law
+        return volume, under_integrated, *self.lame(parameters), *moduli_of_law
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ class Gent(DensityMaterial):
     bulk_modulus: Parameter = parameter(44e6, "bulk_modulus", "Pa")  # K [Pa]
 
     @override
-    def lame(self, constants: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    def lame(self, parameters: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns mu and K - 2/3 mu."""
-        mu = constants["shear_modulus"]
-        return mu, constants["bulk_modulus"] - 2.0 / 3.0 * mu
+        mu = parameters["shear_modulus"]
+        return mu, parameters["bulk_modulus"] - 2.0 / 3.0 * mu

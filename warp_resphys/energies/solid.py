@@ -75,12 +75,12 @@ class Solid(Energy):
     @property
     @override
     def parameters(self) -> tuple[Quantity, ...]:
-        return tuple(self.material.quantities.values())
+        return tuple(self.material.parameters.values())
 
     @property
     @override
-    def constants(self) -> Mapping[str, Parameter]:
-        return self.material.constants
+    def defaults(self) -> Mapping[str, Parameter]:
+        return self.material.values
 
     @property
     @override

@@ -184,16 +184,16 @@ class Tendons(Energy):
 
     @property
     @override
-    def constants(self) -> Mapping[str, Parameter]:
+    def defaults(self) -> Mapping[str, Parameter]:
         values: dict[str, Parameter] = {"tendon_stiffness": self.stiffness}
         if self.friction is not None:
             values |= {FRICTION.name: self.friction, BRISTLE.name: self.bristle_length}
         return values | {offset.name: 0.0 for offset in OFFSETS[: self.offset_count]}
 
     @override
-    def prepare(self, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Implements `Energy.prepare`, with the offsets as ``tendon_route`` (1 or B, T, 3)."""
-        values = super().prepare(constants)
+        values = super().prepare(parameters)
         one = torch.ones_like(values[STIFFNESS.name])
         offsets = [values.pop(offset.name) / kernels.OFFSET_UNIT for offset in OFFSETS[: self.offset_count]]
         parts = [one, *offsets, *(torch.zeros_like(one),) * (len(OFFSETS) - len(offsets))]

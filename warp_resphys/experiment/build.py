@@ -180,7 +180,7 @@ def build_material(settings: MaterialSettings, key: str) -> Material | dict[str,
     materials = {}
     for region, chosen in settings.by_region.items():
         with naming(f"{key}.regions.{region}: " if region else f"{key}: "):
-            materials[region] = make_material(chosen.model, **chosen.constants)
+            materials[region] = make_material(chosen.model, **chosen.values)
     return materials.get("", materials)
 
 

@@ -84,10 +84,10 @@ def check_run(run: RunSettings) -> None:
 def _check_law(law: LawSettings) -> None:
     """Checks the identification of a law, or that a law of another run can be used."""
     with naming("law.terms: "):
-        ConvexMaterial.from_constants(dict.fromkeys(law.terms, 0.0))
+        ConvexMaterial.from_parameters(dict.fromkeys(law.terms, 0.0))
     if law.file is not None:
         given = read_law(law.file)
-        material = MaterialSettings.model_validate({"model": given["model"], **given["constants"]})
+        material = MaterialSettings.model_validate({"model": given["model"], **given["parameters"]})
         build_material(material, f"law: {law.file}")
 
 

@@ -117,7 +117,7 @@ class Experiment:
             return self.settings.published.simulation
         if kind == LAW:
             law = read_json(self.folder / LAW_FILE)
-            return MaterialSettings(model=law["model"], **law["constants"])
+            return MaterialSettings(model=law["model"], **law["parameters"])
         return self.settings.target.material if kind == "target" else self.settings.simulation
 
     @property
@@ -148,7 +148,7 @@ class Experiment:
         identified = Identification.read(self.folder / IDENTIFICATION)
         if key != LAW:
             return identified[key]
-        sysid, parameters = identified.get("sysid", Identification()), read_json(self.folder / LAW_FILE)["parameters"]
+        sysid, parameters = identified.get("sysid", Identification()), read_json(self.folder / LAW_FILE)["others"]
         of_trials = {name: value for name, value in sysid.own.items() if split_name(name)[0] in parameters}
         return Identification(parameters, of_trials, sysid.placement)
 

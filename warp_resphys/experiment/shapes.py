@@ -96,7 +96,7 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
             body = {key: getattr(shape, key) for key in BodySettings.model_fields}
             made_of = experiment.settings_of(kind).model_copy(update=body)
             simulator = build_simulator(made_of, experiment.material_of(kind), on_failure="count")
-            known = simulator.materials[""].quantities
+            known = simulator.materials[""].parameters
             values = {name: x for name, x in experiment.parameters(model).items() if name in known}
             substeps = round(settings.time_step / simulator.time_step)
             q = simulator.rollout(start, settings.data.steps * substeps, None, values).q[::substeps, 0]

@@ -1,4 +1,4 @@
-"""The parameters that can be identified: their names, ranges and effect on a simulator's constants.
+"""The parameters that can be identified: their names, ranges and effect on a simulator.
 
 A name is that of a simulator's constant (``youngs_modulus``), of the constant of one part of an energy with several
 parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), or one of `MASS_FACTOR` and `TILTS`.
@@ -165,7 +165,7 @@ def _by_part(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> di
             continue
         constant, part = of_parts[name]
         if constant not in by_part:
-            common = parameters[constant] if constant in parameters else simulator.tensor(simulator.constants[constant])
+            common = parameters[constant] if constant in parameters else simulator.tensor(simulator.defaults[constant])
             common = common[:, None] if constant in parameters else simulator.parameters[constant].shaped(common)
             by_part[constant] = list(common.expand(len(value), simulator.counts[constant]).unbind(1))
         by_part[constant][part] = value
@@ -216,7 +216,7 @@ def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[st
     def find(name: str) -> float:
         constant, part = of_parts.get(name, (name, None))
         if constant in simulator.parameters:
-            value = simulator.tensor(simulator.constants[constant]).flatten()
+            value = simulator.tensor(simulator.defaults[constant]).flatten()
             return float(value[0 if part is None or len(value) == 1 else part])
         return 1.0 if name == MASS_FACTOR or command_of(simulator, name)[1] in ("factor", *SLOPES) else 0.0
 

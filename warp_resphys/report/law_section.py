@@ -1,6 +1,6 @@
 """The section on the identified law: its terms, its moduli at small strains, the classes that were tried, its use.
 
-The energy and its constants are those of `kernels.materials.convex`; here it is a function of three principal
+The energy and its parameters are those of `kernels.materials.convex`; here it is a function of three principal
 stretches, along axes of which one is the direction of fibres. Uniaxial: the sides are free of stress, so that the
 nominal stress is dW/ds_1 at dW/ds_2 = dW/ds_3 = 0. Viscosity and relaxing branches carry no stress in slow loading.
 `tests/report/test_law_section.py` compares with the kernels.
@@ -27,8 +27,8 @@ from .sections import BEYOND
 from .wording import NONE, TONES, in_a_row, model_words, significant, unbroken
 
 _ISOTROPIC: Final = ("c10", "c20", "c30", "c01", "c02", "dilation", "bulk_1", "bulk_2")
-_NOT_FACTORS: Final = ("ms", "%", "°")  # Units of constants that multiply no term: times, slacks, directions.
-_NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its constants, not shown one by one.
+_NOT_FACTORS: Final = ("ms", "%", "°")  # Units of parameters that multiply no term: times, slacks, directions.
+_NOT_OF_A_LAW: Final = ("density", "mass_damping")  # Of its parameters, not shown one by one.
 _POINTS: Final = 81  # Of the curve of the stress.
 _LEAST: Final = 0.02  # Least range of strains that is drawn, on either side of rest.
 _SHADE: Final = 0.45  # Opacity.
@@ -36,7 +36,7 @@ _MARGIN: Final = 0.15  # Of the drawn range, over the range of the strains.
 _KPA: Final = ("kPa", 1e-3)
 _STRAIN: Final = ("%", 1e2)
 _ANGLE: Final = ("°", 180.0 / np.pi)
-# Of each constant: its term in words, its meaning, and unit on the page with its number in an SI unit.
+# Of each parameter: its term in words, its meaning, and unit on the page with its number in an SI unit.
 _TERMS: Final[Mapping[str, tuple[str, str, tuple[str, float]]]] = {
     "c10": ("Neo-Hookean term", "half the shear modulus that it adds; c10 of I₁ − 3", _KPA),  # noqa: RUF001
     "c20": ("Second-order term in I₁", "stiffens with strain; c20 of (I₁ − 3)²", _KPA),  # noqa: RUF001
@@ -76,14 +76,14 @@ def law_section(data: RunReport, canvas: Canvas) -> Part | None:
     whole, settings = data.metrics.get("law"), data.settings.law
     if whole is None or settings is None:
         return None
-    constants = {name: value for name, value in whole["constants"].items() if not name.startswith(_NOT_OF_A_LAW)}
-    law: UsedLaw = {**whole, "constants": constants}
+    parameters = {name: value for name, value in whole["parameters"].items() if not name.startswith(_NOT_OF_A_LAW)}
+    law: UsedLaw = {**whole, "parameters": parameters}
     blocks: list[Block] = [Text(unbroken(law_text(law)), "law-use"), _terms_table(law)]
     notes = ["± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time."]
     blocks += [Text(" ".join(notes), note=True)] if law.get("deviation") else []
     said = (not_needed_text(law, settings), outside_text(data))
     blocks += [Text(unbroken(text)) for text in said if text]
-    blocks += [_moduli_table(data, constants), *_curve(data, constants, canvas)]
+    blocks += [_moduli_table(data, parameters), *_curve(data, parameters, canvas)]
     return Part("Law of the material", [*blocks, *_classes(law)])
 
 
@@ -105,7 +105,7 @@ def law_text(law: UsedLaw) -> str:
 
 
 def wording(name: str) -> tuple[Wording, str]:
-    """Returns the name, unit and factor of a constant of a law, and its meaning."""
+    """Returns the name, unit and factor of a parameter of a law, and its meaning."""
     if name in _TERMS:
         words, meaning, (unit, factor) = _TERMS[name]
         return (words, unit, factor), meaning
@@ -120,7 +120,7 @@ def wording(name: str) -> tuple[Wording, str]:
 
 def _terms_table(law: LawContent) -> PageTable:
     rows = []
-    known = {**law["constants"], **law.get("parameters", {})}
+    known = {**law["parameters"], **law.get("others", {})}
     bounds = [name for name in law.get("at_bounds", ()) if name in known]
     for name, value in known.items():
         deviation = law.get("deviation", {}).get(name)
@@ -147,24 +147,24 @@ def outside_text(data: RunReport) -> str:
 
 def not_needed_text(law: LawContent, settings: LawSettings) -> str:
     """Returns a sentence on the terms of the library that the law does not have; empty if it has all of them."""
-    constants = law["constants"]
-    names = [name for name in settings.terms if name not in constants]
+    parameters = law["parameters"]
+    names = [name for name in settings.terms if name not in parameters]
     exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
     absent = [within_sentence(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})]
     absent += (
         [f"Ogden's term{'s' if len(exponents) > 1 else ''} of exponent {in_a_row(exponents)}"] if exponents else []
     )
-    absent += [within_sentence(wording(name)[0][0]) for name in VISCOSITIES if name not in constants]
-    if settings.branches and not any(name.startswith("prony") for name in constants):
+    absent += [within_sentence(wording(name)[0][0]) for name in VISCOSITIES if name not in parameters]
+    if settings.branches and not any(name.startswith("prony") for name in parameters):
         absent.append("relaxing branches")
-    if settings.families and not families(constants):
+    if settings.families and not families(parameters):
         absent.append("fibres")
     return f"Terms of the library that the data did not need: {in_a_row(absent)}." if absent else ""
 
 
-def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
+def _moduli_table(data: RunReport, parameters: Mapping[str, float]) -> PageTable:
     """Moduli at small strains: of the law, of the simulator that it replaces, and of a simulated target."""
-    law = small_strain(constants)
+    law = small_strain(parameters)
     columns: dict[str, SmallStrain | None] = {"Law": law}
     start = data.settings.simulation
     below = data.identification["sysid"].parameters if "sysid" in data.identification else {}
@@ -186,21 +186,21 @@ def _moduli_table(data: RunReport, constants: Mapping[str, float]) -> PageTable:
         row("Poisson's ratio", "poissons_ratio", 1.0),
     ]
     notes = ["Of slow motions: viscosity and relaxing branches left out."]
-    if branches := sum(value for name, value in constants.items() if name.startswith("prony_modulus")):
+    if branches := sum(value for name, value in parameters.items() if name.startswith("prony_modulus")):
         fast = 1e-3 * (law.mu + branches)
         notes.append(f"With the relaxing branches, in fast motions, the shear modulus of the law is {fast:.4g} kPa.")
-    notes += ["Fibres are left out too."] if families(constants) else []
+    notes += ["Fibres are left out too."] if families(parameters) else []
     if "corotated" in (start.model, *(target.material.model for target in data.settings.targets.values())):
         notes.append("Of a corotated material they are effective values: its λ counts a third at small strains.")
     return PageTable("At small strains", [*shown], rows, unbroken(" ".join(notes)))
 
 
-def _curve(data: RunReport, constants: Mapping[str, float], canvas: Canvas) -> list[Drawn]:
+def _curve(data: RunReport, parameters: Mapping[str, float], canvas: Canvas) -> list[Drawn]:
     """Draws the stress in slow tension and compression, and the stretches of trials as shades."""
-    stretches, fibres = drawn_stretches(data.stretches), families(constants)
+    stretches, fibres = drawn_stretches(data.stretches), families(parameters)
     directions = {"law": None} if fibres != 1 else {"law, across the fibres": ACROSS, "law, along the fibres": ALONG}
-    curves = {label: 1e-3 * uniaxial_stress(constants, stretches, d) for label, d in directions.items()}  # [kPa]
-    modulus = 1e-3 * small_strain(constants).youngs_modulus
+    curves = {label: 1e-3 * uniaxial_stress(parameters, stretches, d) for label, d in directions.items()}  # [kPa]
+    modulus = 1e-3 * small_strain(parameters).youngs_modulus
     figure, law = figures.new_figure(3.3), TONES["law"].light
     axes = figure.subplots()
     for (name, (low, high)), tone in zip(data.stretches.items(), ("rule", "target"), strict=False):
@@ -255,7 +255,7 @@ def _classes(law: LawContent) -> list[Block]:
                 str(
                     sum(
                         wording(name)[0][1] not in _NOT_FACTORS
-                        for name, value in tried_class["constants"].items()
+                        for name, value in tried_class["parameters"].items()
                         if value
                     )
                 )
@@ -295,10 +295,10 @@ class SmallStrain(NamedTuple):
         return 0.5 * self.lame / (self.lame + self.mu)
 
 
-def small_strain(constants: Mapping[str, float]) -> SmallStrain:
-    """Returns the moduli of a law without its fibres, from its constants by name."""
+def small_strain(parameters: Mapping[str, float]) -> SmallStrain:
+    """Returns the moduli of a law without its fibres, from its parameters by name."""
     rest = torch.ones(3, dtype=torch.float64)
-    slopes = torch.autograd.functional.hessian(lambda s: _energy(constants, s, None), rest)
+    slopes = torch.autograd.functional.hessian(lambda s: _energy(parameters, s, None), rest)
     along, across = float(slopes[0, 0]), float(slopes[0, 1])  # lambda + 2 mu, and lambda.
     return SmallStrain(0.5 * (along - across), across)
 
@@ -307,32 +307,32 @@ def small_strain_of(material: MaterialSettings) -> SmallStrain | None:
     """Returns the moduli of a material at small strains; None for one with regions."""
     if material.regions:
         return None
-    elastic = make_material(material.model, **material.constants)
+    elastic = make_material(material.model, **material.values)
     if material.model == "law":
-        return small_strain({name: float(torch.as_tensor(value)) for name, value in elastic.constants.items()})
-    tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in elastic.constants.items()}
+        return small_strain({name: float(torch.as_tensor(value)) for name, value in elastic.values.items()})
+    tensors = {n: torch.as_tensor(x, dtype=torch.float64).reshape(1, -1) for n, x in elastic.values.items()}
     mu, lame = np.asarray(elastic.law.lame).T @ [float(modulus) for modulus in elastic.moduli(tensors)]
     return SmallStrain(float(mu), float(lame))
 
 
-def ogden_terms(constants: Mapping[str, float]) -> dict[int, float]:
+def ogden_terms(parameters: Mapping[str, float]) -> dict[int, float]:
     """Returns the moduli of Ogden's terms [Pa], by exponent."""
-    found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in constants}
-    return {int(m[2]) * (-1 if m[1] else 1): constants[name] for name, m in found.items() if m}
+    found = {name: re.fullmatch(r"ogden_(m?)(\d+)", name) for name in parameters}
+    return {int(m[2]) * (-1 if m[1] else 1): parameters[name] for name, m in found.items() if m}
 
 
-def families(constants: Mapping[str, float]) -> int:
+def families(parameters: Mapping[str, float]) -> int:
     """Returns the number of families of fibres."""
-    return sum(name.startswith("fibre_tension_") for name in constants)
+    return sum(name.startswith("fibre_tension_") for name in parameters)
 
 
 def uniaxial_stress(
-    constants: Mapping[str, float], stretches: FloatArray, direction: Sequence[float] | None = None
+    parameters: Mapping[str, float], stretches: FloatArray, direction: Sequence[float] | None = None
 ) -> FloatArray:
     """Returns the nominal stress (S,) [Pa] at stretches (S,); NaN where no state with free sides was found.
 
     Args:
-        constants: Of the law, by name.
+        parameters: Of the law, by name.
         stretches: Ratio of the length to that at rest.
         direction: Of the first family of fibres, `ALONG` or `ACROSS` the load; None leaves fibres out.
     """
@@ -343,36 +343,36 @@ def uniaxial_stress(
         stretch = float(stretches[at])
         nearest = min(known, key=lambda other: abs(other - stretch))
         guess = known[nearest] * (stretch / nearest) ** -0.5
-        solved = scipy.optimize.root(lambda sides, s=stretch: _slopes(constants, s, sides, direction)[1:], guess)
-        slopes = _slopes(constants, stretch, solved.x, direction)
-        if np.abs(slopes[1:]).max() < 1e-6 * small_strain(constants).mu:
+        solved = scipy.optimize.root(lambda sides, s=stretch: _slopes(parameters, s, sides, direction)[1:], guess)
+        slopes = _slopes(parameters, stretch, solved.x, direction)
+        if np.abs(slopes[1:]).max() < 1e-6 * small_strain(parameters).mu:
             known[stretch], stress[at] = solved.x, slopes[0]
     return stress
 
 
 def _slopes(
-    constants: Mapping[str, float], stretch: float, sides: FloatArray, direction: Sequence[float] | None
+    parameters: Mapping[str, float], stretch: float, sides: FloatArray, direction: Sequence[float] | None
 ) -> FloatArray:
     """Derivatives (3,) [Pa] of the energy by the principal stretches."""
     s = torch.tensor([stretch, *sides], dtype=torch.float64, requires_grad=True)
-    (slopes,) = torch.autograd.grad(_energy(constants, s, direction), s)
+    (slopes,) = torch.autograd.grad(_energy(parameters, s, direction), s)
     return np.asarray(slopes.numpy())
 
 
-def _energy(constants: Mapping[str, float], s: torch.Tensor, direction: Sequence[float] | None) -> torch.Tensor:
+def _energy(parameters: Mapping[str, float], s: torch.Tensor, direction: Sequence[float] | None) -> torch.Tensor:
     """Energy density [Pa] at principal stretches (3,)."""
-    c10, c20, c30, c01, c02, dilation, bulk_1, bulk_2 = (constants.get(name, 0.0) for name in _ISOTROPIC)
+    c10, c20, c30, c01, c02, dilation, bulk_1, bulk_2 = (parameters.get(name, 0.0) for name in _ISOTROPIC)
     j, first, second = s.prod() - 1.0, s.square().sum(), _pairs(s.square())
     a, b = first - 3.0 - 2.0 * j + j**2, second - 3.0 - 4.0 * j
     energy = c10 * a + c20 * a**2 + c30 * a**3 + c01 * b + c02 * b**2 + (dilation + bulk_1) * j**2 + bulk_2 * j**4
-    for n, mu in ogden_terms(constants).items():
+    for n, mu in ogden_terms(parameters).items():
         powers = s ** abs(n)
         term = powers.sum() + n * (0.5 * j**2 - j) if n > 0 else _pairs(powers) + 2.0 * n * j
         energy = energy + 2.0 * mu / n**2 * term
     if direction is None:
         return energy
     tension, stiffening, compression, slack, toe = (
-        constants.get(f"fibre_{name}_1", 0.0) for name in ("tension", "stiffening", "compression", "slack", "toe")
+        parameters.get(f"fibre_{name}_1", 0.0) for name in ("tension", "stiffening", "compression", "slack", "toe")
     )
     length = (torch.tensor(direction, dtype=torch.float64) * s).norm()
     q, strain = length**2 - 1.0, (length - 1.0 - slack).clamp_min(0.0)

@@ -135,7 +135,7 @@ class Robot:
             MeshError: the mesh cannot be simulated, or has no vertex where the body is fixed.
         """
         materials = self.simulator.materials.items()
-        material = {f"{region}_{name}" if region else name for region, own in materials for name in own.quantities}
+        material = {f"{region}_{name}" if region else name for region, own in materials for name in own.parameters}
         names = material & self.parameters.keys() - {MASS_DAMPING}
         parameters = {name: float(self.parameters[name][0]) for name in names}
         return Robot(self.description.on(mesh, parameters, body), self.simulator.device)

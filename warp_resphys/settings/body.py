@@ -25,8 +25,8 @@ class PhysicsSettings(Settings):
     )
 
 
-class _Constants(Settings):
-    """Constants by name, in SI units, which `energies.materials` lists for each model."""
+class _Parameters(Settings):
+    """Parameters by name, in SI units, which `energies.materials` lists for each model."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
@@ -47,8 +47,8 @@ class _Constants(Settings):
         return (package_of(model) if "." in model else {}) | super().packages()
 
     @property
-    def constants(self) -> dict[str, float]:
-        """Constants by name, such as ``youngs_modulus`` [Pa]."""
+    def values(self) -> dict[str, float]:
+        """Parameters by name, such as ``youngs_modulus`` [Pa]."""
         return dict(self.__pydantic_extra__)
 
 
@@ -57,14 +57,14 @@ def _without_default(schema: dict[str, Any]) -> None:
     del schema["default"]
 
 
-class RegionMaterialSettings(_Constants):
-    """The material of a region; constants that are left out are those of the group around it."""
+class RegionMaterialSettings(_Parameters):
+    """The material of a region; parameters that are left out are those of the group around it."""
 
-    model: Word | None = setting(None, "constitutive model; a different one has its own constants alone")
+    model: Word | None = setting(None, "constitutive model; a different one has its own parameters alone")
 
 
-class MaterialSettings(_Constants):
-    """A material and its constants, in SI units, as `energies.materials` lists them; null takes one out."""
+class MaterialSettings(_Parameters):
+    """A material and its parameters, in SI units, as `energies.materials` lists them; null takes one out."""
 
     model_config = ConfigDict(
         json_schema_extra={"additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]}}
@@ -87,21 +87,21 @@ class MaterialSettings(_Constants):
         """Materials by region; of an empty name where there is one for the whole body."""
         if not self.regions:
             return {"": self}
-        common: dict[str, Any] = {"model": self.model, **self.constants}
+        common: dict[str, Any] = {"model": self.model, **self.values}
         return {
             name: MaterialSettings(
-                **(common if region.model in (None, self.model) else {"model": region.model}) | region.constants
+                **(common if region.model in (None, self.model) else {"model": region.model}) | region.values
             )
             for name, region in self.regions.items()
         }
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Constants by parameter of the simulator, such as ``tip_youngs_modulus`` for a region ``tip``."""
+        """Values by parameter of the simulator, such as ``tip_youngs_modulus`` for a region ``tip``."""
         return {
             f"{region}_{name}" if region else name: value
             for region, material in self.by_region.items()
-            for name, value in material.constants.items()
+            for name, value in material.values.items()
         }
 
 
@@ -380,7 +380,7 @@ class SteppedSettings(BodySettings):
 class TargetSettings(SteppedSettings):
     """The simulation that stands in for the real body."""
 
-    # `run.filled` moves constants that stand directly in ``target`` into its material.
+    # `run.filled` moves parameters that stand directly in ``target`` into its material.
     model_config = ConfigDict(
         json_schema_extra={
             "additionalProperties": {"anyOf": [{"type": "number"}, {"type": "string"}, {"type": "null"}]}

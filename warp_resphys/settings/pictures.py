@@ -101,7 +101,7 @@ class PoseSettings(Settings):
 class SimulatedCamera(Settings):
     """A simulated laboratory of pictures, on the body of the configuration."""
 
-    material: dict[str, float] = setting({}, "constants of the true material that differ from the simulation")
+    material: dict[str, float] = setting({}, "parameters of the true material that differ from the simulation")
     corrections: dict[str, float] = setting({}, "true corrections by parameter")
     noise: NotNegative = setting(1.0, "standard deviation of outlines and tracked points", "px")
     frames: Natural = setting(60, "number of frames of a released body")
@@ -130,7 +130,7 @@ class PictureData(Settings):
     points: dict[str, Vector] = setting({}, "tracked points on the undeformed body, by name", "m")
     likelihood: _Fraction = setting(0.6, "least likelihood of a tracked point")
     cloud: CloudSettings = setting(CloudSettings(), "settings of scans and depth images")
-    materials: dict[str, dict[str, float]] = setting({}, "constants by material, where they differ from simulation")
+    materials: dict[str, dict[str, float]] = setting({}, "parameters by material, where they differ from simulation")
     poses: dict[str, PoseSettings] = setting(description="poses by name")
     train: Some[Word] = setting(description="poses that identify the material")
     test: Many[Word] = setting((), "poses that are predicted with it")

@@ -145,7 +145,7 @@ def _check_identification(run: RunKeys) -> None:
         raise ValueError("law: the simulator has materials by region, and one law is for one material: leave law out.")
     if run.law is not None and run.law.file is None and run.simulation.model == "law":
         raise ValueError(
-            "law: simulation.model is law already: identify its constants in identify.parameters, or take another one."
+            "law: simulation.model is law already: identify its parameters in identify.parameters, or take another one."
         )
     if run.identify is None or run.pictures is not None:
         return

@@ -48,11 +48,11 @@ def filled(values: Any) -> Any:
         part = values.get(group)
         if isinstance(part, Mapping):
             direct = {key: x for key, x in part.items() if key not in keys and not isinstance(x, Mapping)}
-            constants = direct if group == "target" else {}
+            known = direct if group == "target" else {}
             material = _mapping(part.get("material", {}))
-            if constants and material is not None:
-                part = {key: value for key, value in part.items() if key not in constants}
-                part["material"] = {key: value for key, value in {**constants, **material}.items() if value is not None}
+            if known and material is not None:
+                part = {key: value for key, value in part.items() if key not in known}
+                part["material"] = {key: value for key, value in {**known, **material}.items() if value is not None}
             values[group] = {**common, "material": values.get("simulation"), **part}
     return values
 

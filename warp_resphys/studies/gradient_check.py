@@ -182,7 +182,7 @@ class _Problem:
             if value.numel():
                 yield _Case(name, "one", self.direction(sizes[name], *value.shape), partial(torch.add, value))
         for name, quantity in simulator.parameters.items():
-            base = simulator.tensor(simulator.constants[name])
+            base = simulator.tensor(simulator.defaults[name])
             shapes: dict[str, tuple[int, ...]] = {"environment": (self.batch, *(quantity.shape or (3,)))}
             if name != "gravity" and not quantity.shape:
                 base, shapes = base.mean(), {"environment": (self.batch, 1)}

@@ -279,7 +279,7 @@ def _changeable(robot: Robot) -> dict[str, tuple[Quantity, float]]:
         quantity = simulator.parameters.get(name)
         if quantity is None or name in changeable or name == "gravity":
             continue
-        value = simulator.tensor(robot.parameters.get(name, simulator.constants.get(name, float("nan"))))
+        value = simulator.tensor(robot.parameters.get(name, simulator.defaults.get(name, float("nan"))))
         if value.numel() == 1 and bool(torch.isfinite(value).all()):
             changeable[name] = (quantity, float(value))
     return changeable

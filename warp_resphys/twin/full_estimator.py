@@ -99,7 +99,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
             if name == PAYLOAD.name:
                 values.append(float(torch.as_tensor(inputs.get(name, 0.0)).sum()))
                 continue
-            known = torch.as_tensor(self.robot.parameters.get(name, simulator.constants.get(name, ())))
+            known = torch.as_tensor(self.robot.parameters.get(name, simulator.defaults.get(name, ())))
             if known.numel() != 1:
                 raise InputError(
                     f"refine names {name!r}, which has no single value in this robot: refine one that it has "

@@ -5,7 +5,7 @@ A point of the surface, which stands for the area a, has with the distance d fro
     a kappa D B(d / D),     B(s) = -(s - 1)^2 ln s for s < 1, and 0 beyond,
 
 so that the pressure -kappa B'(d / D) begins at the distance D, has a continuous derivative, and grows without bound
-towards d = 0 (incremental potential contact; Li et al. 2020). The stiffness kappa [Pa] is a constant: the gap of a
+towards d = 0 (incremental potential contact; Li et al. 2020). The stiffness kappa [Pa] is constant: the gap of a
 resting body follows from it and is part of the geometry, about D (1 - sqrt(p / 3 kappa)) under a small pressure p
 within a face. At edges, a point also stands for its part of the side walls.
 
@@ -138,7 +138,7 @@ class Contact(Energy):
 
     @property
     @override
-    def constants(self) -> Mapping[str, Parameter]:
+    def defaults(self) -> Mapping[str, Parameter]:
         zeros = {quantity.name: 0.0 for quantity in (GROWTH, *SHIFT, *TURN)}
         known = {STIFFNESS.name: self._by_obstacle("stiffness"), FRICTION.name: self._by_obstacle("friction")}
         return {**known, **zeros}
@@ -198,11 +198,11 @@ class BoundContact(BoundEnergy):
             if len(surface := torch.isin(self._vertices, part).nonzero().ravel()):  # others are out of reach
                 rigid.append((surface, part[~torch.isin(part, self._vertices)]))
         self._clearance = Clearance(contact.obstacles, contact.distance, self._shapes, self._vertices, free, rigid)
-        self._clearance.check_start(like, self.pose(contact.constants, {}))
+        self._clearance.check_start(like, self.pose(contact.defaults, {}))
 
-    def pose(self, constants: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
+    def pose(self, parameters: Mapping[str, Any], inputs: Mapping[str, torch.Tensor]) -> Pose:
         """Returns the poses for parameters and inputs by name."""
-        values = [self._place.new_zeros(1, 1) + constants[q.name] for q in (*SHIFT, *TURN, GROWTH)]
+        values = [self._place.new_zeros(1, 1) + parameters[q.name] for q in (*SHIFT, *TURN, GROWTH)]
         for number, quantity in enumerate(MOTION):
             if quantity.name in inputs:
                 values[number] = values[number] + self._moving * inputs[quantity.name]

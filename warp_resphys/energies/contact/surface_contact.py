@@ -112,7 +112,7 @@ class SurfaceContact(Energy):
 
     @property
     @override
-    def constants(self) -> Mapping[str, Parameter]:
+    def defaults(self) -> Mapping[str, Parameter]:
         others = [float(pair.friction) for pair in self.pairs.values()]
         friction = [cast(float, self.friction), *others] if others else self.friction
         return {STIFFNESS.name: self.stiffness, FRICTION.name: friction}

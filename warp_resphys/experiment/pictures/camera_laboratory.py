@@ -37,7 +37,7 @@ def play_camera(context: StageContext) -> None:
     settings: StageSettings = context.settings
     data, played = settings.data, settings.data.simulated
     assert played is not None
-    material = settings.simulation.changed(**{**settings.simulation.constants, **played.material})
+    material = settings.simulation.changed(**{**settings.simulation.values, **played.material})
     body = build_body(settings)
     surface = ClosedSurface.of(body.mesh)
     centre = torch.as_tensor(body.mesh.vertices[body.fixed_vertices].mean(0))

@@ -121,7 +121,7 @@ def check_pictures(run: RunSettings) -> None:
             released_force(name, pose, build_mesh(run.mesh))
     if not wanted.parameters:
         raise InputError("identify.parameters is empty: give a range for at least one parameter.")
-    known = [*run.simulation.constants, *_PLACED]
+    known = [*run.simulation.values, *_PLACED]
     for name, limits in wanted.parameters.items():
         if name not in known:
             raise InputError(f"identify.parameters names '{name}': choose from {', '.join(known)}.")
@@ -286,8 +286,8 @@ def identify_pictures(context: StageContext) -> None:
     for material in dict.fromkeys(pose.material for pose in poses):
         pose = next(pose for pose in poses if pose.material == material)
         fitted = values_of(pose, found.parameters)
-        constants = {key: fitted.get(key, value) for key, value in plan.poses.material(pose.name).constants.items()}
-        write_json(context.run_dir / law_file(material), law_content(settings.simulation.model, constants))
+        parameters = {key: fitted.get(key, value) for key, value in plan.poses.material(pose.name).values.items()}
+        write_json(context.run_dir / law_file(material), law_content(settings.simulation.model, parameters))
 
 
 def compare_pictures(context: StageContext) -> None:
@@ -355,10 +355,10 @@ def report_pictures(context: StageContext) -> None:
     settings = StageSettings.reading(run, *SIMULATOR, "simulation", "seed", "data")
     poses = SeenPoses(settings, context.run_dir)
     identified = Identification.from_plain(read_json(context.run_dir / IDENTIFICATION)["sysid"])
-    start = dict(run.simulation.constants)
+    start = dict(run.simulation.values)
     for name in data.train:
-        material, constants = data.poses[name].material or "", poses.material(name).constants
-        start |= {own_name(key, material): value for key, value in constants.items()} if material else {}
+        material, parameters = data.poses[name].material or "", poses.material(name).values
+        start |= {own_name(key, material): value for key, value in parameters.items()} if material else {}
     write_pictures_report(
         context.run_dir / REPORT,
         picture_metrics(context.run_dir, run),

@@ -290,9 +290,9 @@ class SeenPoses:
 
     def material(self, name: str) -> MaterialSettings:
         """Returns the material of a pose, as configured."""
-        constants = self.data.materials.get(self.data.poses[name].material or "", {})
+        parameters = self.data.materials.get(self.data.poses[name].material or "", {})
         common = self.settings.simulation
-        return common.changed(**{**common.constants, **constants})
+        return common.changed(**{**common.values, **parameters})
 
     def pose(self, name: str) -> SeenPose:
         """Returns a pose by its name, with a camera for each frame; of a tag, the one that fits better."""

@@ -44,11 +44,11 @@ class IdentifiedLaw:
     """An identified law.
 
     Attributes:
-        simulator: simulator with the law; pass `parameters` to its functions.
+        simulator: simulator with the law; pass `others` to its functions.
         accepted: whether it helps on the trials that it was tested on.
-        constants: of the material, by name, in SI units.
-        parameters: other identified parameters.
-        deviation: standard deviations of constants and parameters; empty if they are not known.
+        parameters: of the material, by name, in SI units.
+        others: parameters identified beside the law, by name.
+        deviation: standard deviations of all of them; empty if they are not known.
         at_bounds: names of those that ended on a bound.
         validation: errors on the trials that the law was tested on.
         model: name of the material's class.
@@ -61,8 +61,8 @@ class IdentifiedLaw:
 
     simulator: Simulator
     accepted: bool
-    constants: Mapping[str, float]
     parameters: Mapping[str, float]
+    others: Mapping[str, float]
     deviation: Mapping[str, float]
     at_bounds: Sequence[str]
     validation: LawTest
@@ -77,7 +77,7 @@ class IdentifiedLaw:
         """Returns the law as JSON data."""
         hidden = ("simulator", "trials")
         known = {key: value for key, value in vars(self).items() if value is not None and key not in hidden}
-        return {**known, **law_content(self.model, self.constants)}
+        return {**known, **law_content(self.model, self.parameters)}
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,12 @@ class LawClass:
 
     Attributes:
         groups: groups of terms besides the modulus.
-        constants: constants of a `ConvexMaterial`, by name.
+        parameters: parameters of a `ConvexMaterial`, by name.
         residual: residual of the weak form, of held-out motions if there are any.
     """
 
     groups: tuple[str, ...]
-    constants: dict[str, float]
+    parameters: dict[str, float]
     residual: float
 
     @property
@@ -152,8 +152,8 @@ def fit_classes(
     for chosen in chain.from_iterable(combinations(names, size) for size in range(len(names) + 1)):
         kept = _sparse(columns, modulus, [k for name in chosen for k in groups[name]])
         coefficients, residual = columns.fit(kept)
-        constants = _constants([columns.candidates[k] for k in kept], coefficients)
-        laws.setdefault(tuple(kept), LawClass(chosen, constants, residual))
+        parameters = _parameters([columns.candidates[k] for k in kept], coefficients)
+        laws.setdefault(tuple(kept), LawClass(chosen, parameters, residual))
     return list(laws.values())
 
 
@@ -206,9 +206,9 @@ def _sparse(columns: _Columns, modulus: Sequence[int], others: Sequence[int]) ->
     return [*modulus, *kept]
 
 
-def _constants(candidates: Sequence[Candidate], coefficients: FloatArray) -> dict[str, float]:
-    """Returns the constants of a `ConvexMaterial`; neighbouring relaxation times become one branch."""
-    constants, branches, families = dict[str, float](), list[list[float]](), list[dict[str, float]]()
+def _parameters(candidates: Sequence[Candidate], coefficients: FloatArray) -> dict[str, float]:
+    """Returns the parameters of a `ConvexMaterial`; neighbouring relaxation times become one branch."""
+    parameters, branches, families = dict[str, float](), list[list[float]](), list[dict[str, float]]()
     for candidate, factor in zip(candidates, coefficients.tolist(), strict=True):
         if "prony_time_1" in candidate:
             modulus, time = factor * UNIT, candidate["prony_time_1"]
@@ -221,17 +221,17 @@ def _constants(candidates: Sequence[Candidate], coefficients: FloatArray) -> dic
             families.append({**candidate, "fibre_tension_1": factor * UNIT})
         else:
             ((name, unit),) = candidate.items()
-            constants[name] = factor * unit
-    shear = 2.0 * (constants["c10"] + constants.get("c01", 0.0)) + sum(
-        value for name, value in constants.items() if name.startswith("ogden")
+            parameters[name] = factor * unit
+    shear = 2.0 * (parameters["c10"] + parameters.get("c01", 0.0)) + sum(
+        value for name, value in parameters.items() if name.startswith("ogden")
     )
     strong = [branch for branch in branches if branch[0] > _LEAST * shear]
-    constants |= branches_of([modulus for modulus, _ in strong], [time for _, time in strong])
+    parameters |= branches_of([modulus for modulus, _ in strong], [time for _, time in strong])
     pulling = [family for family in families if family["fibre_tension_1"] > _LEAST * shear]
     for number, family in enumerate(pulling, 1):
-        constants |= {f"fibre_{name}_{number}": value for name, value in _FIBRE.items()}
-        constants |= {f"{name[:-1]}{number}": value for name, value in family.items()}
-    return constants
+        parameters |= {f"fibre_{name}_{number}": value for name, value in _FIBRE.items()}
+        parameters |= {f"{name[:-1]}{number}": value for name, value in family.items()}
+    return parameters
 
 
 def first_guess(material: Material, known: Mapping[str, float]) -> dict[str, float]:
@@ -239,7 +239,7 @@ def first_guess(material: Material, known: Mapping[str, float]) -> dict[str, flo
 
     Args:
         material: its class.
-        known: its constants.
+        known: its parameters.
     """
     tensors = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in known.items()}
     lame = np.asarray(material.law.lame).T @ [float(m) for m in material.moduli(tensors)]
@@ -253,17 +253,17 @@ def first_guess(material: Material, known: Mapping[str, float]) -> dict[str, flo
     return {"c10": 0.5 * mu, "bulk_1": 0.5 * volume, **viscosities, **branches}
 
 
-def bounds_of_constant(
+def bounds_of_parameter(
     name: str, value: float, guess: Mapping[str, float], deviation: float, modulus: Prior | None
 ) -> Bounds:
-    """Returns the range of a constant of a law, around a first value, and its prior.
+    """Returns the range of a parameter of a law, around a first value, and its prior.
 
     The priors have the weight of one observation. They hold what the trials do not excite: moduli and viscosities near
     those of the first guess, and further terms near zero. At small strains, markers do not tell c10 from these, and the
     neo-Hookean law extrapolates best from there.
 
     Args:
-        name: of the constant.
+        name: of the parameter.
         value: from which its search starts.
         guess: `first_guess`.
         deviation: standard deviation of further terms, over the shear modulus.
@@ -292,41 +292,41 @@ def bounds_of_constant(
 
 
 def is_shape(name: str) -> bool:
-    """Whether a constant has no coefficient's meaning: a time, a direction, a slack or a toe."""
+    """Whether a parameter is no coefficient, but a time, a direction, a slack or a toe."""
     return unit_of(name) != "Pa" and name not in VISCOSITIES
 
 
-def strong_names(constants: Mapping[str, float], shear: float) -> dict[str, str]:
-    """Names of constants by their names without terms, branches and families that hardly resist, which are left out.
+def strong_names(parameters: Mapping[str, float], shear: float) -> dict[str, str]:
+    """Names of parameters by their names without terms, branches and families that hardly resist, which are left out.
 
     Args:
-        constants: of a law.
+        parameters: of a law.
         shear: shear modulus of the material [Pa].
     """
-    weak = {name for name, value in constants.items() if unit_of(name) == "Pa" and value < _LEAST * shear}
-    weak |= {name for name in VISCOSITIES if constants.get(name, 1.0) < 1e-6 * shear}
+    weak = {name for name, value in parameters.items() if unit_of(name) == "Pa" and value < _LEAST * shear}
+    weak |= {name for name in VISCOSITIES if parameters.get(name, 1.0) < 1e-6 * shear}
     kept = {
         name: name
-        for name in constants
+        for name in parameters
         if name in ("c10", "bulk_1") or not (name in weak or name.startswith(("prony", "fibre")))
     }
     for leading in ("prony_modulus_", "fibre_tension_"):
         group = leading.split("_")[0]
-        strong = [name.removeprefix(leading) for name in constants if name.startswith(leading) and name not in weak]
+        strong = [name.removeprefix(leading) for name in parameters if name.startswith(leading) and name not in weak]
         for number, old in enumerate(strong, 1):
-            members = [name for name in constants if name.startswith(group) and name.endswith(f"_{old}")]
+            members = [name for name in parameters if name.startswith(group) and name.endswith(f"_{old}")]
             kept |= {f"{name.removesuffix(old)}{number}": name for name in members}
     return kept
 
 
 def branches_of(moduli: Sequence[float], times: Sequence[float], first: int = 1) -> dict[str, float]:
-    """Constants of branches by their moduli [Pa] and relaxation times [s], numbered from `first`."""
+    """Parameters of branches by their moduli [Pa] and relaxation times [s], numbered from `first`."""
     pairs = enumerate(zip(moduli, times, strict=True), first)
     return {key: x for k, (m, t) in pairs for key, x in ((f"prony_modulus_{k}", m), (f"prony_time_{k}", t))}
 
 
 def family(tension: float, direction: tuple[float, float] = (0.0, 0.0)) -> dict[str, float]:
-    """Constants of fibres with a tension [Pa], along an azimuth and an elevation [rad]."""
+    """Parameters of fibres with a tension [Pa], along an azimuth and an elevation [rad]."""
     zero = {f"fibre_{name}_1": 0.0 for name in ("slack", "stiffening", "compression")}
     angles = dict(zip(("fibre_azimuth_1", "fibre_elevation_1"), direction, strict=True))
     return {"fibre_tension_1": tension, "fibre_toe_1": 0.02, **angles, **zero}

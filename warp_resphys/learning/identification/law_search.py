@@ -32,7 +32,7 @@ from .law import (
     VISCOSITIES,
     IdentifiedLaw,
     LawClass,
-    bounds_of_constant,
+    bounds_of_parameter,
     branches_of,
     family,
     first_guess,
@@ -52,9 +52,9 @@ _HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
-_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of constants of a group begin with these
+_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of parameters of a group begin with these
 _STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
-_FIXED: Final = ("fibre_stiffening", "fibre_compression")  # constants that are not refined
+_FIXED: Final = ("fibre_stiffening", "fibre_compression")  # parameters that are not refined
 _BESIDE: Final = "beside"  # key of the search of parameters beside a known law
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
@@ -78,7 +78,7 @@ def identify_law(
     fewer, the last part, of which `identify` has seen all.
 
     Args:
-        simulator: of the body, with a material of a simpler class; the law begins with its constants.
+        simulator: of the body, with a material of a simpler class; the law begins with its parameters.
         motions: observed states or markers.
         parameters: ranges that `identify` had; parameters that are not of the material are refined with the law.
         identified: result of `identify`; the simulator's own values if None.
@@ -139,8 +139,8 @@ class _LawSearch:
 
     @cached_property
     def known(self) -> dict[str, float]:
-        """Constants of the material as it was identified."""
-        known = {name: float(torch.as_tensor(x)) for name, x in self.base.materials[""].constants.items()}
+        """Parameters of the material as it was identified."""
+        known = {name: float(torch.as_tensor(x)) for name, x in self.base.materials[""].values.items()}
         return known | {name: x for name, x in self.identified.parameters.items() if name in known}
 
     @property
@@ -158,15 +158,15 @@ class _LawSearch:
         """Shear modulus of the identified material [Pa]."""
         return 2.0 * self.guess["c10"]
 
-    def simulator(self, constants: Mapping[str, float], model: str = ConvexMaterial.model) -> Simulator:
-        """Returns the simulator with the constants of a law; failed steps are counted."""
-        material = make_material(model, **{**self.mass, **constants})
+    def simulator(self, parameters: Mapping[str, float], model: str = ConvexMaterial.model) -> Simulator:
+        """Returns the simulator with the parameters of a law; failed steps are counted."""
+        material = make_material(model, **{**self.mass, **parameters})
         return replace(self.base, material=material, solver=replace(self.base.settings, on_failure="count"))
 
     @cached_property
     def others(self) -> dict[str, float]:
         """Identified parameters beside the law: density and damping by mass, and those of other parts."""
-        material = {*self.base.materials[""].quantities} - {*_OF_MASS}
+        material = {*self.base.materials[""].parameters} - {*_OF_MASS}
         return {name: float(value) for name, value in self.identified.parameters.items() if name not in material}
 
     def run(self) -> IdentifiedLaw:
@@ -174,7 +174,7 @@ class _LawSearch:
         if self.motions.sees_states:
             fitted = once(self.kept, "classes", lambda: [asdict(law) for law in self._from_states()])
             classes = TypeAdapter(list[LawClass]).validate_python(fitted)
-            scores = [score.error for score in self.scores([law.constants for law in classes])]
+            scores = [score.error for score in self.scores([law.parameters for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
@@ -184,22 +184,22 @@ class _LawSearch:
         if not self.validation:
             again = self._refine(best.law, whole=True)
             best = best if best.score.beats(again.score) else replace(again, score=best.score)
-        constants = {name: best.others.get(name, x) for name, x in self.mass.items()} | best.law.constants
-        deviation, trials, law = best.found.deviation, self.names(whole=True), self.simulator(constants)
+        parameters = {name: best.others.get(name, x) for name, x in self.mass.items()} | best.law.parameters
+        deviation, trials = best.found.deviation, self.names(whole=True)
         return IdentifiedLaw(
-            simulator=law,
+            simulator=self.simulator(parameters),
             groups=best.law.groups,
-            constants=constants,
-            parameters=best.others,
+            parameters=parameters,
+            others=best.others,
             deviation={n: deviation[old] for n, old in best.names.items() if old in deviation},
             at_bounds=[name for name, old in best.names.items() if old in best.found.at_bounds],
             loss=best.found.loss,
             classes=[
-                TriedClass(groups=[*tried.groups], constants=tried.constants, residual=tried.residual, validation=score)
-                for tried, score in zip(classes, scores, strict=True)
+                TriedClass(groups=[*law.groups], parameters=law.parameters, residual=law.residual, validation=score)
+                for law, score in zip(classes, scores, strict=True)
             ],
             stretches=stretches_in(
-                self.motions, trials, self.simulator(best.law.constants), best.others, self.identified
+                self.motions, trials, self.simulator(best.law.parameters), best.others, self.identified
             ),
             trials=trials,
             **self._tested(best.score),
@@ -207,8 +207,8 @@ class _LawSearch:
 
     def beside(self, law: LawContent) -> IdentifiedLaw:
         """Identifies the parameters beside a known law, which is used in any case."""
-        constants = {**law["constants"], **self.mass}
-        simulator = self.simulator(constants, law["model"])
+        parameters = {**law["parameters"], **self.mass}
+        simulator = self.simulator(parameters, law["model"])
         bounds, found = self._bounds_of_others, Identification()
         if bounds:
             limits = (self.seconds, self.settings.seconds)
@@ -216,8 +216,8 @@ class _LawSearch:
         values = {name: simulator.tensor([value]) for name, value in found.parameters.items()}
         return IdentifiedLaw(
             simulator=simulator,
-            constants=constants,
-            parameters=found.parameters,
+            parameters=parameters,
+            others=found.parameters,
             deviation={**law.get("deviation", {}), **found.deviation},
             at_bounds=[*law.get("at_bounds", ()), *found.at_bounds],
             model=law["model"],
@@ -236,7 +236,7 @@ class _LawSearch:
         """Returns the errors of laws on the trials that they are tested on.
 
         Args:
-            laws: constants by name.
+            laws: parameters by name.
             others: values of the other identified parameters, in place of the identified ones.
         """
         union: dict[str, float] = {}
@@ -307,19 +307,19 @@ class _LawSearch:
         best = self._refine(LawClass(tuple(groups), guess | whole, math.nan))
         tried = [best]
         for name in groups:
-            left = {n: x for n, x in best.law.constants.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
+            left = {n: x for n, x in best.law.parameters.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
             if name == "branches":
                 left |= creep
             if name == "elastic":  # They may have been all that resists shear.
                 left["c10"] = max(left["c10"], guess["c10"])
             smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
-            if left == best.law.constants:  # The search has left nothing of the group.
+            if left == best.law.parameters:  # The search has left nothing of the group.
                 best = replace(best, law=smaller)
                 continue
             tried.append(self._refine(smaller))
             if not best.score.beats(tried[-1].score):
                 best = tried[-1]
-        return [one for one in tried if one.law.constants != best.law.constants] + [best]
+        return [one for one in tried if one.law.parameters != best.law.parameters] + [best]
 
     def _refine(self, law: LawClass, whole: bool = False) -> RefinedLaw:
         """Returns a law that is refined through the simulator, with the other identified parameters.
@@ -328,15 +328,15 @@ class _LawSearch:
             law: first guess.
             whole: whether to use the whole of training trials on which laws are tested as well.
         """
-        guess = dict(law.constants)
+        guess = dict(law.parameters)
         guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
         others, searched = self._bounds_of_others, [name for name in guess if not name.startswith(_FIXED)]
         bounds = {name: self._bounds(name, guess[name]) for name in searched} | others
 
         def begin(before: Identification | None) -> tuple[Simulator, dict[str, float]]:
             first = {} if before is None else dict(before.parameters)
-            constants = guess | {name: value for name, value in first.items() if name in guess}
-            return self.simulator(constants), first | constants
+            parameters = guess | {name: value for name, value in first.items() if name in guess}
+            return self.simulator(parameters), first | parameters
 
         key = " ".join([*law.groups, *(["whole"] if whole else [])])
         limits = (self.seconds,) if whole else (self.seconds, self.settings.seconds, self.early)
@@ -345,7 +345,7 @@ class _LawSearch:
         names = strong_names(refined, self.shear)
         kept, beside = {n: refined[old] for n, old in names.items()}, {n: found.parameters[n] for n in others}
         score = self.scores([kept], beside)[0]
-        return RefinedLaw(replace(law, constants=kept), beside, {**names, **{n: n for n in others}}, found, score)
+        return RefinedLaw(replace(law, parameters=kept), beside, {**names, **{n: n for n in others}}, found, score)
 
     def _search(
         self,
@@ -384,9 +384,9 @@ class _LawSearch:
         return {name: self.ranges[name] for name in self.others if name in self.ranges}
 
     def _bounds(self, name: str, value: float) -> Bounds:
-        """Returns the range of a constant of a law."""
+        """Returns the range of a parameter of a law."""
         prior, modulus = None, self.ranges.get("youngs_modulus")
         if modulus is not None and modulus.prior is not None:
             share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
             prior = Prior(share * modulus.prior.mean, share * modulus.prior.deviation)
-        return bounds_of_constant(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)
+        return bounds_of_parameter(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)

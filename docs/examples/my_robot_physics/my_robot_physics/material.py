@@ -24,7 +24,7 @@ ONE, TWO, THREE, HALF = (wp.constant(wp.float64(n)) for n in (1.0, 2.0, 3.0, 0.5
 
 @wp.func
 def shape_energy(f: wp.mat33d, p: wp.vec3d) -> wp.float64:
-    """W [J/m^3] for the deformation gradient and the constants in their order: mu, L, K."""
+    """W [J/m^3] for the deformation gradient and the parameters in their order: mu, L, K."""
     change = wp.determinant(f) - ONE
     i = wp.ddot(f, f) - TWO * change + change * change
     s = ONE / (p[1] * p[1])
@@ -58,7 +58,7 @@ class ArrudaBoyce(DensityMaterial):
     locking_stretch: Parameter = parameter(2.0, "locking_stretch", "", lower=1.0)  # L
     bulk_modulus: Parameter = parameter(1e6, "bulk_modulus", "Pa")  # K [Pa]
 
-    def lame(self, constants):
+    def lame(self, parameters):
         """Returns mu and lambda at small strains [Pa]."""
-        mu = constants["shear_modulus"]
-        return mu, constants["bulk_modulus"] - 2.0 / 3.0 * mu
+        mu = parameters["shear_modulus"]
+        return mu, parameters["bulk_modulus"] - 2.0 / 3.0 * mu

@@ -50,7 +50,7 @@ def test_with_long_chains_it_is_neo_hookean():
     torch.testing.assert_close(*ends, rtol=0.0, atol=1e-9)
 
 
-def test_gradients_by_its_constants_equal_differences():
+def test_gradients_by_its_parameters_equal_differences():
     rubber = ArrudaBoyce(60e3, 1.6, 4e6, mass_damping=0.5, stiffness_damping=2e-3)
     s = Simulator(Body(BEAM, fixed=select_vertices(BEAM, x=0.0)), rubber, solver=SolverSettings("newton", 1e-12))
     rows = check_gradients(s, "bent", steps=2)

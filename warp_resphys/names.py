@@ -4,14 +4,11 @@ from .data.markers import Markers as Markers
 from .data.markers import Observation as Observation
 from .data.markers import bind_markers as bind_markers
 from .data.recordings.recording_files import read_recording as read_recording
-from .dynamics.nonlinear_solver import SolverSettings as SolverSettings
 from .dynamics.simulator import Simulator as Simulator
 from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Motion as Motion
 from .energies.catalogue import read_material as read_material
 from .energies.contact.obstacle_contact import Contact as Contact
-from .energies.contact.obstacles import Cylinder as Cylinder
-from .energies.contact.obstacles import HalfSpace as HalfSpace
 from .energies.contact.surface_contact import SurfaceContact as SurfaceContact
 from .energies.fibres import Fibres as Fibres
 from .energies.materials import Corotated as Corotated
@@ -22,7 +19,6 @@ from .energies.tendons import Tendons as Tendons
 from .fem.bodies import Body as Body
 from .fem.bodies import Glue as Glue
 from .fem.bodies import PointMass as PointMass
-from .fem.bodies import Rigid as Rigid
 from .fem.coordinates import SymmetryPlane as SymmetryPlane
 from .fem.scene import Scene as Scene
 from .io.errors import ConvergenceError as ConvergenceError
@@ -49,6 +45,10 @@ from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names
 from .robot.robot import Robot as Robot
 from .robot.robot_scene import RobotScene as RobotScene
+from .settings.body import Rigid as Rigid
+from .settings.body import SolverSettings as SolverSettings
+from .settings.contact import Cylinder as Cylinder
+from .settings.contact import HalfSpace as HalfSpace
 from .stepping.inputs import Inputs as Inputs
 from .stepping.state import State as State
 from .twin.twin import Twin as Twin

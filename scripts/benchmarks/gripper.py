@@ -9,10 +9,8 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from warp_resphys.dynamics.nonlinear_solver import SolverSettings
 from warp_resphys.dynamics.simulator import Simulator
 from warp_resphys.energies.contact.obstacle_contact import Contact
-from warp_resphys.energies.contact.obstacles import HalfSpace
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.contact.surface_contact import SurfaceContact
 from warp_resphys.energies.launcher import Launcher
@@ -24,6 +22,8 @@ from warp_resphys.fem.bodies import Body
 from warp_resphys.fem.scene import Scene
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.mesh.selection import select_vertices
+from warp_resphys.settings.body import SolverSettings
+from warp_resphys.settings.contact import HalfSpace
 from warp_resphys.stepping.inputs import Inputs
 
 from .measuring import free_unknowns, now, solves, take_turns

@@ -22,7 +22,7 @@ CAP = np.flatnonzero(BOX.vertices[BOX.cells].mean(1)[:, 0] > 0.045)
 BODIES = {
     "hexahedra": clamped(BOX),
     "tetrahedra": clamped(box_tetrahedra((0.06, 0.04, 0.04), (4, 3, 3))),
-    "rigid part": clamped(Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), rigid={"cap": Rigid(1200.0)}),
+    "rigid part": clamped(Mesh(BOX.vertices, BOX.cells, {"cap": CAP}), rigid={"cap": Rigid(density=1200.0)}),
     "tendon": clamped(BOX, energies=[Tendons([[[0.0, 0.01, 0.04], [0.06, 0.01, 0.04]]], 400.0)]),
     "symmetry": clamped(BOX, symmetry=[SymmetryPlane((0.0, 1.0, 0.0), 0.0)]),
 }

@@ -18,7 +18,7 @@ MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)
 
 
 def simulator(name, device, material=MATERIAL, **settings):
-    chosen = SolverSettings(name, linear_solver="tiled", **({"relative_tolerance": 1e-9} | settings))
+    chosen = SolverSettings(name=name, linear_solver="tiled", **({"relative_tolerance": 1e-9} | settings))
     return Simulator(BODY, material, solver=chosen, device=device)
 
 

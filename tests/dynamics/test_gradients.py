@@ -23,7 +23,7 @@ MESHES = {
     "hexahedron27": box_hexahedra(SIZE, (1, 1, 1), nodes=27),
 }
 DAMPED = Corotated(264e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 PER_ELEMENT = ("", ", each element", ", each environment")
 KINDS = [
     *("q", "v", "external_force", "fixed_positions", "attached_mass"),
@@ -41,7 +41,7 @@ def test_factors_in_single_precision_give_gradients_in_double(pose_name, poisson
     material = replace(DAMPED, poissons_ratio=poissons_ratio)
     both = []
     for factors in ("single", "double"):
-        sim = simulator(material=material, solver=replace(TIGHT, factors=factors))
+        sim = simulator(material=material, solver=TIGHT.changed(factors=factors))
         state = pose(sim, pose_name, 2)
         q = state.q.clone().requires_grad_(True)
         end = sim.rollout(State(q, state.v), 3)
@@ -55,7 +55,7 @@ def test_single_precision_needs_no_factor_in_double(monkeypatch):
     refactor = ExactHessian.refactor_exact
     monkeypatch.setattr(ExactHessian, "refactor_exact", lambda self: (tried.append(self.exact), refactor(self)))
     sim = simulator(
-        material=replace(DAMPED, poissons_ratio=0.499), time_step=1.0, solver=replace(TIGHT, factors="single")
+        material=replace(DAMPED, poissons_ratio=0.499), time_step=1.0, solver=TIGHT.changed(factors="single")
     )
     state = pose(sim, "bent", 2)
     q = state.q.clone().requires_grad_(True)
@@ -90,8 +90,8 @@ def test_every_parameter_with_every_integrator(integrator, start):
     [
         {"material": StableNeoHookean(**DAMPED.values)},
         {"material": replace(DAMPED, poissons_ratio=-0.2)},
-        {"solver": SolverSettings("quasi_newton", relative_tolerance=1e-12)},
-        {"solver": SolverSettings("newton", relative_tolerance=1e-12, linear_solver="sparse")},
+        {"solver": SolverSettings(name="quasi_newton", relative_tolerance=1e-12)},
+        {"solver": SolverSettings(name="newton", relative_tolerance=1e-12, linear_solver="sparse")},
         {"body": clamped(MESHES["hexahedron"], mass="per_vertex", volume_integration="full")},
     ],
     ids=["stable_neo_hookean", "auxetic", "quasi_newton", "sparse", "integration"],

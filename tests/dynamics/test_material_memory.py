@@ -21,7 +21,7 @@ SIZE = (0.04, 0.02, 0.02)  # m
 MESH = box_hexahedra(SIZE, (2, 1, 1))
 TIP = select_vertices(MESH, x=SIZE[0])
 CLAMPED = clamped(MESH)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-11)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-11)
 WEIGHTLESS = (0.0, 0.0, 0.0)
 ELASTIC = Corotated(2e4, 0.0, density=1000.0)  # without lateral contraction: lambda is zero, all stiffness relaxes
 MU = 1e4  # Pa, the shear modulus

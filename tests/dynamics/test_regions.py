@@ -11,10 +11,11 @@ from support.clamped import clamped, noise
 from support.regions import beam, two_boxes
 from support.slopes import check_slopes
 from warp_resphys import Body, Corotated, InputError, Mesh, Scene, Simulator, StableNeoHookean, State, box_hexahedra
-from warp_resphys.fem.bodies import Glue, Rigid
+from warp_resphys.fem.bodies import Glue
 from warp_resphys.fem.coordinates import Coordinates, DeviceCoordinates, barycentric, control_vertices
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.mesh.selection import select_vertices
+from warp_resphys.settings.body import Rigid
 
 MESH = beam((6, 2, 2))
 SILICONE = Corotated(2e5, 0.45, prony=[(0.2, 0.1)], stiffness_damping=1e-3)
@@ -76,7 +77,7 @@ def test_a_rigid_body_of_a_scene_has_no_material():
 def test_a_rigid_box_turns_as_eulers_equations_say(integrator, order):
     """About an axis near that of the largest moment of inertia, so that it nutates."""
     mesh = box_hexahedra((0.1, 0.05, 0.03), (2, 1, 1))
-    body = Body(Mesh(mesh.vertices, mesh.cells, {"all": np.arange(2)}), rigid={"all": Rigid(1000.0)})
+    body = Body(Mesh(mesh.vertices, mesh.cells, {"all": np.arange(2)}), rigid={"all": Rigid(density=1000.0)})
     spin = np.array([2.0, 1.0, 10.0])
     inertia = 1000.0 * 0.1 * 0.05 * 0.03 / 12.0 * np.array([0.05**2 + 0.03**2, 0.1**2 + 0.03**2, 0.1**2 + 0.05**2])
     momentum, turn, h = inertia * spin, np.eye(3), 1e-4
@@ -183,7 +184,7 @@ FLAT = Mesh(beam().vertices, beam().cells, {"cap": np.arange(81, 90), "next": np
         (lambda: Body(BOXES, ENDS[:1], glued=[Glue(ENDS, "left")]), "is fixed"),
         (lambda: Body(BOXES, rigid={"right": Rigid()}, glued=[Glue(ENDS, "left")]), "part of a rigid part"),
         (lambda: Body(FAR, glued=[Glue(FAR_ENDS, "left")]), "farther than the tolerance"),
-        (lambda: Rigid(stiffness=0.0), "must be positive, in Pa"),
+        (lambda: Rigid(stiffness=0.0), r"Rigid\.stiffness is 0\.0: it must be a positive number, in Pa"),
     ],
 )
 def test_invalid_rigid_parts_and_glue_are_refused(make, key):

@@ -13,7 +13,7 @@ from warp_resphys.studies.gradient_check import POSES, check_gradients
 
 SIZE = (0.1, 0.03, 0.03)
 SOFT = StableNeoHookean(264e3, 0.45, mass_damping=0.5, stiffness_damping=1e-3)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 TURN = 0.4  # about x
 
 
@@ -29,7 +29,7 @@ def beam(half, angle=0.0, rigid=False, stiffness=1e9):
     regions = {"cap": np.flatnonzero(mesh.vertices[mesh.cells].mean(1)[:, 0] > 0.08)} if rigid else {}
     mesh = Mesh(turned(mesh.vertices, angle), mesh.cells, regions)
     planes = [SymmetryPlane(turned([0.0, 1.0, 0.0], angle), 0.015)] if half else []
-    return clamped(mesh, rigid={"cap": Rigid(1200.0, stiffness)} if rigid else {}, symmetry=planes)
+    return clamped(mesh, rigid={"cap": Rigid(density=1200.0, stiffness=stiffness)} if rigid else {}, symmetry=planes)
 
 
 def simulator(body, angle=0.0, solver=TIGHT, **more):
@@ -42,7 +42,7 @@ def simulator(body, angle=0.0, solver=TIGHT, **more):
     [("newton", "banded", 0.0, False), ("quasi_newton", "auto", TURN, True), ("newton", "sparse", TURN, False)],
 )
 def test_half_a_beam_swings_like_the_whole_one(solver, linear, angle, rigid):
-    settings = SolverSettings(solver, relative_tolerance=1e-11, linear_solver=linear)
+    settings = SolverSettings(name=solver, relative_tolerance=1e-11, linear_solver=linear)
     half, whole = (beam(side, angle, rigid) for side in (True, False))
     runs = []
     for body in (half, whole):
@@ -78,7 +78,7 @@ NAMED = Mesh(BOX.vertices, BOX.cells, {"cap": np.arange(144, 160), "beam": np.ar
             ),
             "'cap'",
         ),
-        (lambda: simulator(beam(True), solver=SolverSettings("projective_dynamics")), "projective_dynamics"),
+        (lambda: simulator(beam(True), solver=SolverSettings(name="projective_dynamics")), "projective_dynamics"),
     ],
 )
 def test_invalid_symmetry_is_refused(make, key):

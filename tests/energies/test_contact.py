@@ -15,9 +15,9 @@ from warp_resphys import Body, Corotated, Inputs, Simulator, State, SymmetryPlan
 from warp_resphys.energies.contact.contact_points import vertex_areas, vertex_factors
 from warp_resphys.energies.contact.obstacle_contact import Contact
 from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
-from warp_resphys.energies.contact.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh.selection import select_cells, select_vertices
+from warp_resphys.settings.contact import Box, Capsule, Cylinder, HalfSpace, Sphere
 
 CPU = torch.device("cpu")
 TIGHT = {"solver": "newton", "relative_tolerance": 1e-13}
@@ -67,7 +67,7 @@ def test_distances_and_normals_within_and_around_a_shape(shape):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_derivatives_of_distances_and_normals(shape):
     """By position, place, rotation and growth: first and second derivatives of the distance, and `turn_slope`."""
-    obstacles = (SHAPES[shape], replace(SHAPES[shape], axis=(1.0, 0.5, 0.1)))
+    obstacles = (SHAPES[shape], SHAPES[shape].changed(axis=(1.0, 0.5, 0.1)))
     rng, shapes = np.random.default_rng(2), ObstacleSet(obstacles, D, CPU)
     y = rng.normal(size=(2, 40, 3)) * 0.025
     turns = np.stack([np.stack([o.turn for o in obstacles])] * 2)
@@ -96,7 +96,7 @@ def test_areas_of_vertices_sum_to_the_surface(mesh):
 def resting(tilt=0.0, moves=False, **options):
     """A block at rest on a floor under gravity that is tilted by an angle [degrees], and its gap [m]."""
     floor = resting_floor(WEIGHT * math.cos(math.radians(tilt)))
-    return simulator(replace(floor, moves=moves), **options), -floor.position[2]
+    return simulator(floor.changed(moves=moves), **options), -floor.position[2]
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
@@ -346,10 +346,10 @@ def test_values_by_the_name_of_an_obstacle():
         ),
         (lambda: Contact({"a": HalfSpace()}, slip_speed=math.nan), "contact.slip_speed is nan"),
         (lambda: Contact({"a": HalfSpace()}, friction_factors={"foot": -1.0}), "friction_factors.foot is -1"),
-        (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be positive"),
+        (lambda: Sphere(radius=-1.0), "Sphere.radius is -1.0: it must be a positive number, in m"),
         (lambda: Box(edges=(0.1, 0.0, 0.1)), "Box.edges is"),
-        (lambda: HalfSpace(axis=(0.0, 0.0, 0.0)), "HalfSpace.axis is .* must have a length"),
-        (lambda: HalfSpace(position=(0.0, 0.0)), "HalfSpace.position is .* three finite numbers"),
+        (lambda: HalfSpace(axis=(0.0, 0.0, 0.0)), "HalfSpace.axis is .* not all zero"),
+        (lambda: HalfSpace(position=(0.0, 0.0)), r"HalfSpace.position is \(0.0, 0.0\): it must be three numbers, in m"),
     ],
 )
 def test_values_out_of_range(make, message):

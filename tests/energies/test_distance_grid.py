@@ -151,7 +151,7 @@ def test_gradients_of_a_block_that_slides_over_a_ring():
         ({"distances": np.zeros((4, 4, 4))}, "8 nodes or more"),
         ({"distances": -np.ones((9, 9, 9))}, "end outside of the shape"),
         ({"spacing": 0.0}, "spacing"),
-        ({"low": (0.0, math.nan, 0.0)}, "DistanceGrid.low is .* three finite numbers"),
+        ({"low": (0.0, math.nan, 0.0)}, "DistanceGrid.low is .*: it must be three numbers, in m"),
     ],
 )
 def test_grids_that_are_refused(change, words):

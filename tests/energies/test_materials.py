@@ -16,7 +16,7 @@ from warp_resphys.energies.convex_material import ConvexMaterial, FibreFamily
 from warp_resphys.studies.gradient_check import check_gradients
 
 BODY = clamped(box_hexahedra((0.1, 0.03, 0.03), (5, 2, 2)))
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 C10, C01, BULK = 36e3, 8e3, 4e6
 FIBRES = [FibreFamily(0.3, 0.2, 0.0, 0.5, 40e3, 10e3), FibreFamily(-0.4, 0.1, 0.005, 0.5, 20e3)]
 

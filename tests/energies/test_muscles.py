@@ -16,7 +16,7 @@ SIZE, MODULUS = (0.12, 0.02, 0.02), 264e3
 BEAM = box_hexahedra(SIZE, (6, 2, 2))
 MESHES = {"hexahedra": BEAM, "tetrahedra10": box_tetrahedra(SIZE, (4, 2, 2), order=2)}
 ALONG = (2.0, 0.0, 0.0)  # of any length
-TIGHT = SolverSettings("newton", relative_tolerance=1e-11)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-11)
 
 
 def whole(mesh):

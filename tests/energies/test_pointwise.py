@@ -18,7 +18,7 @@ from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
 CLAMP, TIP = select_vertices(MESH, x=0.0), select_vertices(MESH, x=0.06)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 MATERIAL = Corotated(1e5, 0.45, mass_damping=0.5, stiffness_damping=2e-3)
 FIBRES = Muscles([Muscle(range(2), (1.0, 0.0, 0.2))], stiffness=4e4)
 VALUES = {"muscle_stress": 2e4, "muscle_contraction": 0.5}  # where no fibre is near its toe

@@ -17,7 +17,7 @@ from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
 from warp_resphys.studies.gradient_check import central_difference, check_gradients
 
 SOFT = Corotated(100e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 
 
 def volumes_of(s, q):

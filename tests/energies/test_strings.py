@@ -19,7 +19,7 @@ BEAM = box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2))
 TIP = select_vertices(BEAM, x=0.1, z=0.03)
 SOFT = Corotated(264e3, 0.49, stiffness_damping=0.002)
 RIGID = replace(SOFT, youngs_modulus=1e12, stiffness_damping=0.0)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-10)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-10)
 G = 9.81
 
 
@@ -96,7 +96,7 @@ def test_gradients(integrator, start, device):
     strings = Strings([TIP, select_vertices(BEAM, x=0.05, z=0.0)[:1]], [0.2, 0.1], 1e-2, toe=2e-2)
     body = clamped(BEAM, energies=(strings,))
     material = replace(SOFT, mass_damping=0.5)
-    solver = replace(TIGHT, relative_tolerance=1e-12)
+    solver = TIGHT.changed(relative_tolerance=1e-12)
     sim = Simulator(body, material, time_step=0.01, integrator=integrator, solver=solver, device=device)
     rows = check_gradients(sim, start, steps=5)
     own = {row.parameter: row for row in rows if row.parameter.startswith(("payload", "string"))}

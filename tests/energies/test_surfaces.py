@@ -15,13 +15,14 @@ from warp_resphys.energies import FrictionPair
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher, warp_view
 from warp_resphys.environments.making import ball_mesh
-from warp_resphys.fem.bodies import Body, Rigid
+from warp_resphys.fem.bodies import Body
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels.contact import nearest_points
 from warp_resphys.kernels.contact import surface_pairs as kernels
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.selection import select_cells, select_vertices
 from warp_resphys.mesh.volume_mesh import Mesh, join
+from warp_resphys.settings.body import Rigid
 
 CPU = torch.device("cpu")
 SOFT = Corotated(youngs_modulus=2.5e5, poissons_ratio=0.45)
@@ -220,7 +221,7 @@ def test_regions_have_their_own_friction():
     for name, y in (("a", 0.007), ("b", 0.0385)):
         cube = box_hexahedra((0.015,) * 3, (2, 2, 2))
         bodies[name] = Body(replace(cube, vertices=cube.vertices + [0.01, y, 0.0109]))
-    pairs = {"pad": FrictionPair("b", "plate_rough", 0.6)}
+    pairs = {"pad": FrictionPair(first="b", second="plate_rough", friction=0.6)}
     contact = SurfaceContact(2e4, 0.2, pairs=pairs)
     slope = math.radians(25.0)
     options = {"gravity": (G * math.sin(slope), 0.0, -G * math.cos(slope)), "solver": FINE}
@@ -244,7 +245,10 @@ def test_regions_have_their_own_friction():
         {"surface_friction": torch.tensor([[0.2, 0.6]], dtype=torch.float64)},
         {"surface_friction": 1e-5},
     )
-    pairs = {"first": FrictionPair("plate", "b", 0.6), "second": FrictionPair("b", "plate_rough", 0.05)}
+    pairs = {
+        "first": FrictionPair(first="plate", second="b", friction=0.6),
+        "second": FrictionPair(first="b", second="plate_rough", friction=0.05),
+    }
     both = replace(simulator, body=Scene(bodies, SurfaceContact(2e4, 0.2, pairs=pairs)))
     swapped = dict(reversed(pairs.items()))
     other = replace(simulator, body=Scene(bodies, SurfaceContact(2e4, 0.2, pairs=swapped)))
@@ -253,9 +257,12 @@ def test_regions_have_their_own_friction():
     assert float(held) < 1e-3 < 0.1 < float(slides)  # the first pair that fits counts
     with pytest.raises(InputError, match="the pair 'pad' of a contact"):
         Simulator(Scene({"a": bodies["a"]}, contact))
-    with pytest.raises(InputError, match="surface_friction is -1"):
-        SurfaceContact(pairs={"pad": FrictionPair("a", "b", -1.0)})
-    for wrong in ([FrictionPair("a", "b", 1.0)], {"other": FrictionPair("a", "b", 1.0)}):
+    with pytest.raises(InputError, match=r"FrictionPair\.friction is -1\.0: it must be a number, zero or more"):
+        SurfaceContact(pairs={"pad": FrictionPair(first="a", second="b", friction=-1.0)})
+    for wrong in (
+        [FrictionPair(first="a", second="b", friction=1.0)],
+        {"other": FrictionPair(first="a", second="b", friction=1.0)},
+    ):
         with pytest.raises(InputError, match="by name, other than 'other'"):
             SurfaceContact(pairs=wrong)
     with pytest.raises(InputError, match=r"3 values for 2 coefficients \(other, pad\)"):

@@ -18,7 +18,7 @@ SIZE, DIVISIONS = (0.12, 0.02, 0.02), (6, 2, 2)
 BEAM = box_hexahedra(SIZE, DIVISIONS)
 SOFT = Corotated(264e3, 0.45, mass_damping=0.5)
 WEIGHTLESS = (0.0, 0.0, 0.0)
-TIGHT = SolverSettings("newton", relative_tolerance=1e-11)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-11)
 
 
 def route(height, count=7, depth=SIZE[1] / 2, length=SIZE[0]):
@@ -50,7 +50,7 @@ def test_an_offset_tendon_bends_a_beam_to_a_constant_curvature():
     ("solver", "linear"), [("newton", "dense"), ("quasi_newton", "banded"), ("projective_dynamics", "sparse")]
 )
 def test_a_winch_shortens_a_stiff_tendon_by_what_it_takes_in(solver, linear):
-    settings = SolverSettings(solver, relative_tolerance=1e-9, linear_solver=linear)
+    settings = SolverSettings(name=solver, relative_tolerance=1e-9, linear_solver=linear)
     sim = simulator(route(0.018), stiffness=2e4, solver=settings)
     assert bool(sim.step(sim.rest_state(), Inputs(tendon_contraction=2e-3)).converged.all())
     q = sim.static_equilibrium(Inputs(tendon_contraction=2e-3)).q[0].numpy()
@@ -78,7 +78,7 @@ ACROSS = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]  # a beam's tendons
 @pytest.mark.parametrize(("solver", "offset"), [("quasi_newton", (5e-3, 0.0)), ("projective_dynamics", (0.0, 5e-3))])
 def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
     """In a beam's cells shape functions are linear along each axis: an offset along one is exact."""
-    settings = SolverSettings(solver, relative_tolerance=1e-10)
+    settings = SolverSettings(name=solver, relative_tolerance=1e-10)
     tapering = np.linspace([0.0, 1.0, 0.0], [0.0, 0.2, 0.0], 7), np.linspace([0.0, 0.0, 0.1], [0.0, 0.0, 1.0], 7)
     drive = Inputs(tendon_tension=0.5, tendon_contraction=4e-3)
     tendons = Tendons([route(0.013, depth=0.013)], stiffness=2000.0, directions=[tapering])

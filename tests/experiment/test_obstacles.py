@@ -131,7 +131,7 @@ class TestSurfaces:
         pairs = "self_contact.pairs={pad: {first: lower, second: body, friction: 0.8}}"
         simulator = simulator_of(*ABOVE, pairs)
         (contact,) = simulator.body.energies
-        assert contact.pairs == {"pad": FrictionPair("lower", "body", 0.8)}
+        assert contact.pairs == {"pad": FrictionPair(first="lower", second="body", friction=0.8)}
         given = {"surface_friction_pad": torch.tensor([0.5, 0.6], dtype=torch.float64)}
         assert given.keys() <= {*identifiable_parameters(simulator)}
         assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.3, 0.5], [0.3, 0.6]]

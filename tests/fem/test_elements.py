@@ -144,7 +144,7 @@ def test_patch(name, model, integration):
     mesh = MESHES[name]
     boundary = surface_vertices(mesh)
     material = MATERIALS[model](1e5, 0.45, density=1000.0)
-    settings = SolverSettings("newton", relative_tolerance=1e-12, absolute_tolerance=1e-12)
+    settings = SolverSettings(name="newton", relative_tolerance=1e-12, absolute_tolerance=1e-12)
     body = Body(mesh, fixed=boundary, volume_integration=integration)
     simulator = Simulator(body, material, gravity=(0.0, 0.0, 0.0), solver=settings)
     f = np.eye(3) + 0.05 * np.random.default_rng(4).normal(size=(3, 3))

@@ -22,7 +22,7 @@ def finger():
 
 def ball():
     """A rigid body of other cells, free to fall."""
-    return Body.rigid_body(box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2), Rigid(900.0))
+    return Body.rigid_body(box_tetrahedra((0.02, 0.02, 0.02), (1, 1, 1), order=2), Rigid(density=900.0))
 
 
 def test_bodies_of_a_scene_move_as_each_alone():

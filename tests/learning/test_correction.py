@@ -128,7 +128,7 @@ def test_lost_environments_stand_at_rest_without_inputs(integrator):
 
 def at_rest(*stiffnesses):
     """The state of beams with springs (N/m) from their tips to the places of their tips at rest, and the force."""
-    s = Simulator(BODY, Corotated(1e5, 0.4), solver=SolverSettings("newton", 1e-12))
+    s = Simulator(BODY, Corotated(1e5, 0.4), solver=SolverSettings(name="newton", relative_tolerance=1e-12))
     k = torch.zeros(len(stiffnesses), len(MESH.vertices), 1, dtype=torch.float64)
     k[:, TIP] = torch.tensor(stiffnesses, dtype=torch.float64)[:, None, None]
 

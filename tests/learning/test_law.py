@@ -17,7 +17,7 @@ MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))
 TIP = select_vertices(MESH, x=0.08)
 STIFF = {"c10": 3e4, "bulk_1": 3e6}  # Pa, of the weight
 BODY = Body(MESH, fixed=select_vertices(MESH, x=0.0))
-TIGHT = SolverSettings("newton", relative_tolerance=1e-12)
+TIGHT = SolverSettings(name="newton", relative_tolerance=1e-12)
 UNIT = {
     "c10": 1e5,
     "c20": 1e5,

@@ -9,9 +9,9 @@ from scipy.optimize import brentq
 
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Simulator, box_hexahedra, select_vertices
 from warp_resphys.energies.contact.contact_points import vertex_areas
-from warp_resphys.energies.contact.obstacles import Capsule, Cylinder, Obstacle, Sphere
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher
+from warp_resphys.settings.contact import Capsule, Cylinder, Obstacle, Sphere
 
 G = 9.81
 KAPPA, D = 2e4, 1e-3  # Pa, m

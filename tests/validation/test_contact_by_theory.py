@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from support.contact import BLOCK, SOFT, WEIGHT, D, G, crossings_and_gap, distances, on_obstacles, resting_floor, solves
 from warp_resphys import Body, Mesh, Rigid, Scene, Simulator, SolverSettings, State, SurfaceContact, box_hexahedra
 from warp_resphys.energies.contact.contact_points import vertex_areas
-from warp_resphys.energies.contact.obstacles import Box, Capsule, Cylinder, HalfSpace, Sphere
 from warp_resphys.mesh.boxes import box_tetrahedra
 from warp_resphys.mesh.selection import select_vertices
+from warp_resphys.settings.contact import Box, Capsule, Cylinder, HalfSpace, Sphere
 
 SLIP = 1e-3  # v_s [m/s]
 AXIS = (0.3, -0.2, 0.9)

@@ -17,7 +17,6 @@ Journal of the Mechanics and Physics of Solids 56, 2008.
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
@@ -26,7 +25,7 @@ import torch
 from support.contact import pressure
 from warp_resphys import Body, Contact, Mesh, Simulator, StableNeoHookean, box_hexahedra
 from warp_resphys.energies.contact.contact_points import vertex_areas
-from warp_resphys.energies.contact.obstacles import Cylinder, Sphere
+from warp_resphys.settings.contact import Cylinder, Sphere
 
 YOUNG, POISSON = 264e3, 0.45  # Pa, -
 GROWTH = 1.4  # of the cells away from the contact, from one to the next
@@ -86,7 +85,7 @@ def press(obstacle, mesh, depths, distance, stiffness, device):
     Returns vertical forces [N] and distances [m] of the vertices, (N,), for every depth.
     """
     radius, deep = obstacle.radius, -float(mesh.vertices[:, 2].min())
-    obstacle = replace(obstacle, position=(0.0, 0.0, radius + distance))
+    obstacle = obstacle.changed(position=(0.0, 0.0, radius + distance))
     contact = Contact({"obstacle": obstacle}, stiffness, distance=distance)
     fixed = np.flatnonzero(mesh.vertices[:, 2] < -deep + 1e-9)
     rubber = StableNeoHookean(youngs_modulus=YOUNG, poissons_ratio=POISSON, density=1070.0)

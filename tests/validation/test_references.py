@@ -22,7 +22,7 @@ def test_every_solver_reproduces_a_reference(name, solver, reference_data, devic
     body = Body(mesh, select_vertices(mesh, x=vertices[:, 0].min()), mass="per_vertex", volume_integration="full")
     material = Corotated(**{key: float(given[key]) for key in ("youngs_modulus", "poissons_ratio", "density")})
     # Each solver then stays within a tenth of the bound.
-    settings = SolverSettings(solver, relative_tolerance=1e-7, max_iterations=50_000)
+    settings = SolverSettings(name=solver, relative_tolerance=1e-7, max_iterations=50_000)
     simulator = Simulator(body, material, float(given["dt"]), given["gravity"], solver=settings, device=device)
     q, v, force = (simulator.tensor(given[key]) for key in ("q", "v", "f_ext"))
     with torch.no_grad():

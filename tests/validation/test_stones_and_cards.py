@@ -46,7 +46,7 @@ def arch(stones, friction):
         along = np.array([-math.sin(middle), 0.0, math.cos(middle)])
         x -= np.outer(x @ along, along) * gap / (angle * RADIUS)
         contact = Contact(floor, kappa, friction, distance)
-        bodies[f"stone{k}"] = Body.rigid_body(replace(brick, vertices=x), Rigid(DENSITY), energies=[contact])
+        bodies[f"stone{k}"] = Body.rigid_body(replace(brick, vertices=x), Rigid(density=DENSITY), energies=[contact])
     return Scene(bodies, SurfaceContact(kappa, friction, distance))
 
 
@@ -77,7 +77,7 @@ def house(degrees, storeys, friction):
         u, y, v = brick.vertices.T
         x, z = (corners[0] + np.outer(u, corners[1] - corners[0]) + np.outer(v, corners[3] - corners[0])).T
         card = replace(brick, vertices=np.stack([x, y, z], 1))
-        bodies[f"card{k}"] = Body.rigid_body(card, Rigid(DENSITY), energies=[ground])
+        bodies[f"card{k}"] = Body.rigid_body(card, Rigid(density=DENSITY), energies=[ground])
     return Scene(bodies, SurfaceContact(kappa, friction, GAP))
 
 

@@ -27,7 +27,6 @@ from scipy.spatial.transform import Rotation
 
 from support.contact import G, crossings_and_gap, solves
 from warp_resphys import Contact, Corotated, Inputs, Scene, Simulator, SolverSettings, StableNeoHookean, SurfaceContact
-from warp_resphys.energies.contact.obstacles import Cylinder, HalfSpace
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.tendons import Tendons
@@ -37,6 +36,7 @@ from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.rod import rod
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.mesh.volume_mesh import Mesh
+from warp_resphys.settings.contact import Cylinder, HalfSpace
 
 _SIDE = 0.1  # of Erleben's bodies [m]
 _GAP = 0.05  # that the upper one falls [m]

@@ -15,6 +15,7 @@ from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import InputError
 from ..linalg.threads import shards_of
+from ..settings.body import SolverSettings
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
 from ..stepping.integrators import make_integrator
@@ -22,7 +23,6 @@ from ..stepping.quantity import Quantity
 from ..stepping.state import Constants, State
 from .assembly import BlockPattern
 from .energy_set import EnergySet, Materials, place_energies
-from .nonlinear_solver import SolverSettings
 from .workspace import Workspace
 
 _GRAVITY = Quantity("gravity", "m/s^2", per="axis")

@@ -11,11 +11,11 @@ from typing_extensions import override
 from ..energies.potential import IncrementalPotential, StepTerms
 from ..io.errors import ConvergenceError
 from ..linalg.threads import in_threads, threads_for
+from ..settings.body import SolverSettings
 from ..stepping.adjoints import AdjointFunction, first_derivatives
 from ..stepping.state import SolveReport
 from .hessian import ExactHessian
 from .minimiser import Minimiser
-from .nonlinear_solver import SolverSettings
 from .workspace import Workspace
 
 P = TypeVar("P")

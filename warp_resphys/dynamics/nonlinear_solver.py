@@ -20,59 +20,24 @@ Kernels make all decisions for an environment (`minimiser`); the host launches t
 that does both.
 """
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 
 from ..energies.launcher import struct_of
 from ..energies.potential import IncrementalPotential
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError
 from ..kernels.minimisation import NEVER, Tolerances
-from ..linalg.choice import LINEAR_SOLVERS, make_linear_solver
+from ..linalg.choice import make_linear_solver
+from ..settings.body import SolverName, SolverSettings
 from ..stepping.state import SolveReport
 from .assembly import BlockPattern
 from .hessian import ExactHessian, ProjectiveHessian
 from .minimiser import Minimiser
 
-SolverName = Literal["projective_dynamics", "quasi_newton", "newton"]
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
-FACTORS = ("double", "single")
-_PATIENCE = 3  # by which `SolverSettings.refactor_after` is multiplied where factors are kept
-
-
-@dataclass(frozen=True)
-class SolverSettings:
-    """Settings of the nonlinear solver."""
-
-    name: str = "quasi_newton"  # one of `SOLVERS`
-    # residual over balancing forces at which a solve has converged; below 1e-5 no gain for float32 states
-    relative_tolerance: float = 1e-8
-    absolute_tolerance: float = 1e-12  # residual at which a solve has converged in any case [N]
-    max_iterations: int = 2000  # iterations after which a solve has failed
-    memory: int = 12  # number of L-BFGS pairs
-    refactor_after: int = 4  # iterations of a step above which ``quasi_newton`` refactorises
-    linear_solver: str = "auto"  # ``auto``, ``banded``, ``tiled``, ``dense``, ``sparse`` or ``pardiso``
-    factors: str = "double"  # or ``single``: factors and L-BFGS pairs in float32; see ``factors`` in docs/settings.md
-    on_failure: str = "raise"  # ``raise`` a `ConvergenceError`, or ``count`` the failure in the report and continue
-
-    def __post_init__(self) -> None:
-        """Raises InputError for an unknown name or a number out of range."""
-        if self.name not in SOLVERS:
-            raise InputError(f"solver is {self.name!r}: choose one of {', '.join(SOLVERS)}.")
-        if self.on_failure not in ("raise", "count"):
-            raise InputError(f"solver.on_failure is {self.on_failure!r}: choose raise or count.")
-        if self.factors not in FACTORS:
-            raise InputError(f"solver.factors is {self.factors!r}: choose {' or '.join(FACTORS)}.")
-        if self.linear_solver not in LINEAR_SOLVERS:
-            raise InputError(
-                f"solver.linear_solver is {self.linear_solver!r}: choose one of {', '.join(LINEAR_SOLVERS)}."
-            )
-        for key in ("relative_tolerance", "max_iterations", "memory", "refactor_after"):
-            if not getattr(self, key) > 0:
-                raise InputError(f"solver.{key} is {getattr(self, key)}: it must be positive.")
-        if not self.absolute_tolerance >= 0:
-            raise InputError(f"solver.absolute_tolerance is {self.absolute_tolerance}: it must be zero or more.")
+_REFACTOR_AFTER = 4  # iterations of a step above which ``quasi_newton`` refactorises
+_PATIENCE = 3  # by which it is multiplied where factors are kept
 
 
 def check_converged(settings: SolverSettings, report: SolveReport | None, positions: torch.Tensor) -> None:
@@ -108,7 +73,7 @@ def make_minimiser(
     blocks = (pattern.rows, pattern.cols, len(pattern.free), 1 if projective else 3)
     linear = make_linear_solver(settings.linear_solver, *blocks, potential.device, factors)
     hessian = (ProjectiveHessian if projective else ExactHessian)(potential, pattern, linear)
-    quasi = settings.refactor_after * (_PATIENCE if linear.keeps_factors else 1)
+    quasi = _REFACTOR_AFTER * (_PATIENCE if linear.keeps_factors else 1)
     after = {"newton": 0, "quasi_newton": quasi, "projective_dynamics": NEVER}[settings.name]
     tolerances = struct_of(
         Tolerances,

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacles import HalfSpace
 from ..energies.materials import Material
 from ..fem.bodies import Body
 from ..fem.integration_points import volume_points
@@ -18,6 +17,7 @@ from ..io.errors import InputError, warn
 from ..mesh.quality import scaled_jacobian
 from ..mesh.readers import LONGEST_DIAGONAL, SHORTEST_DIAGONAL
 from ..mesh.volume_mesh import Mesh
+from ..settings.contact import HalfSpace
 
 SOFTEST: Final = 1e3  # Pa, of gels
 UNLIKELY: Final = (1e8, 1e9)  # Pa, stiffer than rubbers and softer than the plastics that hard parts are made of

@@ -11,6 +11,8 @@ from ..energies.materials import Corotated, Material
 from ..fem.bodies import Body
 from ..io.errors import InputError
 from ..io.machine import find_device
+from ..io.settings import parse
+from ..settings.body import SolverSettings
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.rollout import rollout
 from ..stepping.state import Constants, State
@@ -18,7 +20,7 @@ from .energy_set import Materials, joined_names
 from .equations import EquationsOfMotion, check_count
 from .linearisation import Linearisation
 from .mesh_error import CHECKED, warn_of_cells
-from .nonlinear_solver import SolverSettings, check_converged
+from .nonlinear_solver import check_converged
 from .plausibility import warn_of_implausible
 from .statics import SHIFT, StaticEquilibrium, friction_holds
 from .time_step import TimeStep
@@ -96,9 +98,10 @@ class Simulator:
 
     def _build(self) -> None:
         self.device = find_device(self.device)
-        settings = SolverSettings(name=self.solver) if isinstance(self.solver, str) else self.solver
+        chosen = {"name": self.solver} if isinstance(self.solver, str) else self.solver
+        settings = parse(SolverSettings, chosen, "solver")
         tolerance = self.relative_tolerance
-        self.settings = settings if tolerance is None else replace(settings, relative_tolerance=tolerance)
+        self.settings = settings if tolerance is None else settings.changed(relative_tolerance=tolerance)
         where = (self.gravity, self.time_step, self.integrator, self.settings, self.device, self.dtype)
         self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
         self.method, self.rest_positions, self.fixed = equations.method, equations.rest_positions, equations.fixed

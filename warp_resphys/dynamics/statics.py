@@ -88,7 +88,7 @@ class StaticEquilibrium(TimeStep):
         """Returns the equilibrium (B, N, 3) [m] under a share of loads, inputs and the motion of the fixed vertices."""
         equations, workspace = self.equations, self.workspace
         most = min(equations.settings.max_iterations, _MOST_ITERATIONS)
-        settings = replace(equations.settings, name="newton", on_failure="raise", max_iterations=most)
+        settings = equations.settings.changed(name="newton", on_failure="raise", max_iterations=most)
         terms, fixed = self.terms(share, near), self.fixed_positions(share)
         with _progress_of(workspace.parts[0][1].potential, share, most):
             x, report = equilibrium(workspace, "statics", settings, terms, start, fixed)

@@ -18,10 +18,11 @@ from ..kernels.lbfgs import lbfgs_kernels
 from ..kernels.modules import compile_together
 from ..linalg.choice import make_linear_solver
 from ..linalg.linear_solver import LinearSolver
+from ..settings.body import SolverSettings
 from .assembly import BlockPattern
 from .hessian import ExactHessian
 from .minimiser import Minimiser
-from .nonlinear_solver import SolverSettings, make_minimiser
+from .nonlinear_solver import make_minimiser
 
 T = TypeVar("T")
 Shard = tuple[slice, "Workspace"]

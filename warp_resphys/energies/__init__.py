@@ -1,15 +1,15 @@
 """Energies of a body: materials, actuators, contact and surroundings."""
 
+from ..settings.contact import Box as Box
+from ..settings.contact import Capsule as Capsule
+from ..settings.contact import FrictionPair as FrictionPair
+from ..settings.contact import Sphere as Sphere
 from ..stepping.quantity import Quantity as Quantity
 from ..stepping.quantity import parameter as parameter
 from .base import Energy as Energy
 from .catalogue import make_material as make_material
 from .catalogue import share_outside_law as share_outside_law
-from .contact.obstacles import Box as Box
-from .contact.obstacles import Capsule as Capsule
 from .contact.obstacles import DistanceGrid as DistanceGrid
-from .contact.obstacles import Sphere as Sphere
-from .contact.surface_contact import FrictionPair as FrictionPair
 from .convex_material import ConvexMaterial as ConvexMaterial
 from .convex_material import FibreFamily as FibreFamily
 from .materials import DensityMaterial as DensityMaterial

@@ -21,12 +21,13 @@ import warp as wp
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from ..fem.bodies import Body, Rigid
+from ..fem.bodies import Body
 from ..fem.coordinates import barycentric, weighted_sum
 from ..fem.integration_points import Points, SolidPoints, volume_points
 from ..kernels import vertex_rotations as kernels
 from ..kernels.axial import INERTIA
 from ..mesh.volume_mesh import Mesh
+from ..settings.body import Rigid
 from ..stepping.quantity import Parameter, parameter
 from ..stepping.state import Mass
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep

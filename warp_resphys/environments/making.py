@@ -17,9 +17,8 @@ from ..control.sampling import driven_input
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
 from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacles import HalfSpace
 from ..energies.contact.surface_contact import SurfaceContact
-from ..fem.bodies import Body, Rigid
+from ..fem.bodies import Body
 from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.boxes import box_hexahedra
@@ -28,6 +27,8 @@ from ..robot.actuation import BASE, Given
 from ..robot.loading import load
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
+from ..settings.body import Rigid
+from ..settings.contact import HalfSpace
 from ..stepping.rollout import states
 from ..stepping.state import State
 from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
@@ -61,7 +62,7 @@ def gripper(robot: Robot) -> RobotScene:
     ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, table + _RADIUS + 0.9 * _DISTANCE])
     below = Contact({"table": HalfSpace(position=(0.0, 0.0, table))}, _STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
     density = _MASS / float(Body(ball).discretisation.element_volumes.sum())
-    things = {BALL: Body.rigid_body(ball, Rigid(density, _YOUNGS_MODULUS), energies=[below])}
+    things = {BALL: Body.rigid_body(ball, Rigid(density=density, stiffness=_YOUNGS_MODULUS), energies=[below])}
     contact = SurfaceContact(_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
     return RobotScene(robots, things, contact, _TOLERANCE)
 

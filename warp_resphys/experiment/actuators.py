@@ -1,6 +1,6 @@
 """Energies of a configured body: actuators, the input that drives them, a fluid, and contact with obstacles."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final, cast
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..energies.base import Energy
 from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacles import Box, Capsule, Cylinder, DistanceGrid, HalfSpace, Obstacle, Sphere
-from ..energies.contact.surface_contact import FrictionPair, SurfaceContact
+from ..energies.contact.obstacles import DistanceGrid
+from ..energies.contact.surface_contact import SurfaceContact
 from ..energies.fibres import Fibres
 from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
@@ -26,17 +26,10 @@ from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.selection import select_cells, select_vertices
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
+from ..settings.contact import SurfaceFile
 from ..settings.mesh import PlaceSettings
 from ..stepping.quantity import Quantity
 
-_SHAPES: Final[Mapping[str, Callable[..., Obstacle]]] = {
-    "half_space": HalfSpace,
-    "sphere": Sphere,
-    "capsule": Capsule,
-    "cylinder": Cylinder,
-    "box": Box,
-    "surface": DistanceGrid.from_file,
-}
 # Driving input by group and the value of its key ``commanded``.
 _COMMANDED: Final[Mapping[str, Mapping[str, Quantity]]] = {
     "tendons": {"tension": TENSION, "contraction": CONTRACTION},
@@ -80,8 +73,7 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
     if settings.obstacles:
         energies.append(build_contact(settings))
     if settings.self_contact is not None:
-        pairs = {name: FrictionPair(**dict(pair)) for name, pair in settings.self_contact.pairs.items()}
-        energies.append(SurfaceContact(**dict(settings.self_contact) | {"pairs": pairs}))
+        energies.append(SurfaceContact(**dict(settings.self_contact)))
     return energies + list(own_energies(settings).values())
 
 
@@ -216,10 +208,10 @@ def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:
 
 def build_contact(settings: BodySettings) -> Contact:
     """Builds the contact of a body with its ``obstacles``."""
-    obstacles = {}
-    for name, obstacle in settings.obstacles.items():
-        own = dict(obstacle)
-        obstacles[name] = _SHAPES[own.pop("shape")](**own)
+    obstacles = {
+        name: DistanceGrid.from_file(**obstacle.arguments()) if isinstance(obstacle, SurfaceFile) else obstacle
+        for name, obstacle in settings.obstacles.items()
+    }
     return Contact(obstacles, **dict(settings.contact))
 
 

@@ -18,12 +18,11 @@ from numpy.typing import ArrayLike
 from ..data.marker_view import MarkerView
 from ..data.markers import BoundMarkers, JoinedMarkers, Markers, bind_markers, follow_vertices
 from ..data.rigid_bodies import arms, corners_of
-from ..dynamics.nonlinear_solver import SolverSettings
 from ..dynamics.plausibility import check_weight
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import make_material
 from ..energies.materials import Material
-from ..fem.bodies import Body, Glue, Rigid
+from ..fem.bodies import Body, Glue
 from ..fem.coordinates import SymmetryPlane
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import digest
@@ -212,11 +211,10 @@ def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) 
     mesh = _with_regions(mesh, settings)
     energies = build_actuators(settings, mesh, payload_at)
     fixed = () if settings.fixed is None else select_vertices(mesh, **settings.fixed.arguments())
-    rigid = {name: Rigid(**dict(part)) for name, part in settings.rigid.items()}
     glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
     planes = _symmetry_planes(settings.symmetry)
-    physics = dict(settings.physics)
-    return Body(mesh, energies=tuple(energies), fixed=fixed, rigid=rigid, glued=glued, symmetry=planes, **physics)
+    more = {"rigid": settings.rigid, "glued": glued, "symmetry": planes, **dict(settings.physics)}
+    return Body(mesh, energies=tuple(energies), fixed=fixed, **more)
 
 
 def _symmetry_planes(settings: SymmetrySettings | None) -> list[SymmetryPlane]:
@@ -367,14 +365,14 @@ def build_simulator(
     Raises:
         InputError: a value cannot be simulated.
     """
-    solver = dict(settings.solver) | ({} if on_failure is None else {"on_failure": on_failure})
+    solver = settings.solver if on_failure is None else settings.solver.changed(on_failure=on_failure)
     simulator = Simulator(
         build_body(settings, payload_at) if body is None else body,
         build_material(material, "simulation"),
         time_step=settings.time_step,
         gravity=settings.gravity,
         integrator=settings.integrator,
-        solver=SolverSettings(**solver),
+        solver=solver,
         device=simulation_device(settings.device),
     )
     for made in simulator.materials.values():

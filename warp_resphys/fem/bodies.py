@@ -15,27 +15,11 @@ from ..io.errors import InputError
 from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
+from ..settings.body import Rigid
 from .coordinates import Coordinates, SymmetryPlane, dependence, rigid_weights
 from .integration_points import Discretisation, Points, discretise
 
 MASS_MODES = ("row_sum", "per_vertex")
-
-
-@dataclass(frozen=True)
-class Rigid:
-    """A nearly rigid region of a mesh, such as an end cap, a base plate or an insert.
-
-    Raises:
-        InputError: a stiffness that is not positive.
-    """
-
-    density: float | Sequence[float] | Any = 1200.0  # [kg/m^3], a number or (B, 1) values
-    stiffness: float = 1e9  # kappa of the energy kappa V |F - R(F)|^2 [Pa]
-
-    def __post_init__(self) -> None:
-        """Checks the stiffness."""
-        if not (np.isfinite(self.stiffness) and self.stiffness > 0.0):
-            raise InputError(f"the stiffness of a rigid part is {self.stiffness:g}: it must be positive, in Pa.")
 
 
 @dataclass(frozen=True)

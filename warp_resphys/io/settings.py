@@ -13,7 +13,8 @@ integers are accepted as floating-point numbers, and lists become tuples. Relati
 dotted key.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -36,6 +37,8 @@ Some = Annotated[tuple[T, ...], Strict(False), Field(min_length=1)]  # a list of
 Pair = Annotated[tuple[T, T], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 
+_KIND = ("kind", "shape")  # keys that choose among classes
+
 
 class Settings(BaseModel):
     """Base of all settings classes. Objects are immutable and compared by content."""
@@ -44,12 +47,27 @@ class Settings(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
     )
 
+    def __init__(self, /, **values: Any) -> None:
+        """Checks the keys.
+
+        Raises:
+            InputError: as `parse`; the message names the class.
+        """
+        with _in_words(type(self), values, type(self).__name__):
+            self.__pydantic_validator__.validate_python(values, self_instance=self)
+
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined] # Groups within others are not made by it.
+
     def __hash__(self) -> int:  # Of other orders as well, as bodies are cached by it.
         return hash(self.model_dump_json())
 
     def plain(self) -> dict[str, Any]:
         """Returns nested data of JSON types."""
         return self.model_dump(mode="json", by_alias=True)
+
+    def arguments(self) -> dict[str, Any]:
+        """Returns the keys that are not null and choose no kind, as arguments of a function."""
+        return {name: value for name, value in dict(self).items() if value is not None and name not in _KIND}
 
     def content(self) -> Any:
         """Returns the data that a fingerprint covers, of JSON types: all keys."""
@@ -65,7 +83,7 @@ class Settings(BaseModel):
         Raises:
             InputError: an invalid value.
         """
-        return parse(type(self), {**dict(self), **values})
+        return type(self)(**{**dict(self), **values})
 
     @classmethod
     def of(cls, source: "Settings", **values: Any) -> Self:
@@ -112,8 +130,15 @@ def parse(settings: type[S], values: Any, where: str = "") -> S:
         InputError: an unknown or missing key, a value of another type or out of range, or values that contradict each
             other. The message has the dotted key, the value, and what it must be.
     """
-    try:
+    with _in_words(settings, values, where):
         return settings.model_validate(values)
+
+
+@contextmanager
+def _in_words(settings: type[Settings], values: Any, where: str) -> Iterator[None]:
+    """Raises one sentence in place of an error of pydantic; see `parse`."""
+    try:
+        yield
     except ValidationError as error:
         schema = settings.model_json_schema()
         raise InputError(sentence(schema, values, where, error.errors(include_url=False))) from None

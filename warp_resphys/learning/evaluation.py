@@ -125,7 +125,7 @@ def roll_out(
         steps at which trials left the training range, -1 where they did not; ``film`` (K + 1, N, 3) vertices [m].
     """
     data_driven = isinstance(force, Learned) and force.replaces_simulator
-    simulator = replace(simulator, solver=replace(simulator.settings, on_failure="count"))
+    simulator = replace(simulator, solver=simulator.settings.changed(on_failure="count"))
     run, points, bodies = TrialRollout(simulator, motions, names, identified, data_driven), [], list[torch.Tensor]()
     predictor = run.predictor(force) if isinstance(force, Learned) else force
     for state in run.roll(predictor):

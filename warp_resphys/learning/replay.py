@@ -39,7 +39,7 @@ _EXACT = 1e-12  # relative tolerance of a solver, small enough for differences o
 
 def exact(simulator: Simulator) -> Simulator:
     """Returns a simulator whose solutions differ by their parameters alone, also where these hardly differ."""
-    return replace(simulator, solver=replace(simulator.settings, relative_tolerance=_EXACT))
+    return replace(simulator, solver=simulator.settings.changed(relative_tolerance=_EXACT))
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,13 @@ beam of 8-node hexahedra       91,368                 1.1, 0.03     104, 0.3
 =============================  ========  ===========  ============  ===========
 """
 
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 
 from ..io.errors import InputError
 from ..kernels.tiled_cholesky import TILE
+from ..settings.body import LinearSolverName
 from .banded import BandedSolver, BorderedSolver, banded_rest, hubs
 from .cholmod import SparseSolver
 from .dense import DenseSolver
@@ -29,7 +30,6 @@ from .linear_solver import Indices, LinearSolver, bandwidth
 from .pardiso import PardisoSolver, has_pardiso
 from .tiled import TiledSolver
 
-LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"]
 LINEAR_SOLVERS: tuple[LinearSolverName, ...] = get_args(LinearSolverName)
 MAX_BANDED_FLOPS = 4e10  # multiplications of a banded factor on a CPU above which CHOLMOD is cheaper
 MAX_SMALL_FLOPS = 5e8  # multiplications of a banded factor up to which no other one is cheaper

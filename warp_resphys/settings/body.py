@@ -7,8 +7,11 @@ from typing_extensions import override
 
 from ..io.classes import ClassSettings, package_of
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
-from .mesh import BoxSettings, Curve, Direction, Divisions, LengthUnit, MeshSettings, PlaceSettings, SymmetrySettings
+from .contact import ContactSettings, ObstacleSettings, SurfaceContactSettings
+from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
 
+SolverName = Literal["quasi_newton", "newton", "projective_dynamics"]
+LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"]
 Integrator = Literal["implicit_euler", "bdf2", "midpoint"]
 TimeStep = Annotated[float, Field(gt=0.0, le=10.0)]
 OwnEnergies = Annotated[
@@ -105,11 +108,11 @@ class MaterialSettings(_Parameters):
         }
 
 
-class RigidSettings(Settings):
-    """A rigid region, such as an end cap or an insert, by `fem.bodies.Rigid`."""
+class Rigid(Settings):
+    """A nearly rigid region of a mesh, such as an end cap, a base plate or an insert."""
 
     density: Positive = setting(1200.0, unit="kg/m^3")
-    stiffness: Positive = setting(1.0e9, "stiffness of the energy that penalises deformation", "Pa")
+    stiffness: Positive = setting(1.0e9, "kappa of the energy kappa V |F - R(F)|^2, which penalises deformation", "Pa")
 
 
 class PartSettings(Settings):
@@ -229,108 +232,19 @@ class StringSettings(Settings):
     toe: Positive = setting(1.0e-5, "elongation over which it becomes taut", "m")
 
 
-class SolveSettings(Settings):
+class SolverSettings(Settings):
     """Settings of the solver of a step, `dynamics.nonlinear_solver`."""
 
-    name: Literal["quasi_newton", "newton", "projective_dynamics"] = setting("quasi_newton", "method")
+    name: SolverName = setting("quasi_newton", "method")
     relative_tolerance: Annotated[float, Field(gt=0.0, le=0.1)] = setting(1.0e-8, "residual over the forces in balance")
     absolute_tolerance: NotNegative = setting(1.0e-12, "residual at which a step is always solved", "N")
     max_iterations: Natural = setting(500, "iterations after which a step fails")
     memory: Natural = setting(12, "number of pairs that L-BFGS keeps")
-    linear_solver: Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"] = setting(
-        "auto", "linear solver; pardiso needs a CPU"
-    )
+    linear_solver: LinearSolverName = setting("auto", "linear solver; pardiso needs a CPU")
     factors: Literal["double", "single"] = setting(
         "double", "precision of factors and L-BFGS pairs; results stay accurate"
     )
     on_failure: Literal["raise", "count"] = setting("raise", "effect of a failed step; count continues")
-
-
-class _Placed(Settings):
-    position: Vector = setting((0.0, 0.0, 0.0), "position of its centre; of a half-space, a point of its plane", "m")
-    axis: Direction = setting((0.0, 0.0, 1.0), "direction of its z axis: a half-space's normal, a cylinder's axis")
-    moves: bool = setting(False, "moves by `data.obstacle_motion` or inputs of a robot")
-
-
-class HalfSpaceSettings(_Placed):
-    """All points below a plane, such as a floor."""
-
-    shape: Literal["half_space"]
-
-
-class SphereSettings(_Placed):
-    """A sphere."""
-
-    shape: Literal["sphere"]
-    radius: Positive = setting(unit="m")
-
-
-class CapsuleSettings(_Placed):
-    """All points within a radius of a segment."""
-
-    shape: Literal["capsule"]
-    radius: Positive = setting(unit="m")
-    length: Positive = setting(description="length along its axis, without the half-spheres", unit="m")
-
-
-class CylinderSettings(_Placed):
-    """A cylinder with flat ends."""
-
-    shape: Literal["cylinder"]
-    radius: Positive = setting(unit="m")
-    length: Positive = setting(description="length along its axis", unit="m")
-
-
-class CuboidSettings(_Placed):
-    """A cuboid with edges along the axes of the world, unless its axis turns it."""
-
-    shape: Literal["box"]
-    edges: Annotated[tuple[Positive, Positive, Positive], Field(strict=False)] = setting(
-        description="their lengths", unit="m"
-    )
-
-
-class SurfaceSettings(_Placed):
-    """The interior of a closed surface, by its distances on a grid."""
-
-    shape: Literal["surface"]
-    path: Word = setting(description="path of an STL, OBJ or PLY file; its z axis is along `axis`")
-    units: LengthUnit = setting("mm", "unit of the file")
-    spacing: Positive = setting(1.0e-3, "spacing of the grid, which rounds edges", "m")
-
-
-ObstacleSettings = Annotated[
-    HalfSpaceSettings | SphereSettings | CapsuleSettings | CylinderSettings | CuboidSettings | SurfaceSettings,
-    Field(discriminator="shape"),
-]
-
-
-class FrictionPairSettings(Settings):
-    """Friction between two regions of the mesh, or within one, by `energies.contact.surface_contact.FrictionPair`."""
-
-    first: Word = setting(description="name of a region")
-    second: Word = setting(description="name of a region, which may be the same")
-    friction: NotNegative = setting(description="coefficient of friction")
-
-
-class SurfaceContactSettings(Settings):
-    """Contact of the body with itself, and of its parts with one another, by `energies.contact.surface_contact`."""
-
-    stiffness: Positive = setting(1.0e5, "stiffness of the barrier", "Pa")
-    friction: NotNegative = setting(0.0, "coefficient of friction")
-    distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
-    slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
-    pairs: dict[str, FrictionPairSettings] = setting({}, "friction of pairs of regions, by name, the first that fits")
-
-
-class ContactSettings(Settings):
-    """Contact of the body with its obstacles, by `energies.contact.obstacle_contact`."""
-
-    stiffness: Positive | dict[str, Positive] = setting(1.0e5, "stiffness of the barrier, or one per obstacle", "Pa")
-    friction: NotNegative | dict[str, NotNegative] = setting(0.0, "coefficient, or one per obstacle")
-    distance: Positive = setting(1.0e-3, "gap at which contact begins", "m")
-    slip_speed: Positive = setting(1.0e-3, "speed at which friction is fully developed", "m/s")
-    friction_factors: dict[str, NotNegative] = setting({}, "factors of the friction of regions of the mesh, by name")
 
 
 class BodySettings(Settings):
@@ -341,7 +255,7 @@ class BodySettings(Settings):
     parts: dict[str, PartSettings] = setting({}, "further meshes; the cells of the first one are the region 'body'")
     glued: Many[GlueSettings] = setting((), "glue between meshes that do not match")
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
-    rigid: dict[str, RigidSettings] = setting({}, "rigid regions")
+    rigid: dict[str, Rigid] = setting({}, "rigid regions")
     fixed: PlaceSettings | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
     symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
@@ -394,5 +308,5 @@ class SimulatorSettings(SteppedSettings):
     """Settings of a simulator, without the material."""
 
     gravity: Vector = setting((0.0, 0.0, -9.80709), "acceleration of gravity", "m/s^2")
-    solver: SolveSettings = SolveSettings()
+    solver: SolverSettings = SolverSettings()
     device: Word = setting("auto", "cpu, cuda or auto, which uses CUDA for training if available")

@@ -1,6 +1,6 @@
 """Settings of meshes, and of places and cells on them."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -29,13 +29,7 @@ Span = Annotated[Pair[float], AfterValidator(_rising)]
 Curve = Annotated[Many[Vector], Field(min_length=2)]
 
 
-class _Given(Settings):
-    def arguments(self) -> dict[str, Any]:
-        """Returns the keys that are not null, as arguments of a function."""
-        return {key: value for key, value in dict(self).items() if value is not None}
-
-
-class PlaceSettings(_Given):
+class PlaceSettings(Settings):
     """Vertices on a plane, or between two planes."""
 
     x: float | Span | None = setting(None, "coordinate, or two between which the vertices lie", "m")
@@ -44,7 +38,7 @@ class PlaceSettings(_Given):
     tolerance: Positive | None = setting(None, "largest distance from the plane; null: 1e-9", "m")
 
 
-class SymmetrySettings(_Given):
+class SymmetrySettings(Settings):
     """Symmetry planes: the mesh is one side of them, and its vertices in a plane only move within it."""
 
     x: float | None = setting(None, "position of the plane normal to x; null: none", "m")
@@ -53,7 +47,7 @@ class SymmetrySettings(_Given):
     tolerance: Positive = setting(1e-9, "largest distance of a vertex in a plane", "m")
 
 
-class BoxSettings(_Given):
+class BoxSettings(Settings):
     """Cells with their centres in a box."""
 
     x: Span | None = setting(None, "lowest and highest x; null: any", "m")

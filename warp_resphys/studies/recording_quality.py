@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import matplotlib as mpl
 import numpy as np
@@ -52,10 +52,6 @@ class RecordingFile(Settings):
     labels: Many[Word] | None = None
     bag: BagSettings | None = None
     table: TableSettings | None = None
-
-    def arguments(self) -> tuple[Any, ...]:
-        """Returns the arguments of `read_recording` after the path."""
-        return self.units, self.rate, self.labels, self.table, self.bag
 
 
 class RecordingInspection(Settings):
@@ -137,10 +133,11 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     if settings.compare_with and len(still) < 2:
         raise InputError("compare_with needs two or more markers on the base to compare: name them in still.")
     configured = settings.recording.arguments()
-    recording = read_recording(str(settings.recording.path), *configured)
+    recordings = [str(settings.recording.path), *settings.compare_with]
+    recording, *others = [read_recording(**{**configured, "path": path}) for path in recordings]
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
-    trials = [recording, *(read_recording(path, *configured) for path in settings.compare_with)]
+    trials = [recording, *others]
     moved = zip(trials[1:], *compare_base(trials, still), strict=True) if len(trials) > 1 else ()
     motions = [(trial.source, _MILLI * shift, _MILLI * distortion) for trial, shift, distortion in moved]
     figure = recording_quality(recording, result)
@@ -225,7 +222,7 @@ def convert(settings: Conversion, folder: Path) -> None:
     for path, place in places.items():
         if place.exists() and place.samefile(path):
             raise InputError(f"{path} would be replaced by itself: choose another folder, as in to=converted.")
-        recording = read_recording(path, *settings.recording.arguments())
+        recording = read_recording(**{**settings.recording.arguments(), "path": path})
         write_recording(place, recording)
         frames, channels = len(recording.positions), recording.actuation
         inputs = "" if channels is None else f", inputs {channels.shape[1]}"

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from ...io.errors import InputError
+from ...settings.contact import Obstacle
 from .obstacle_poses import ObstacleSet, Pose
-from .obstacles import DistanceGrid, Obstacle
+from .obstacles import DistanceGrid
 
 log = logging.getLogger(__name__)
 

@@ -36,6 +36,7 @@ from typing_extensions import override
 from ...fem.integration_points import Points
 from ...io.errors import InputError, listed
 from ...mesh.volume_mesh import Mesh
+from ...settings.contact import Obstacle
 from ...stepping.quantity import Parameter, Quantity
 from ...stepping.rotations import rotations
 from ...stepping.state import State
@@ -58,7 +59,7 @@ from .contact_points import (
 )
 from .obstacle_poses import ObstacleMotion, ObstacleSet, Pose
 from .obstacle_term import ContactTerm
-from .obstacles import DistanceGrid, Obstacle
+from .obstacles import DistanceGrid
 
 
 @dataclass(frozen=True)

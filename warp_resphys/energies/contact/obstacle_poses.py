@@ -12,9 +12,10 @@ from typing_extensions import override
 from ...io.arrays import FloatArray
 from ...kernels.contact import signed_distances as kernels
 from ...mesh.motion_files import MovingSurface
+from ...settings.contact import Obstacle
 from ...stepping.adjoints import AdjointFunction, first_derivatives
 from ..launcher import Launcher, struct_of, warp_view
-from .obstacles import DistanceGrid, Obstacle, surface_of
+from .obstacles import KINDS, DistanceGrid, surface_of
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class ObstacleSet:
         ]
         low = [(0.0,) * 3 if grid is None else grid.low for grid in grids]
         arrays = {
-            "kind": np.array([o.kind for o in obstacles], dtype=np.int32),
+            "kind": np.array([KINDS[type(o)] for o in obstacles], dtype=np.int32),
             "size": np.array([o.size for o in obstacles]),
             "low": np.array(low),
             "nodes": np.array(nodes, dtype=np.int32),

@@ -8,11 +8,11 @@ import warp as wp
 from typing_extensions import override
 
 from ...kernels.contact import barriers as kernels
+from ...settings.contact import Obstacle
 from ..launcher import Launcher, struct_of, warp_view
 from ..term import Adjoint, PointSet, Term
 from .contact_points import FRICTION, FRICTION_VALUES, GROWTH, POSE, STIFFNESS, ContactPoints
 from .obstacle_poses import ObstacleSet
-from .obstacles import Obstacle
 
 
 class ContactTerm(Term):

@@ -1,27 +1,29 @@
-"""Shapes of rigid obstacles, and their surfaces as triangles."""
+"""Obstacles by distances on a grid, and surfaces of obstacles as triangles."""
 
 import itertools
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 import scipy.ndimage
 import warp as wp
 from numpy.typing import ArrayLike
+from pydantic import BeforeValidator, model_validator
 from typing_extensions import override
 
 from ...io.arrays import FloatArray, IntArray
 from ...io.errors import InputError, MeshError
 from ...io.kernel_cache import start_quietly
+from ...io.settings import Positive, Vector, setting
 from ...kernels.contact import signed_distances as kernels
 from ...kernels.modules import shareable
 from ...mesh.readers import METRES
 from ...mesh.tetrahedra import read_shells
+from ...settings.contact import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere
 
-Vector = tuple[float, float, float]
 # Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
 # it, and a third above, from the coefficients of the node before, itself and the one behind.
 _VALUES = np.array([[2.0, 4.0, 0.0], [1.0, 4.0, 1.0], [0.0, 4.0, 2.0]]) / 6.0
@@ -30,121 +32,10 @@ _CORNERS: Final = 64  # of a circle
 _PLATE: Final = (1.5, 0.02)  # edge and thickness of the plate that stands for a half-space, over the body's size
 
 
-@dataclass(frozen=True, kw_only=True)
-class Obstacle:
-    """A rigid body.
-
-    Args:
-        position: of its centre; of a half-space, of any point of its plane [m].
-        axis: direction of its z axis: the normal of a half-space, or the axis of a capsule or cylinder.
-        moves: whether it has the inputs `contact.MOTION`.
-
-    Raises:
-        InputError: a size that is not positive, or an axis of no length.
-    """
-
-    kind: ClassVar[int]
-    vectors: ClassVar[tuple[str, ...]] = ("position", "axis")  # fields that are three numbers
-    lengths: ClassVar[tuple[str, ...]] = ()  # fields that are lengths
-
-    position: Vector = (0.0, 0.0, 0.0)
-    axis: Vector = (0.0, 0.0, 1.0)
-    moves: bool = False
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        name = type(self).__name__
-        for key in self.vectors:
-            value = getattr(self, key)
-            if np.shape(value) != (3,) or not np.isfinite(np.asarray(value, dtype=float)).all():
-                raise InputError(f"{name}.{key} is {value}: it must be three finite numbers.")
-        if not np.linalg.norm(self.axis) > 0.0:
-            raise InputError(f"{name}.axis is {self.axis}: it must have a length.")
-        for key in self.lengths:
-            value = getattr(self, key)
-            if not (np.isfinite(value) & (np.asarray(value) > 0.0)).all():
-                raise InputError(f"{name}.{key} is {value}: it must be positive, in metres.")
-
-    @property
-    def size(self) -> Vector:
-        """Sizes as in `kernels.contact.signed_distances` [m]."""
-        return (0.0, 0.0, 0.0)
-
-    @property
-    def turn(self) -> FloatArray:
-        """(3, 3) rotation from its axes to those of the world."""
-        z = np.asarray(self.axis, dtype=float) / np.linalg.norm(self.axis)
-        x = np.eye(3)[int(np.argmin(np.abs(z)))]
-        x = x - (x @ z) * z
-        x /= np.linalg.norm(x)
-        return np.stack([x, np.cross(z, x), z], axis=1)
+def _float64(values: Any) -> FloatArray:
+    return np.asarray(values, dtype=np.float64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class HalfSpace(Obstacle):
-    """All points below a plane with the normal ``axis``, such as a floor."""
-
-    kind: ClassVar[int] = int(kernels.HALF_SPACE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sphere(Obstacle):
-    """A sphere."""
-
-    kind: ClassVar[int] = int(kernels.SPHERE)
-    lengths: ClassVar[tuple[str, ...]] = ("radius",)
-    radius: float  # [m]
-
-    @property
-    @override
-    def size(self) -> Vector:
-        return (self.radius, 0.0, 0.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Rod(Obstacle):
-    """A shape of revolution."""
-
-    lengths: ClassVar[tuple[str, ...]] = ("radius", "length")
-    radius: float  # [m]
-    length: float  # along its axis, of a capsule without its half-spheres [m]
-
-    @property
-    @override
-    def size(self) -> Vector:
-        return (self.radius, self.radius, 0.5 * self.length)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Capsule(_Rod):
-    """All points within a radius of a segment."""
-
-    kind: ClassVar[int] = int(kernels.CAPSULE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cylinder(_Rod):
-    """A cylinder with flat ends."""
-
-    kind: ClassVar[int] = int(kernels.CYLINDER)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Box(Obstacle):
-    """A cuboid; its edges are along the axes of the world unless ``axis`` or inputs turn it."""
-
-    kind: ClassVar[int] = int(kernels.BOX)
-    lengths: ClassVar[tuple[str, ...]] = ("edges",)
-    edges: Vector  # [m]
-
-    @property
-    @override
-    def size(self) -> Vector:
-        x, y, z = self.edges
-        return (0.5 * x, 0.5 * y, 0.5 * z)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class DistanceGrid(Obstacle):
     """Any shape, by its signed distances at the nodes of a grid, interpolated by cubic B-splines.
 
@@ -155,26 +46,26 @@ class DistanceGrid(Obstacle):
             are not positive.
     """
 
-    kind: ClassVar[int] = int(kernels.GRID)
-    vectors: ClassVar[tuple[str, ...]] = (*Obstacle.vectors, "low")
-    lengths: ClassVar[tuple[str, ...]] = ("spacing",)
-    distances: FloatArray  # (I, J, K) [m]
-    spacing: float  # of the nodes [m]
-    low: Vector  # place of the first node in the axes of the obstacle [m]
+    distances: Annotated[Any, BeforeValidator(_float64)]  # (I, J, K) [m]
+    spacing: Positive = setting(description="of the nodes", unit="m")
+    low: Vector = setting(description="place of the first node in the axes of the obstacle", unit="m")
 
-    def __post_init__(self) -> None:
-        """Checks the grid."""
-        super().__post_init__()
-        object.__setattr__(self, "distances", np.asarray(self.distances, dtype=np.float64))
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
         shape = self.distances.shape
         if len(shape) != 3 or min(shape) < 8 or not np.isfinite(self.distances).all():
-            raise InputError(
-                f"DistanceGrid.distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes."
-            )
+            raise ValueError(f"distances has shape {shape}: give finite distances at 8 nodes or more by 3 axes.")
         if not self.margin > 0.0:
-            raise InputError(
-                "DistanceGrid.distances reach zero at the boundary of the grid: let it end outside of the shape."
-            )
+            raise ValueError("distances reach zero at the boundary of the grid: let it end outside of the shape.")
+        return self
+
+    @override
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    @override
+    def __hash__(self) -> int:
+        return id(self)
 
     @cached_property
     def margin(self) -> float:
@@ -205,7 +96,7 @@ class DistanceGrid(Obstacle):
 
     @property
     @override
-    def size(self) -> Vector:
+    def size(self) -> tuple[float, float, float]:
         return (self.spacing, self.largest_slope, self.margin)
 
     @classmethod
@@ -262,6 +153,17 @@ class DistanceGrid(Obstacle):
             raise MeshError(f"the units of an obstacle's surface must be one of {', '.join(METRES)}, not {units}")
         vertices, shells = read_shells(Path(path).expanduser())
         return cls.of_surface(METRES[units] * vertices, np.concatenate(shells), spacing, margin, **pose)
+
+
+# Kinds of the kernels.
+KINDS: Final[Mapping[type[Obstacle], int]] = {
+    HalfSpace: int(kernels.HALF_SPACE),
+    Sphere: int(kernels.SPHERE),
+    Capsule: int(kernels.CAPSULE),
+    Box: int(kernels.BOX),
+    Cylinder: int(kernels.CYLINDER),
+    DistanceGrid: int(kernels.GRID),
+}
 
 
 def signed_distances(vertices: ArrayLike, triangles: ArrayLike, places: ArrayLike) -> FloatArray:

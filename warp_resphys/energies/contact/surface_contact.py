@@ -30,6 +30,7 @@ from ...fem.integration_points import Points
 from ...fem.scene import Scene
 from ...io.errors import InputError, naming
 from ...mesh.volume_mesh import Mesh
+from ...settings.contact import FrictionPair
 from ...stepping.quantity import Parameter, Quantity
 from ..base import BoundEnergy, Energy, EnergySite, EnergyStep
 from ..launcher import Launcher
@@ -39,18 +40,6 @@ from .pairs import PairList, Surface
 from .surface_term import FRICTION, STIFFNESS, SurfacePoints, SurfaceTerm
 
 _LEAST: Final = 1e-4  # share of D within which surfaces count as touching
-
-
-@dataclass(frozen=True)
-class FrictionPair:
-    """Friction between two regions of a mesh, or within one; in a scene, bodies are regions.
-
-    A vertex, an edge or a triangle is in a region if all of its vertices are.
-    """
-
-    first: str
-    second: str
-    friction: float  # mu
 
 
 @dataclass(frozen=True)
@@ -86,8 +75,6 @@ class SurfaceContact(Energy):
                 f"pairs of a contact between surfaces are {self.pairs!r}: give FrictionPair(...) by name, other than "
                 "'other', which stands for all surfaces that are in no pair."
             )
-        for pair in self.pairs.values():
-            FRICTION.check(pair.friction)
         if self.pairs and not isinstance(self.friction, float | int):
             raise InputError("contact of surfaces with pairs has one number as the friction of all others.")
 

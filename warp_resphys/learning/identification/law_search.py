@@ -161,7 +161,7 @@ class _LawSearch:
     def simulator(self, parameters: Mapping[str, float], model: str = ConvexMaterial.model) -> Simulator:
         """Returns the simulator with the parameters of a law; failed steps are counted."""
         material = make_material(model, **{**self.mass, **parameters})
-        return replace(self.base, material=material, solver=replace(self.base.settings, on_failure="count"))
+        return replace(self.base, material=material, solver=self.base.settings.changed(on_failure="count"))
 
     @cached_property
     def others(self) -> dict[str, float]:
@@ -227,7 +227,7 @@ class _LawSearch:
     def _tested(self, score: Score) -> dict[str, Any]:
         """Whether a law helps, and its errors and those without it on the trials that laws are tested on."""
         shared = {name: self.base.tensor([value]) for name, value in self.identified.parameters.items()}
-        counting = replace(self.base, solver=replace(self.base.settings, on_failure="count"))
+        counting = replace(self.base, solver=self.base.settings.changed(on_failure="count"))
         below, split = self._scores(counting, shared)[0], "validation" if self.validation else "training"
         errors = LawTest(trials=[*self.checked], split=split, law=score.error, below=below.error)
         return {"accepted": score.beats(below), "validation": errors}

@@ -169,7 +169,7 @@ class Misfit(BoundedMisfit):
         super().__init__(bounds)
         simulator = first.simulator
         most = min(simulator.settings.max_iterations, _MOST_ITERATIONS)
-        settings = replace(simulator.settings, max_iterations=most, on_failure="raise")
+        settings = simulator.settings.changed(max_iterations=most, on_failure="raise")
         self.simulator = replace(simulator, solver=settings)
         self._known = {} if known is None else dict(known)
         self._shares = None if shares is None else np.array(shares)

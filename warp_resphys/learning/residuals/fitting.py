@@ -212,7 +212,7 @@ class Fitting:
         validation = self.samples(judged) if self.validation else train
         network = self.new_network(train, settings)
         learned = Learned(network, self._range_of(network, train), self.force_frame)
-        counting = replace(self.simulator, solver=replace(self.simulator.settings, on_failure="count"))
+        counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
         error = rollout_error(counting, self.motions, judged, self.identified, self.data_driven)
         kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
 

@@ -11,12 +11,15 @@ from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
 from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.search import first_points, search_parameters
-from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.settings.learning import Bounds, Prior
 
 TRUTH = {"youngs_modulus": 215e3, "stiffness_damping": 0.002}
-RANGES = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True), "stiffness_damping": Bounds(0.0, 0.02)}
+RANGES = {
+    "youngs_modulus": Bounds(lower=1e5, upper=1e6, logarithmic=True),
+    "stiffness_damping": Bounds(lower=0.0, upper=0.02),
+}
 FIRST = {"youngs_modulus": 400e3, "stiffness_damping": 0.0}
 
 
@@ -31,7 +34,7 @@ def replay_of(sim, truth, masses=(0.0, 0.05), frames=25, noise=0.0):
 
 
 def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
-    bounds = {"youngs_modulus": Bounds(1e5, 1e6), "density": Bounds(800.0, 1500.0)}
+    bounds = {"youngs_modulus": Bounds(lower=1e5, upper=1e6), "density": Bounds(lower=800.0, upper=1500.0)}
     truth = {"youngs_modulus": 215e3, "density": 1070.0}
     replay, release = replay_of(simulator(), truth, masses=(0.0,), noise=5e-5)
     misfit = Misfit([(replay, release)], bounds)
@@ -44,7 +47,7 @@ def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
 
 
 def test_a_parameter_outside_its_range_ends_on_the_bound():
-    bounds = {"youngs_modulus": Bounds(3e5, 1e6, logarithmic=True)}
+    bounds = {"youngs_modulus": Bounds(lower=3e5, upper=1e6, logarithmic=True)}
     pair = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=12)
     result = search_parameters(Misfit([pair], bounds), [{"youngs_modulus": 6e5}], 40)
     assert result.at_bounds == ("youngs_modulus",)
@@ -52,7 +55,7 @@ def test_a_parameter_outside_its_range_ends_on_the_bound():
 
 
 def test_failed_points_are_infinite_and_the_others_unchanged():
-    bounds = {"youngs_modulus": Bounds(1.0, 1e10, logarithmic=True)}
+    bounds = {"youngs_modulus": Bounds(lower=1.0, upper=1e10, logarithmic=True)}
     replay, release = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=5)
     points = np.linspace(0.0, 1.0, 6)[:, None]
     whole = Misfit([(replay, release)], bounds).losses_or_infinite(points)
@@ -107,10 +110,13 @@ def test_no_parameters_and_a_motion_that_stands_still_are_refused():
 @pytest.mark.parametrize(
     ("limits", "sentence"),
     [
-        ({"lower": 1.0, "upper": 1.0}, "leave no range"),
-        ({"lower": 0.0, "upper": np.inf}, "leave no range"),
-        ({"lower": 0.0, "upper": 1.0, "logarithmic": True}, "its lower bound must be positive"),
-        ({"lower": 0.0, "upper": 1.0, "prior": Prior(2.0, 1.0)}, "the prior has the mean 2, outside of the range"),
+        ({"lower": 1.0, "upper": 1.0}, "lower is 1: it must be below upper, 1"),
+        ({"lower": 0.0, "upper": np.inf}, "upper is inf: it must be a number"),
+        ({"lower": 0.0, "upper": 1.0, "logarithmic": True}, "it must be positive, as the scale is logarithmic"),
+        (
+            {"lower": 0.0, "upper": 1.0, "prior": Prior(mean=2.0, deviation=1.0)},
+            "prior.mean is 2, outside of the range",
+        ),
         ({"lower": 0.0, "upper": 1.0, "per": "trial"}, "per is trial, but there is no prior"),
     ],
 )
@@ -119,7 +125,7 @@ def test_bounds_leave_a_range_and_values_of_trials_have_a_prior(limits, sentence
         Bounds(**limits)
 
 
-@pytest.mark.parametrize("bounds", [Bounds(1e5, 1e6, logarithmic=True), Bounds(-1.0, 3.0)])
+@pytest.mark.parametrize("bounds", [Bounds(lower=1e5, upper=1e6, logarithmic=True), Bounds(lower=-1.0, upper=3.0)])
 def test_bounds_there_and_back(bounds):
     unit = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
     values = bounds.from_unit(unit)
@@ -182,7 +188,7 @@ def test_parameters_are_recovered_from_motions_whose_inputs_were_late(placed):
 def test_derivatives_are_those_of_the_loss_with_the_best_delays_and_priors(accuracy):
     replay, start = late(noise=1e-4)
     start = replace(start, delay=double([0.002, 0.0, 0.0]))
-    ranges = {**RANGES, "density": replace(Bounds(800.0, 1600.0), prior=Prior(1100.0, 50.0))}
+    ranges = {**RANGES, "density": Bounds(lower=800.0, upper=1600.0, prior=Prior(mean=1100.0, deviation=50.0))}
     misfit, unit = Misfit([(replay, start)], ranges, accuracy=accuracy, delay=0.02), np.array([0.4, 0.25, 0.9])
     for _ in range(2):
         misfit.update_prior_weight(unit)

@@ -16,11 +16,10 @@ from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.identification.identification import identify
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.observed_motions import ObservedMotions
-from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.residuals.fitting import Fitting, fit_force
 from warp_resphys.learning.residuals.reconstruction import reconstruct
-from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings
+from warp_resphys.settings.learning import Bounds, InTheLoopSettings, NetworkSettings, Prior, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0))
@@ -80,8 +79,10 @@ def test_trials_have_their_values_sessions_their_marker_places_and_finished_sear
     motions = ObservedMotions.of(wrong, seen, inputs=wr.Inputs(tendon_tension=logged), observation=MARKERS)
     motions = replace(motions, trials=replace(motions.trials, sessions=("monday", "friday", "monday")))
     ranges = {
-        "youngs_modulus": Bounds(1e5, 1e6),
-        "tendon_tension_factor": Bounds(0.5, 2.0, False, Prior(1.0, 0.3), "trial"),
+        "youngs_modulus": Bounds(lower=1e5, upper=1e6),
+        "tendon_tension_factor": Bounds(
+            lower=0.5, upper=2.0, logarithmic=False, prior=Prior(mean=1.0, deviation=0.3), per="trial"
+        ),
     }
 
     def identified():

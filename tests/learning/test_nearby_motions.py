@@ -11,14 +11,17 @@ from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, Ten
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.errors import ConvergenceError
 from warp_resphys.learning.identification.misfit import Misfit
-from warp_resphys.learning.parameters import Bounds
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
+from warp_resphys.settings.learning import Bounds
 
 MESH = box_hexahedra(divisions=(4, 1, 1))
 CLAMP = select_vertices(MESH, x=0.0)
 SOFT = Corotated(8e4, 0.49)
-RANGES = {"youngs_modulus": Bounds(5e4, 5e5, logarithmic=True), "poissons_ratio": Bounds(0.4, 0.499)}
+RANGES = {
+    "youngs_modulus": Bounds(lower=5e4, upper=5e5, logarithmic=True),
+    "poissons_ratio": Bounds(lower=0.4, upper=0.499),
+}
 VALUES = {"youngs_modulus": 2e5, "poissons_ratio": 0.47}
 
 

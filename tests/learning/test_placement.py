@@ -119,7 +119,7 @@ SIM = Simulator(Body(MESH, select_vertices(MESH, x=0.0)), time_step=0.01)
 EDGES = select_vertices(MESH, x=0.1, y=0.0), select_vertices(MESH, x=0.1, y=0.03)
 WEIGHTS = ((0.0, 0.0), (0.05, 0.0), (0.0, 0.06), (0.05, 0.05), (0.1, 0.02))
 TRUTH = {"youngs_modulus": 215e3}
-RANGES = {"youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}
+RANGES = {"youngs_modulus": Bounds(lower=1e5, upper=1e6, logarithmic=True)}
 
 
 def posed(observe, noise=0.0, truth=TRUTH):
@@ -157,7 +157,7 @@ def test_the_modulus_is_recovered_from_misplaced_markers():
 
 def test_a_prior_determines_what_poses_do_not():
     """Weight against stiffness: poses under no other load than the body's own tell their ratio alone."""
-    ranges = {**RANGES, "density": Bounds(800.0, 1600.0, prior=Prior(1200.0, 40.0))}
+    ranges = {**RANGES, "density": Bounds(lower=800.0, upper=1600.0, prior=Prior(mean=1200.0, deviation=40.0))}
     still, start = posed(bind(), noise=1e-5, truth={"youngs_modulus": 215e3, "density": 1070.0})
     own = still.trials.select([0])
     pair = Replay(SIM, bind(), own), start.select([0])
@@ -198,7 +198,10 @@ def test_modulus_and_mounting_are_recovered_from_poses_of_a_rigid_part():
     noisy = places + 1e-4 * draw.normal(size=places.shape) + (seen - places) @ shaken
     seen = replace(blank, observed=torch.as_tensor(noisy))
     pair = Replay(simulator, follow_vertices(mesh, cap, nominal), seen), start
-    ranges, guess = {"beam_youngs_modulus": Bounds(1e5, 1e6, logarithmic=True)}, [{"beam_youngs_modulus": 4e5}]
+    ranges, guess = (
+        {"beam_youngs_modulus": Bounds(lower=1e5, upper=1e6, logarithmic=True)},
+        [{"beam_youngs_modulus": 4e5}],
+    )
     bodies = ((0, nominal - middle),)
     accuracy = Accuracy(markers=2e-3, mounting=0.03, rigid_bodies=bodies, centre=CENTRE.tolist())
     result = search_parameters(Misfit([pair], ranges, accuracy=accuracy), guess, 30, labels=LABELS)
@@ -223,7 +226,13 @@ def test_misplaced_vertices_are_refused():
         MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved(MOVED[:2])
 
 
-OWN = {**RANGES, **{f"attached_mass_factor@w{i}": Bounds(0.7, 1.3, prior=Prior(1.0, 0.05)) for i in (1, 2, 3, 4)}}
+OWN = {
+    **RANGES,
+    **{
+        f"attached_mass_factor@w{i}": Bounds(lower=0.7, upper=1.3, prior=Prior(mean=1.0, deviation=0.05))
+        for i in (1, 2, 3, 4)
+    },
+}
 GAINS = (1.0, 0.93, 1.05, 1.0, 0.97)  # of the weights that hung on the body, over those that were logged
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, redundancy, uncertainty_of
-from warp_resphys.learning.parameters import Bounds
+from warp_resphys.settings.learning import Bounds
 
-BOUNDS = {"stiffness": Bounds(1.0, 3.0), "damping": Bounds(0.1, 10.0, logarithmic=True)}
+BOUNDS = {"stiffness": Bounds(lower=1.0, upper=3.0), "damping": Bounds(lower=0.1, upper=10.0, logarithmic=True)}
 UNIT = np.array([0.5, 0.25])
 
 

@@ -12,9 +12,9 @@ import warp_resphys as wr
 from support.slopes import differences
 from warp_resphys.data.camera import PLACES, Lens, PlacedCamera
 from warp_resphys.experiment.pictures.camera_laboratory import depth_image
-from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.mesh.surface import closest_of
 from warp_resphys.pictures import ClosedSurface, Cloud, Photo, PictureMisfit, SeenPose
+from warp_resphys.settings.learning import Bounds, Prior
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1), nodes=20)
 CLAMP = wr.select_vertices(MESH, x=0.0)
@@ -28,13 +28,16 @@ ABOVE = torch.tensor(  # looks down: x right, y towards the viewer
 )
 CAMERA = PlacedCamera(LENS, ABOVE, CENTRE)
 PLAIN = PlacedCamera.corrections({})
-MODULUS = {"youngs_modulus": Bounds(3e4, 1e6, True)}
+MODULUS = {"youngs_modulus": Bounds(lower=3e4, upper=1e6, logarithmic=True)}
 TRUTH = {"youngs_modulus": 1.2e5}
 
 
 def bounds_of(*names, prior=None):
     """Ranges of shifts and turns."""
-    return {name: Bounds(-0.06, 0.06) if "shift" in name else Bounds(-0.5, 0.5, prior=prior) for name in names}
+    return {
+        name: Bounds(lower=-0.06, upper=0.06) if "shift" in name else Bounds(lower=-0.5, upper=0.5, prior=prior)
+        for name in names
+    }
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +129,7 @@ def test_derivatives_of_clouds_are_those_of_differences(beam, kind):
         names = (*PLACES, "focal_factor", "principal_point_1", "principal_point_2")
     ranges = {**MODULUS, **bounds_of(*PLACES)}
     for name in names[len(PLACES) :]:
-        ranges[name] = Bounds(0.9, 1.1) if name == "focal_factor" else Bounds(-20.0, 20.0)
+        ranges[name] = Bounds(lower=0.9, upper=1.1) if name == "focal_factor" else Bounds(lower=-20.0, upper=20.0)
     values = {**dict.fromkeys(ranges, 0.003), "youngs_modulus": 1.4e5}
     misfit = PictureMisfit([own], ranges)
     unit = misfit.to_unit(values | ({"focal_factor": 1.01} if kind == "depth" else {}))
@@ -148,7 +151,7 @@ def test_a_turned_scan_with_outliers(beam):
     turn = Rotation.from_rotvec((0.1, -0.2, 0.15))
     shift = np.array([0.01, -0.02, 0.015])
     own = with_cloud(pose, Cloud(turn.apply(points) + shift))
-    ranges = {**MODULUS, **bounds_of(*PLACES, prior=Prior(0.0, 0.1))}
+    ranges = {**MODULUS, **bounds_of(*PLACES, prior=Prior(mean=0.0, deviation=0.1))}
     first = {**dict.fromkeys(ranges, 0.0), "youngs_modulus": 3e5}
     result = wr.learning.search_parameters(PictureMisfit([own], ranges), [first], 40)
     deviation = result.uncertainty.deviation["youngs_modulus"]

@@ -24,10 +24,10 @@ CAMERA = PlacedCamera(LENS, LOOKS, torch.tensor([0.0, 0.01, 0.01], dtype=torch.f
 POINTS = wr.bind_markers(MESH, [[0.1, 0.0, 0.01], [0.06, 0.0, 0.01], [0.08, 0.0, 0.02]], ["a", "b", "c"])
 SIZE = (240, 320)
 RANGES = {
-    "youngs_modulus": Bounds(3e4, 1e6, True),
-    "camera_shift_1": Bounds(-0.02, 0.02, prior=Prior(0.0, 0.01)),
-    "camera_turn_2": Bounds(-0.2, 0.2, prior=Prior(0.0, 0.05)),
-    "focal_factor": Bounds(0.9, 1.1, prior=Prior(1.0, 0.02)),
+    "youngs_modulus": Bounds(lower=3e4, upper=1e6, logarithmic=True),
+    "camera_shift_1": Bounds(lower=-0.02, upper=0.02, prior=Prior(mean=0.0, deviation=0.01)),
+    "camera_turn_2": Bounds(lower=-0.2, upper=0.2, prior=Prior(mean=0.0, deviation=0.05)),
+    "focal_factor": Bounds(lower=0.9, upper=1.1, prior=Prior(mean=1.0, deviation=0.02)),
 }
 TRUTH = {"youngs_modulus": 1.2e5, "camera_shift_1": 0.003, "camera_turn_2": 0.02, "focal_factor": 1.01}
 FIRST = {"youngs_modulus": 3e5, "camera_shift_1": 0.0, "camera_turn_2": 0.0, "focal_factor": 1.0}
@@ -67,7 +67,7 @@ def test_derivatives_are_those_of_differences(seen):
 def test_parameters_come_back(seen, kind):
     photo = replace(seen.photos[0], **({"tracked": None} if kind == "outline" else {"outline": None}))
     # Six exact coordinates determine four parameters, without priors.
-    ranges = RANGES if kind == "outline" else {name: replace(range_, prior=None) for name, range_ in RANGES.items()}
+    ranges = RANGES if kind == "outline" else {name: range_.changed(prior=None) for name, range_ in RANGES.items()}
     result = search_parameters(PictureMisfit([replace(seen, photos=(photo,))], ranges), [FIRST], 40, tolerance=1e-12)
     limit = 0.1 if kind == "outline" else 1e-3  # a mask has whole pixels
     assert result.parameters["youngs_modulus"] == pytest.approx(TRUTH["youngs_modulus"], rel=limit)
@@ -92,12 +92,12 @@ def test_a_body_beside_the_picture_is_named():
 
 def test_a_step_that_moves_the_body_out_of_the_picture_has_failed(seen):
     photo = replace(seen.photos[0], tracked=None)
-    misfit = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(-0.6, 0.6)}, TRUTH)
+    misfit = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(lower=-0.6, upper=0.6)}, TRUTH)
     with pytest.raises(wr.InputError, match="does not show the simulated body"):
         misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5}))
     assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.003})) is not None
     assert misfit.linearise(misfit.to_unit({"camera_shift_1": 0.5})) is None
-    again = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(-0.6, 0.6)}, TRUTH)
+    again = PictureMisfit([replace(seen, photos=(photo,))], {"camera_shift_1": Bounds(lower=-0.6, upper=0.6)}, TRUTH)
     points = np.stack([again.to_unit({"camera_shift_1": shift}) for shift in (0.5, 0.003)])
     assert np.isfinite(again.losses_or_infinite(points)).tolist() == [False, True]
 
@@ -146,7 +146,7 @@ def test_deviations_are_those_of_repeated_pictures():
     """Of outlines with a pixel of noise, whose two directions see the same noise."""
     seen, _ = pose()
     region = seen.surface.region(CAMERA.pixels(seen.shape(TRUTH), PlacedCamera.corrections(TRUTH)).numpy())
-    ranges = {"youngs_modulus": RANGES["youngs_modulus"], "camera_shift_1": Bounds(-0.02, 0.02)}
+    ranges = {"youngs_modulus": RANGES["youngs_modulus"], "camera_shift_1": Bounds(lower=-0.02, upper=0.02)}
     known = {name: value for name, value in TRUTH.items() if name not in ranges}
     first, found, said = {name: TRUTH[name] for name in ranges}, [], []
     for seed in range(12):

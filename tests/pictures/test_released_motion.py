@@ -10,9 +10,9 @@ import torch
 import warp_resphys as wr
 from support.slopes import differences
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
-from warp_resphys.learning.parameters import Bounds, Prior
 from warp_resphys.pictures import ClosedSurface, Cloud, Lens, Outline, Photo, PictureMisfit, PlacedCamera, SeenPose
 from warp_resphys.pictures.released_force import ReleasedForce, at_own_times
+from warp_resphys.settings.learning import Bounds, Prior
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1), nodes=20)
 LENS = Lens(torch.tensor([[700.0, 0.0, 160.0], [0.0, 700.0, 120.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
@@ -25,12 +25,12 @@ POINTS = wr.bind_markers(MESH, [[0.1, 0.0, 0.01], [0.06, 0.0, 0.01], [0.08, 0.0,
 SIZE = (240, 320)
 ROW_TIME, RATE = 6e-5, 60.0  # s, Hz: the rows take 14 ms
 RANGES = {
-    "youngs_modulus": Bounds(3e4, 1e6, True),
-    "density": Bounds(500.0, 2000.0),
-    "stiffness_damping": Bounds(0.0, 0.02),
-    "release_delay": Bounds(-0.03, 0.03, prior=Prior(0.0, 0.01)),
-    "release_force_3": Bounds(-0.1, 0.1, prior=Prior(0.0, 0.01)),
-    "camera_shift_3": Bounds(-0.02, 0.02, prior=Prior(0.0, 0.01)),
+    "youngs_modulus": Bounds(lower=3e4, upper=1e6, logarithmic=True),
+    "density": Bounds(lower=500.0, upper=2000.0),
+    "stiffness_damping": Bounds(lower=0.0, upper=0.02),
+    "release_delay": Bounds(lower=-0.03, upper=0.03, prior=Prior(mean=0.0, deviation=0.01)),
+    "release_force_3": Bounds(lower=-0.1, upper=0.1, prior=Prior(mean=0.0, deviation=0.01)),
+    "camera_shift_3": Bounds(lower=-0.02, upper=0.02, prior=Prior(mean=0.0, deviation=0.01)),
 }
 TRUTH = {
     "youngs_modulus": 1.2e5,
@@ -132,4 +132,4 @@ def test_what_cannot_be_released_is_named(seen):
     with pytest.raises(wr.InputError, match="beam moves, and a scan shows no time"):
         replace(seen, photos=(scan,))
     with pytest.raises(wr.InputError, match="no parameter 'clamp_turn' to identify"):
-        PictureMisfit([seen], {"clamp_turn": Bounds(0.0, 1.0)})
+        PictureMisfit([seen], {"clamp_turn": Bounds(lower=0.0, upper=1.0)})

@@ -41,7 +41,7 @@ from warp_resphys.report.wording import (
     share_text,
     shown_models,
 )
-from warp_resphys.settings.learning import RangeSettings
+from warp_resphys.settings.learning import Bounds
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 DOWN = np.array([0.0, 0.0, -9.8])
@@ -171,7 +171,7 @@ class TestIdentification:
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
         identified.uncertainty.deviation["youngs_modulus"] = deviation
         prior = {"mean": 250e3, "deviation": 10e3}
-        ranges = {"youngs_modulus": parse(RangeSettings, {"lower": 5e4, "upper": 2e6, "prior": prior})}
+        ranges = {"youngs_modulus": parse(Bounds, {"lower": 5e4, "upper": 2e6, "prior": prior})}
         said = uncertainty_text("sysid", identified, ranges)
         assert said.endswith("do not constrain Young's modulus beyond its prior (250 ± 10 kPa).") is not informs
 

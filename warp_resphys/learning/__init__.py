@@ -1,12 +1,12 @@
 """Identification of parameters, reconstruction of residual forces, and networks that predict these forces."""
 
+from ..settings.learning import Bounds as Bounds
+from ..settings.learning import Prior as Prior
 from .evaluation import evaluate as evaluate
 from .identification.identification import identify as identify
 from .identification.law_search import identify_law as identify_law
 from .identification.search import Identification as Identification
 from .identification.search import search_parameters as search_parameters
 from .observed_motions import ObservedMotions as ObservedMotions
-from .parameters import Bounds as Bounds
-from .parameters import Prior as Prior
 from .residuals.fitting import fit_force as fit_force
 from .residuals.reconstruction import reconstruct as reconstruct

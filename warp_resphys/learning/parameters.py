@@ -4,9 +4,7 @@ A name is that of a simulator's constant (``youngs_modulus``), of the constant o
 parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), or one of `MASS_FACTOR` and `TILTS`.
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import torch
@@ -15,7 +13,7 @@ from ..data.input_response import RESPONSES, SLOPES
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
 from ..io.errors import InputError
-from ..settings.learning import RangeSettings
+from ..settings.learning import Bounds
 
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
@@ -23,80 +21,20 @@ _OWN: Final = "@"
 HUNG: Final = ("attached_mass", PAYLOAD.name)
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Prior knowledge of a parameter: a normal distribution, of its logarithm where that is searched."""
-
-    mean: float  # in the parameter's unit
-    deviation: float  # standard deviation, in the parameter's unit
+Limits = Bounds | tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """The range of a parameter."""
+def bounds_of(limits: Limits) -> Bounds:
+    """Returns bounds, also from a pair of numbers, which is logarithmic if both are positive.
 
-    lower: float  # in the parameter's unit
-    upper: float  # in the parameter's unit
-    logarithmic: bool = False  # whether it is searched on a logarithmic scale
-    prior: Prior | None = None
-    per: str = "all"  # session or trial: each has its own value, near the mean of the prior
-
-    @classmethod
-    def of(cls, limits: "Limits") -> "Bounds":
-        """Returns bounds from settings, or from a pair of numbers, which is logarithmic if both are positive."""
-        if isinstance(limits, RangeSettings):
-            prior = None if limits.prior is None else Prior(**dict(limits.prior))
-            return cls(limits.lower, limits.upper, limits.logarithmic, prior, limits.per)
-        if isinstance(limits, Bounds):
-            return limits
-        if not isinstance(limits, Sequence) or len(limits) != 2:
-            raise InputError(f"a range is {limits!r}: give the smallest and the largest value, or Bounds.")
-        return cls(limits[0], limits[1], logarithmic=min(limits) > 0.0)
-
-    def __post_init__(self) -> None:
-        """Checks the range.
-
-        Raises:
-            InputError: an empty or infinite range, or a logarithmic one that is not positive.
-        """
-        if not (math.isfinite(self.lower) and math.isfinite(self.upper) and self.lower < self.upper):
-            raise InputError(f"the bounds {self.lower:g} and {self.upper:g} leave no range: the first must be smaller.")
-        if self.logarithmic and not self.lower > 0.0:
-            raise InputError(f"a logarithmic range from {self.lower:g}: its lower bound must be positive.")
-        if self.prior is not None and not self.lower <= self.prior.mean <= self.upper:
-            raise InputError(
-                f"the prior has the mean {self.prior.mean:g}, outside of the range from {self.lower:g} to "
-                f"{self.upper:g}: widen the range, or correct the prior."
-            )
-        if self.per in ("session", "trial") and self.prior is None:
-            raise InputError(f"per is {self.per}, but there is no prior, which holds the values: add one.")
-
-    def unit_prior(self) -> tuple[float, float] | None:
-        """Mean and standard deviation of the prior, as fractions of the range; None without a prior."""
-        if self.prior is None:
-            return None
-        mean = self.to_unit(self.prior.mean)
-        return mean, self.prior.deviation / self.slope(mean)
-
-    def to_unit(self, value: float) -> float:
-        """Returns a value as a fraction of the range, 0 to 1."""
-        low, high, x = (math.log(v) if self.logarithmic else v for v in (self.lower, self.upper, value))
-        return (x - low) / (high - low)
-
-    def from_unit(self, unit: torch.Tensor) -> torch.Tensor:
-        """Returns the values at fractions of the range; differentiable."""
-        if self.logarithmic:
-            return self.lower * torch.exp(unit * math.log(self.upper / self.lower))
-        return self.lower + unit * (self.upper - self.lower)
-
-    def slope(self, unit: float) -> float:
-        """Derivative of the value by its fraction of the range."""
-        if self.logarithmic:
-            return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
-        return self.upper - self.lower
-
-
-Limits = Bounds | RangeSettings | tuple[float, float]
+    Raises:
+        InputError: neither.
+    """
+    if isinstance(limits, Bounds):
+        return limits
+    if not isinstance(limits, Sequence) or len(limits) != 2:
+        raise InputError(f"a range is {limits!r}: give the smallest and the largest value, or Bounds.")
+    return Bounds(lower=limits[0], upper=limits[1], logarithmic=min(limits) > 0.0)
 
 
 def own_name(name: str, owner: str) -> str:

@@ -27,7 +27,8 @@ from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError
 from ..learning.identification.misfit import BoundedMisfit
 from ..learning.identification.uncertainty import LinearMisfit, LinearTrial
-from ..learning.parameters import Bounds, split_name
+from ..learning.parameters import split_name
+from ..settings.learning import Bounds
 from .released_force import RELEASE_DELAY
 from .seen import Photo, SeenPose, Shape
 

@@ -13,7 +13,7 @@ from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.identification.search import Identification
 from ..learning.parameters import own_name, split_name
 from ..learning.placement import PlainPlacement
-from ..settings.learning import RangeSettings
+from ..settings.learning import Bounds
 from . import figures
 from .data import RunReport
 from .page import Canvas, Cell, PageTable, Part, Row, Text
@@ -197,7 +197,7 @@ def placement_text(name: str, placed: PlainPlacement, lengths: Mapping[str, floa
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def uncertainty_text(name: str, identified: Identification, ranges: Mapping[str, RangeSettings]) -> str:
+def uncertainty_text(name: str, identified: Identification, ranges: Mapping[str, Bounds]) -> str:
     """Returns sentences on the parameters of a model that the data do not determine; empty without uncertainties."""
     uncertainty = identified.uncertainty
     if uncertainty is None:

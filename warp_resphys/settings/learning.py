@@ -1,6 +1,7 @@
 """Settings of identification, reconstruction of forces, networks and their training."""
 
-from typing import Annotated, Literal, Self
+import math
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -22,6 +23,9 @@ from ..io.settings import (
 from .body import Integrator
 from .performed import different, rising
 
+if TYPE_CHECKING:
+    import torch
+
 Size = Annotated[int, Field(ge=1, le=16_384)]
 Term = Annotated[
     str,
@@ -32,20 +36,20 @@ Term = Annotated[
 ]
 
 
-class PriorSettings(Settings):
-    """Normal prior of a parameter."""
+class Prior(Settings):
+    """Normal prior of a parameter, or of its logarithm where that is searched."""
 
     mean: float = setting(description="mean, in the parameter's unit")
     deviation: Positive = setting(description="standard deviation, in the parameter's unit")
 
 
-class RangeSettings(Settings):
+class Bounds(Settings):
     """The search range of a parameter."""
 
     lower: float = setting(description="lower bound, in the parameter's unit")
     upper: float = setting(description="upper bound, in the parameter's unit")
     logarithmic: bool = setting(False, "whether the scale is logarithmic")
-    prior: PriorSettings | None = setting(None, "prior knowledge")
+    prior: Prior | None = setting(None, "prior knowledge")
     per: Literal["all", "session", "trial", "material", "lens"] = setting(
         "all", "what shares a value; session, trial: values near the mean of the prior; material, lens: for pictures"
     )
@@ -65,6 +69,30 @@ class RangeSettings(Settings):
             )
         return self
 
+    def unit_prior(self) -> tuple[float, float] | None:
+        """Mean and standard deviation of the prior, as fractions of the range; None without a prior."""
+        if self.prior is None:
+            return None
+        mean = self.to_unit(self.prior.mean)
+        return mean, self.prior.deviation / self.slope(mean)
+
+    def to_unit(self, value: float) -> float:
+        """Returns a value as a fraction of the range, 0 to 1."""
+        low, high, x = (math.log(v) if self.logarithmic else v for v in (self.lower, self.upper, value))
+        return (x - low) / (high - low)
+
+    def from_unit(self, unit: "torch.Tensor") -> "torch.Tensor":
+        """Returns the values at fractions of the range; differentiable."""
+        if self.logarithmic:
+            return self.lower * (unit * math.log(self.upper / self.lower)).exp()
+        return self.lower + unit * (self.upper - self.lower)
+
+    def slope(self, unit: float) -> float:
+        """Derivative of the value by its fraction of the range."""
+        if self.logarithmic:
+            return self.lower * (self.upper / self.lower) ** unit * math.log(self.upper / self.lower)
+        return self.upper - self.lower
+
 
 class PlacementSettings(Settings):
     """Prior standard deviations of positions of markers and pose of the recordings, which are identified."""
@@ -78,9 +106,7 @@ class PlacementSettings(Settings):
     between_sessions: Positive = setting(0.5, "deviations between sessions, relative to those above")
 
 
-Ranges = Annotated[
-    dict[str, RangeSettings], BeforeValidator(without_null, json_schema_input_type=dict[str, RangeSettings | None])
-]
+Ranges = Annotated[dict[str, Bounds], BeforeValidator(without_null, json_schema_input_type=dict[str, Bounds | None])]
 Guesses = Annotated[dict[str, float], BeforeValidator(without_null, json_schema_input_type=dict[str, float | None])]
 
 

@@ -22,7 +22,7 @@ from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
 from ...learning.identification.search import Identification, first_points, search_parameters, shown
-from ...learning.parameters import TILTS, Bounds, configured_parameters, own_name, split_name
+from ...learning.parameters import TILTS, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
@@ -34,6 +34,7 @@ from ...report.pictures_page import (
     picture_verdict,
     write_pictures_report,
 )
+from ...settings.learning import Bounds
 from ...settings.pictures import PictureData
 from ...settings.run import RunSettings
 from ...settings.stage_keys import SIMULATOR, StageSettings
@@ -172,7 +173,7 @@ class _Plan:
             for owner in dict.fromkeys(owners[limits.per]) if chosen(name, limits.per) else ():
                 mine = [pose for pose in poses if owner in (*pose.owners, *pose.lenses)]
                 if any(name in pose.parameter_names and (pose.deforms or name in CORRECTIONS) for pose in mine):
-                    result[own_name(name, owner) if owner else name] = Bounds.of(limits)
+                    result[own_name(name, owner) if owner else name] = limits
         return result
 
     def guess(self, names: Iterable[str], poses: Sequence[SeenPose]) -> Values:

@@ -17,8 +17,9 @@ from ...data.trials import RESTING, Trials
 from ...dynamics.simulator import Simulator
 from ...io.errors import ConvergenceError
 from ...io.parts import Checkpoint
+from ...settings.learning import Bounds
 from ..observed_motions import ObservedMotions
-from ..parameters import Bounds, Limits, configured_parameters, own_name, split_name
+from ..parameters import Limits, bounds_of, configured_parameters, own_name, split_name
 from ..placement import Accuracy, PlainPlacements
 from ..replay import Replay, Start
 from .misfit import Misfit
@@ -71,7 +72,7 @@ def identify(
         ConvergenceError: the simulation fails at every start.
     """
     trials = motions.trials.names if names is None else tuple(names)
-    ranges = {name: Bounds.of(limits) for name, limits in parameters.items()}
+    ranges = {name: bounds_of(limits) for name, limits in parameters.items()}
     bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
     known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds]), **(first_guess or {})}
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}

@@ -21,7 +21,7 @@ from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import Material
 from ...io.arrays import FloatArray
 from ...mesh.volume_mesh import Mesh
-from ..parameters import Bounds, Prior
+from ...settings.learning import Bounds, Prior
 from .weak_form import Candidate, NormalEquations, WeakForm
 
 MODULUS: Final = ("c10", "bulk_1")  # of the smallest class, a neo-Hookean solid
@@ -272,23 +272,24 @@ def bounds_of_parameter(
     shear = 2.0 * guess["c10"]
     if name == "bulk_1":
         mean = max(value, shear)
-        return Bounds(0.1 * mean, max(10.0 * mean, _STIFFEST * shear), True, Prior(mean, 3.0 * mean))
+        most = max(10.0 * mean, _STIFFEST * shear)
+        return Bounds(lower=0.1 * mean, upper=most, logarithmic=True, prior=Prior(mean=mean, deviation=3.0 * mean))
     if name == "c10":
-        return Bounds(0.0, max(4.0 * value, shear), prior=modulus or Prior(value, shear))
+        return Bounds(lower=0.0, upper=max(4.0 * value, shear), prior=modulus or Prior(mean=value, deviation=shear))
     if name.startswith("prony_time"):
-        return Bounds(value / 4.0, 4.0 * value, True)
+        return Bounds(lower=value / 4.0, upper=4.0 * value, logarithmic=True)
     if name.startswith(("fibre_azimuth", "fibre_elevation")):
-        return Bounds(value - _TURN, value + _TURN)
+        return Bounds(lower=value - _TURN, upper=value + _TURN)
     if name.startswith("fibre_slack"):
-        return Bounds(0.0, 0.1)
+        return Bounds(lower=0.0, upper=0.1)
     if name.startswith("fibre_toe"):
-        return Bounds(0.002, 0.1, True)
+        return Bounds(lower=0.002, upper=0.1, logarithmic=True)
     if name in VISCOSITIES:
         known = guess[name]
         most = (0.01 if name == "shear_viscosity" else 1.0) * shear
-        prior = Prior(known, known) if known > 1e-6 * shear else None
-        return Bounds(0.0, max(4.0 * value, 4.0 * known, most), prior=prior)
-    return Bounds(0.0, max(4.0 * value, shear), prior=Prior(0.0, deviation * shear))
+        prior = Prior(mean=known, deviation=known) if known > 1e-6 * shear else None
+        return Bounds(lower=0.0, upper=max(4.0 * value, 4.0 * known, most), prior=prior)
+    return Bounds(lower=0.0, upper=max(4.0 * value, shear), prior=Prior(mean=0.0, deviation=deviation * shear))
 
 
 def is_shape(name: str) -> bool:

@@ -25,9 +25,9 @@ from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
 from ...io.errors import InputError
 from ...io.parts import Checkpoint
-from ...settings.learning import LawSettings
+from ...settings.learning import Bounds, LawSettings, Prior
 from ..observed_motions import Identified, ObservedMotions
-from ..parameters import Bounds, Limits, Prior
+from ..parameters import Limits, bounds_of
 from .law import (
     VISCOSITIES,
     IdentifiedLaw,
@@ -95,7 +95,7 @@ def identify_law(
     """
     if "" not in simulator.materials:
         raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
-    ranges = {name: Bounds.of(limits) for name, limits in (parameters or {}).items()}
+    ranges = {name: bounds_of(limits) for name, limits in (parameters or {}).items()}
     names = motions.trials.names if train is None else tuple(train)
     if motions.train_fraction < 1.0:
         learned = motions.train_fraction * float(motions.trials.times.max())
@@ -388,5 +388,5 @@ class _LawSearch:
         prior, modulus = None, self.ranges.get("youngs_modulus")
         if modulus is not None and modulus.prior is not None:
             share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
-            prior = Prior(share * modulus.prior.mean, share * modulus.prior.deviation)
+            prior = Prior(mean=share * modulus.prior.mean, deviation=share * modulus.prior.deviation)
         return bounds_of_parameter(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)

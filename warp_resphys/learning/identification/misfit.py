@@ -22,8 +22,9 @@ from typing_extensions import override
 
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
+from ...settings.learning import Bounds
 from ...stepping.state import State
-from ..parameters import Bounds, check_names, split_name
+from ..parameters import check_names, split_name
 from ..placement import Accuracy, DisplacedMarkers
 from ..replay import Replay, Start, exact
 from ..trial_batch import TrialBatch

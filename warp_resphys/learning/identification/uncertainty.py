@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...io.arrays import FloatArray
-from ..parameters import Bounds
+from ...settings.learning import Bounds
 from .nuisances import Nuisances
 
 _UNIFORM = 12.0  # reciprocal variance of a parameter in its range, as a fraction of it

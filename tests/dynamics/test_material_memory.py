@@ -271,7 +271,7 @@ def test_branches_without_modulus_have_a_gradient():
         (lambda: replace(ELASTIC, prony=[0.3]), "give a (ratio, time) for each branch"),
         (lambda: replace(ELASTIC, prony=[(0.3, 0.0)]), "prony_time_1 is"),
         (lambda: make_material(prony_ratio_1=0.1), "prony has prony_ratio_1: give each branch"),
-        (lambda: make_material(prony=3), "has no constant 'prony'"),
+        (lambda: make_material(prony=3), "has no parameter 'prony'"),
     ],
 )
 def test_wrong_branches_and_sliders_are_refused(make, said):

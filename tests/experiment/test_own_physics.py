@@ -120,7 +120,7 @@ def test_another_version_is_told_and_runs_stages_again(installed, tmp_path, monk
         ("simulation._target_=arruda", r"material model is 'arruda': choose one of corotated, .* class as _target_"),
         ("simulation._target_=os.system", r"simulation: os\.system cannot be imported .*module of Python itself"),
         ("simulation._target_=my_robot_physics.sines.Sines", r"Sines is no subclass of .*materials\.Material"),
-        ("simulation.locking=3", r"simulation: arruda_boyce has no constant 'locking'"),
+        ("simulation.locking=3", r"simulation: arruda_boyce has no parameter 'locking'"),
         ("energies.magnet._target_=my_robot.Magnet", r"energies\.magnet: .* cannot be imported .*No module named"),
         ("energies.magnet._target_=my_robot_physics.magnet.Coil", r"magnet\.Coil cannot be imported .*no attribute"),
         ("energies.magnet._target_=torch.nn.Linear", r"Linear is no subclass of warp_resphys\.energies\.base\.Energy"),

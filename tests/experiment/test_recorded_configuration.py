@@ -42,7 +42,7 @@ RECORDED = [
     ("markers/bind_to", None, "markers.bind is rigid: set markers.bind_to"),
     ("markers/reference/Tip - 1", [0.1, 0.0, 0.0], "markers.tracked and markers.reference both have 'Tip - 1'"),
     ("markers", None, "markers is null, but data.kind is recorded"),
-    ("published/simulation/colour", 1.0, "published.simulation: corotated has no constant 'colour'"),
+    ("published/simulation/colour", 1.0, "published.simulation: corotated has no parameter 'colour'"),
     ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
     ("identify/parameters/colour", WHOLE, "identify.parameters names 'colour'"),
     ("identify/elastic/density", WHOLE, "identify.elastic names 'density'"),

@@ -229,6 +229,7 @@ def test_recordings_that_begin_with_the_release_of_a_deformed_body(shelf):
     for name, recording in shelf.recordings.items():
         shelf.write(name, positions=recording.positions[44:], rest=np.median(recording.positions[:40], axis=0))
     shelf.config["data"] |= {"begins": "released", "rest": "file", "seconds": 0.4}
+    shelf.config["release"]["sideways"] = 0.0
     results = shelf.bring_in()
     np.testing.assert_allclose(results["bound"], whole["bound"], rtol=0.0, atol=2e-5)
     np.testing.assert_allclose(results["held"], results["observed"][:, 0], rtol=0.0, atol=1e-12)
@@ -277,7 +278,10 @@ def still(shelf, noise):
         (lambda shelf: shelf.write("load52", positions=still(shelf, 1e-5)), "never moves by more than"),
         (give(actuation=np.zeros((101, 2))), "holds an actuation, 2 in each frame, which nothing here uses"),
         (give(rate=25.0), "has 25 frames per second, too few .* record at least 40"),
-        (lambda shelf: shelf.config["data"].update(rest="file"), r"has no array 'rest' .* or set data\.rest to held"),
+        (
+            lambda shelf: (shelf.config["data"].update(rest="file"), shelf.config["release"].update(sideways=0.0)),
+            r"has no array 'rest' .* or set data\.rest to held",
+        ),
     ],
 )
 def test_a_recording_that_cannot_be_used_is_named(shelf, wrong, message):
@@ -323,6 +327,7 @@ def test_a_wrong_vertical_and_a_body_that_is_too_short_are_noticed(shelf):
     refuse(shelf, r"bare\.h5: with data\.up .* degrees from the configured one: set data\.up", InputError)
     shelf.config["data"]["up"] = "x"
     shelf.config["mesh"]["size"] = [0.06, 0.03, 0.03]
+    shelf.config["data"]["payload_at"] = {"x": 0.06}
     shelf.config["markers"] |= {"bind": "normal", "bind_to": None}
     refuse(shelf, r"Marker 'Tip - \d' is \d\d\.\d mm from the surface", InputError)
 

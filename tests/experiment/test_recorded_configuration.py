@@ -44,15 +44,14 @@ RECORDED = [
     ("markers", None, "markers is null, but data.kind is recorded"),
     ("published/simulation/colour", 1.0, "published.simulation: corotated has no parameter 'colour'"),
     ("gravity", [0.0, 0.0, 0.0], "release.sideways is across gravity, but gravity is zero"),
-    ("identify/parameters/colour", WHOLE, "identify.parameters names 'colour'"),
-    ("identify/elastic/density", WHOLE, "identify.elastic names 'density'"),
+    ("identify/parameters/colour", WHOLE, "identify.parameters: there is no parameter 'colour' to identify"),
+    ("identify/elastic/density", WHOLE, "identify.elastic: there is no parameter 'density' to identify"),
     ("identify/parameters/density", {"lower": 2.0, "upper": 1.0}, "identify.parameters.density.lower is 2"),
     ("identify/first_guess/mass_damping", 50.0, "identify.first_guess.mass_damping is 50: .* from 0 to 10"),
-    ("identify/first_guess/colour", 1.0, "identify.first_guess names 'colour'"),
+    ("identify/first_guess/colour", 1.0, "identify.first_guess: there is no parameter 'colour' to identify"),
 ]
 PLAYED = [
     ("laboratory", None, "data.folder is not set: give the folder of the recordings"),
-    ("data/rest", "file", "data.rest is file, but the simulated bodies are held undeformed"),
     ("laboratory/seconds", 1.0, "laboratory.seconds is 1.0, less than data.seconds"),
     ("laboratory/material/stiffness_damping", -1.0, "laboratory.material: stiffness_damping is -1"),
     ("laboratory/test", [], "laboratory.test is empty: add at least one of laboratory.trials"),
@@ -75,7 +74,12 @@ def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
     pulled["laboratory"]["trials"]["m10"]["pull"] = [0.0, 0.1, 0.0]
     with pytest.raises(InputError, match=r"laboratory\.trials\.m10\.pull deforms the body .*: set data\.rest to file"):
         check(pulled)
-    for trial in pulled["laboratory"]["trials"].values():
+    trials = pulled["laboratory"]["trials"]
+    for pull in ([0.0, 0.1, 0.0], None):
+        trials["m10"]["pull"] = pull
+        with pytest.raises(InputError, match="data.rest is file, but the simulated bodies are held undeformed"):
+            check(changed(pulled, "data/rest", "file"))
+    for trial in trials.values():
         trial["pull"] = [0.0, 0.1, 0.0]
     check(changed(pulled, "data/rest", "file"))
 

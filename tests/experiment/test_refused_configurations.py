@@ -115,9 +115,12 @@ CASES = {
     PLATE: [
         ("regions.cap: no cell has its centre", "regions.cap.x=[0.2,0.3]"),
         ("no region 'lid'", "rigid.lid.density=1000"),
-        ("simulation.regions.tip: corotated has no constant", "simulation.regions.tip.youngs_module=1e5"),
+        ("simulation.regions.tip: corotated has no parameter", "simulation.regions.tip.youngs_module=1e5"),
         ("cap", "simulation.regions.cap.density=1000"),
-        ("parameters names 'youngs_modulus'", "identify.parameters.youngs_modulus={lower: 1.0, upper: 2.0}"),
+        (
+            "parameters: there is no parameter 'youngs_modulus'",
+            "identify.parameters.youngs_modulus={lower: 1.0, upper: 2.0}",
+        ),
         ("midpoint", "identify.integrator=midpoint"),
         ("at most 45, in degrees", "markers.rigid_bodies.plate.orientation_deviation=90"),
         ("plate.part is 'lid', but the rigid parts", "markers.rigid_bodies.plate.part=lid"),
@@ -161,7 +164,7 @@ CASES = {
         ("tendons.stiffness", "tendons.commanded=contraction"),
         ("left.offsets", "+tendons.routes.left.offsets=[[[1,0,0],[0,1,0],[0,0,1]]]"),
         ("3 tendons|the tendons have", "+tendons.routes.left.offsets=[[1,0,0]]"),
-        ("'tendon_offset_1_left': choose from", f"+{OFFSET}_left={{lower:-1,upper:1}}"),
+        ("'tendon_offset_1_left' to identify: choose from", f"+{OFFSET}_left={{lower:-1,upper:1}}"),
         ("tendons and muscles are two inputs of the body, but recordings have one: take one out", MUSCLES),
         (
             "no cell has its centre within x from 1 to 2",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..data.markers import MarkerMap
 from ..dynamics.simulator import Simulator
+from ..io.errors import InputError
 from ..io.fan_out import ALONE, Workers
 from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.progress import show
@@ -45,8 +46,7 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
         files: of the bodies, see `settings.stage_keys.StageSettings`.
     """
     assert run.ablation is not None
-    own = run.ablation
-    workers = workers_for(run.parallel, own.processes, run.device).at_most(len(own.counts))
+    workers = workers_for(run.parallel, run.ablation.processes, run.device).at_most(len(run.ablation.counts))
     keys = (*SIMULATOR, "simulation")
     generated = StageSettings.reading(run, *keys, "target", "data", files=files)
     drawn = (f"ablation.{name}" for name in ("counts", "draws", "modes"))
@@ -56,6 +56,24 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
         Stage("ablation", partial(ablate, workers=workers), (DRAWS, SUMMARY), ablated, ("generate",)),
         Stage("report", report_ablation, (REPORT,), run, ("ablation",)),
     ]
+
+
+def check_ablation(run: RunSettings, simulator: Simulator) -> None:
+    """Checks that the body has as many surface vertices as markers, and that forces can be reconstructed from them.
+
+    Raises:
+        InputError: it has fewer, or a method that does not fit.
+    """
+    assert run.ablation is not None
+    most, surface = max(run.ablation.counts), len(surface_vertices(simulator.body.mesh))
+    if most > surface:
+        raise InputError(
+            f"ablation.counts asks for {most} markers, but the mesh has {surface} surface vertices: use fewer, or "
+            "refine the mesh."
+        )
+    probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
+    method = dict(run.reconstruction) | {"modes": run.ablation.modes}
+    make_reconstructor(simulator, **method, observation=probe)
 
 
 def print_ablation(run: RunSettings, folder: Path) -> None:

@@ -83,7 +83,7 @@ def own_energies(settings: BodySettings) -> dict[str, Energy]:
     Raises:
         InputError: see `ClassSettings.factory`.
     """
-    return {name: own.factory(Energy, f"energies.{name}")() for name, own in settings.energies.items()}
+    return {name: energy.factory(Energy, f"energies.{name}")() for name, energy in settings.energies.items()}
 
 
 def build_chambers(settings: ChamberSettings | None, mesh: Mesh) -> tuple[Chamber, ...]:
@@ -116,8 +116,12 @@ class Drive:
         return self.quantity.per
 
 
-def _driving(settings: BodySettings) -> dict[str, tuple[Quantity, int]]:
-    """Inputs of a body with their number of values, by key; of energies of other packages, the first input."""
+def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
+    """Input of a body with its number of values; None without. Of energies of other packages it is the first.
+
+    Raises:
+        InputError: the body has several.
+    """
     driving: dict[str, tuple[Quantity, int]] = {}
     if settings.chambers is not None:
         driving["chambers"] = PRESSURE, settings.chambers.count
@@ -128,30 +132,23 @@ def _driving(settings: BodySettings) -> dict[str, tuple[Quantity, int]]:
     for name, energy in own_energies(settings).items():
         if energy.inputs:
             driving[f"energies.{name}"] = energy.inputs[0], energy.count
-    return driving
-
-
-def check_drive(settings: BodySettings) -> None:
-    """Checks that a body has one input at most.
-
-    Raises:
-        InputError: it has several.
-    """
-    driving = [*_driving(settings)]
     if len(driving) > 1:
-        raise InputError(
-            f"{driving[0]} and {driving[1]} are two inputs of the body, but recordings have one: take one out."
-        )
+        first, second, *_ = driving
+        raise InputError(f"{first} and {second} are two inputs of the body, but recordings have one: take one out.")
+    return next(iter(driving.values()), None)
 
 
 def driving_quantity(settings: BodySettings) -> Quantity | None:
     """Quantity that drives the body; None without actuators."""
-    return next((quantity for quantity, _ in _driving(settings).values()), None)
+    driving = _driving(settings)
+    return None if driving is None else driving[0]
 
 
 def driven_parts(settings: BodySettings) -> int:
     """Number of values of the driving input."""
-    return next(count for _, count in _driving(settings).values())
+    driving = _driving(settings)
+    assert driving is not None
+    return driving[1]
 
 
 def drive_of(settings: BodySettings, body: Body) -> Drive | None:

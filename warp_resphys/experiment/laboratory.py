@@ -23,14 +23,16 @@ from ..data.rigid_bodies import as_markers, corners_of, with_axes
 from ..data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
+from ..io.errors import InputError, number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
 from ..mesh.selection import select_vertices
 from ..settings.performed import Trial
-from ..settings.played import PlaySettings
-from ..settings.stage_keys import StageSettings
+from ..settings.played import LaboratorySettings
+from ..settings.run import RunSettings
+from ..settings.stage_keys import PLAYED, StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample
 from ..stepping.state import State
@@ -228,23 +230,74 @@ def laboratory_simulator(settings: StageSettings, gravity: FloatArray) -> Simula
     return build_simulator(simulated, settings.laboratory.material, payload_at=settings.payload_at)
 
 
-def largest_input(limit: float | None, laboratory: PlaySettings) -> float:
-    """Largest random or periodic input, in its unit, so that recorded ones stay within a limit with any zero."""
-    assert limit is not None
-    return limit - _FURTHEST_ZERO * laboratory.zero_noise
+def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:
+    """Checks that the laboratory of a run can record its trials.
+
+    Raises:
+        InputError: durations, inputs or time steps that do not fit the trials or the body.
+    """
+    data, laboratory, begins = run.recorded, run.laboratory, {trial.begins for trial in trials}
+    assert data is not None
+    assert laboratory is not None
+    for trial in trials:
+        if trial.pull is not None and data.rest != "file":
+            raise InputError(
+                f"laboratory.trials.{trial.name}.pull deforms the body before its release: set data.rest to file, so "
+                "that the recordings have the markers on the undeformed body."
+            )
+    if data.rest == "file" and any(trial.pull is None and trial.begins == "held" for trial in trials):
+        raise InputError("data.rest is file, but the simulated bodies are held undeformed: set it to held.")
+    if begins & {"held", "released"}:
+        for key in ("seconds", "held_seconds"):
+            if getattr(laboratory, key) is None:
+                raise InputError(f"laboratory.{key} is missing: released trials need it.")
+        if (laboratory.seconds or 0.0) < (data.seconds or 0.0):
+            raise InputError(
+                f"laboratory.seconds is {laboratory.seconds}, less than data.seconds ({data.seconds}): record at "
+                "least as long as the data are used."
+            )
+    _check_waves(laboratory, trials)
+    if begins & {*RESTING}:
+        substeps_of(run.time_step, laboratory, "laboratory")
+        if driving_quantity(laboratory) is not None:
+            driven = next(trial for trial in trials if trial.begins in RESTING)
+            _inputs_of(StageSettings.reading(run, *PLAYED), driven)
+
+
+def _check_waves(laboratory: LaboratorySettings, trials: Sequence[Trial]) -> None:
+    """Refuses waves of bodies without inputs, of trials without motion, and of other parts than those of the body."""
+    quantity = driving_quantity(laboratory)
+    for trial in trials:
+        if trial.waves is None:
+            continue
+        key = f"laboratory.trials.{trial.name}.waves"
+        if quantity is None or trial.begins not in RESTING:
+            why = "the body has no inputs" if quantity is None else f"the trial begins {trial.begins}"
+            raise InputError(f"{key} is set, but {why}: leave it out.")
+        count, parts = len(trial.waves.phases), driven_parts(laboratory)
+        if count != parts:
+            wanted = number_of(parts, quantity.per)
+            raise InputError(f"{key}.phases has {count} values, but the body has {wanted}: give as many phases.")
+    without = [trial.name for trial in trials if trial.begins in RESTING and not trial.is_driven]
+    if without and any(trial.waves is not None for trial in trials):
+        raise InputError(f"laboratory.trials.{without[0]}.waves is missing, which other trials have: add it.")
 
 
 def _inputs_of(settings: StageSettings, trial: Trial) -> FloatArray:
-    """(K + 1, C) inputs of a trial at the frames: its waves, or drawn from the seed and the number of its sequence."""
+    """(K + 1, C) inputs of a trial at the frames: its waves, or drawn from the seed and the number of its sequence.
+
+    They are small enough that recorded ones stay within the limit of inputs with any zero.
+    """
     draw = np.random.default_rng([settings.seed, 1, trial.sequence or 0])
-    assert settings.data.steps is not None
-    before = settings.data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
-    steps, parts = before + settings.data.steps, driven_parts(settings.laboratory)
-    limit = largest_input(settings.data.input_limit, settings.laboratory)
+    data, laboratory = settings.data, settings.laboratory
+    assert data.steps is not None
+    before = data.steps if trial.begins == UNDER_INPUTS else 0  # whose end finds the body under inputs
+    steps, parts = before + data.steps, driven_parts(laboratory)
+    limit = data.input_limit - _FURTHEST_ZERO * laboratory.zero_noise
     if trial.waves is not None:
         drawn = wave_inputs(trial.waves, limit, steps, settings.time_step)
     else:
-        drawn = draw_inputs(settings.laboratory.sequences, limit, steps, settings.time_step, parts, draw)
+        drawn = draw_inputs(laboratory.sequences, limit, steps, settings.time_step, parts, draw)
     drawn = drawn[before:]
     if trial.is_released:
         drawn = np.zeros_like(drawn)

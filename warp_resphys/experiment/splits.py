@@ -6,8 +6,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..data.rigid_bodies import owners
 from ..data.trials import evenly
-from ..io.errors import DataFileError, InputError
+from ..io.errors import DataFileError, InputError, listed
 from ..settings.data_kinds import RecordedData, ReleaseFromLoad, SimulatedData
 from ..settings.performed import Split, Trial, TrialSettings
 from ..settings.played import LaboratorySettings
@@ -30,7 +31,7 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
 
     Raises:
         DataFileError: the folder of recordings does not exist or has no recordings.
-        InputError: a trial has no file.
+        InputError: there are none, a trial has no file or that of another one, or a marker is in no trial.
     """
     data, trials = run.trial_data, dict[str, Trial]()
     if not isinstance(data, RecordedData):
@@ -41,22 +42,45 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
         others = data.others.items() if isinstance(data, ReleaseFromLoad) else ()
         return trials | {name: Trial(name=name, begins="given", load=held) for name, held in others}
 
-    def trial(name: str, own: TrialSettings, **given: Any) -> Trial:
-        return Trial(**{**dict(own), "name": name, "begins": own.begins or data.begins, "file": None, **given})
+    trials = _recorded(data) if data.folder is not None else _played(run, data)
+    if run.markers is not None:
+        tracked = run.markers.observed
+        if nowhere := [label for label in tracked if not any(trial.has(label) for trial in trials.values())]:
+            raise InputError(
+                f"{listed(owners(nowhere))} of markers.tracked or rigid_bodies is in no data.trials.NAME.labels: add "
+                "it there, or leave it out."
+            )
+    return trials
 
-    if data.folder is not None:
-        folder = Path(data.folder).expanduser()
-        for name, own in (data.trials or _recordings(folder)).items():
-            if own.file is None:
-                raise InputError(f"data.trials.{name}.file is missing: give the name of a file in data.folder.")
-            trials[name] = trial(name, own, file=str(folder / own.file))
-        return trials
+
+def _trial(data: RecordedData, name: str, settings: TrialSettings, **more: Any) -> Trial:
+    begins = settings.begins or data.begins
+    return Trial(**{**dict(settings), "name": name, "begins": begins, "file": None, **more})
+
+
+def _recorded(data: RecordedData) -> dict[str, Trial]:
+    """Trials with a recording in a folder."""
+    assert data.folder is not None
+    folder, trials, files = Path(data.folder).expanduser(), dict[str, Trial](), dict[str, str]()
+    for name, settings in (data.trials or _recordings(folder)).items():
+        if settings.file is None:
+            raise InputError(f"data.trials.{name}.file is missing: give the name of a file in data.folder.")
+        if (other := files.setdefault(settings.file, name)) != name:
+            raise InputError(f"the trials '{other}' and '{name}' have the same file, {settings.file}: use it once.")
+        trials[name] = _trial(data, name, settings, file=str(folder / settings.file))
+    return trials
+
+
+def _played(run: RunSettings, data: RecordedData) -> dict[str, Trial]:
+    """Trials of the simulated laboratory."""
     assert run.laboratory is not None
+    if not run.laboratory.trials and not data.sequences:
+        raise InputError("laboratory.trials is empty: name the trials, or set data.sequences.")
     drawn = {f"t{number:03d}": number for number in range(data.sequences)}
     trials = {name: Trial(name=name, begins=data.begins, sequence=number) for name, number in drawn.items()}
-    for name, own in run.laboratory.trials.items():
+    for name, settings in run.laboratory.trials.items():
         new = len(trials) if data.sequences else None
-        trials[name] = trial(name, own, sequence=trials[name].sequence if name in trials else new)
+        trials[name] = _trial(data, name, settings, sequence=trials[name].sequence if name in trials else new)
     return trials
 
 
@@ -65,7 +89,7 @@ def _recordings(folder: Path) -> dict[str, TrialSettings]:
     if not folder.is_dir():
         raise DataFileError(f"{folder} is not a folder: set data.folder to your recordings.")
     files: dict[str, str] = {}
-    for path in sorted(own for own in folder.iterdir() if own.suffix.lower() in _SUFFIXES):
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES):
         if (other := files.setdefault(path.stem, path.name)) != path.name:
             raise DataFileError(
                 f"{folder} has two recordings of one name, {other} and {path.name}: list the trials in data.trials."

@@ -7,18 +7,21 @@ parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
+import numpy as np
 import torch
 
 from ..data.input_response import RESPONSES, SLOPES
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
-from ..io.errors import InputError
+from ..energies.tendons import OFFSETS, Tendons
+from ..io.errors import InputError, naming
 from ..settings.learning import Bounds
 
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
 _OWN: Final = "@"
 HUNG: Final = ("attached_mass", PAYLOAD.name)
+_NOT_NEGATIVE: Final = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
 
 
 Limits = Bounds | tuple[float, float]
@@ -75,6 +78,52 @@ def check_names(names: Iterable[str], known: Sequence[str]) -> None:
     for name in (split_name(name)[0] for name in names):
         if name not in known:
             raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(known)}.")
+
+
+def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequence[str], sessions: bool) -> None:
+    """Checks the ranges of parameters that are to be identified from trials.
+
+    Args:
+        simulator: of the body.
+        ranges: ranges by name.
+        known: names that may be identified.
+        sessions: whether trials name their sessions.
+
+    Raises:
+        InputError: there is no range, a name is unknown, a parameter stands beside those of its parts, a time or a
+            slope may be negative, tendons leave the body at a bound, or nothing shares a value as `per` says.
+    """
+    if not ranges:
+        raise InputError(f"parameters is empty: give a range for at least one of {', '.join(known)}.")
+    with naming("parameters: "):
+        check_names(ranges, known)
+    of_parts = parameters_of_parts(simulator)
+    for name, limits in ranges.items():
+        if (parts := [part for part, (whole, _) in of_parts.items() if whole == name]) and {*parts} <= {*ranges}:
+            raise InputError(f"parameters names {name} and its parts, {', '.join(parts)}: choose one.")
+        if (word := command_of(simulator, name)[1]) in _NOT_NEGATIVE and limits.lower < 0.0:
+            raise InputError(
+                f"parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not negative: set it to "
+                "zero or more."
+            )
+        if limits.per in ("material", "lens"):
+            raise InputError(f"parameters.{name}.per is {limits.per}, which is for data.kind pictures: leave it out.")
+        if limits.per == "session" and not sessions:
+            raise InputError(f"parameters.{name}.per is session, but no trial names one: set data.trials.NAME.session.")
+        whole, part = of_parts.get(name, (name, None))
+        for end, value in (("lower", limits.lower), ("upper", limits.upper)):
+            with naming(f"parameters.{name}.{end}: "):
+                _check_routes(simulator, whole, part, value)
+
+
+def _check_routes(simulator: Simulator, name: str, part: int | None, value: float) -> None:
+    """Refuses a value of an offset with which tendons, all or one, leave the body."""
+    for tendons in (energy for energy in simulator.body.energies if isinstance(energy, Tendons)):
+        for number, quantity in enumerate(OFFSETS[: tendons.offset_count]):
+            if quantity.name == name:
+                offsets = np.zeros((tendons.count, tendons.offset_count))
+                offsets[slice(None) if part is None else part, number] = value
+                tendons.rerouted(offsets).points(simulator.body.mesh)
 
 
 def constants_of(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -21,7 +21,7 @@ def check_relations(run: RunKeys) -> None:
     _check_base(run)
     _check_obstacles(run)
     _check_view(run)
-    _check_identification(run)
+    _check_law(run)
     _check_control(run)
 
 
@@ -57,7 +57,7 @@ def _check_data(run: RunKeys) -> None:
 
 
 def _check_times(run: RunKeys) -> None:
-    """Checks that the time step resolves the configured frequencies."""
+    """Checks that the time step resolves the configured frequencies, and that trials are as long as the horizons."""
     data, trials = run.recorded, {} if run.laboratory is None else run.laboratory.trials
     frequencies = {
         f"{key}.swings.{name}.frequency": swing.frequency
@@ -71,6 +71,12 @@ def _check_times(run: RunKeys) -> None:
         if 2.0 * frequency * run.time_step >= 1.0:
             raise ValueError(
                 f"{key} is {frequency:g} Hz: it must be below {0.5 / run.time_step:g} Hz, half of the steps."
+            )
+    if data is not None and data.steps is not None and data.horizons:
+        length = data.steps * run.time_step
+        if data.horizons[-1] > length + 1e-9:
+            raise ValueError(
+                f"data.horizons is {list(data.horizons)}: they must rise, up to the {length:g} s of data.steps."
             )
 
 
@@ -115,8 +121,20 @@ def _check_obstacles(run: RunKeys) -> None:
 def _check_view(run: RunKeys) -> None:
     """Checks that the recordings show what the settings need of the positions of markers."""
     data, markers = run.recorded, run.markers
+    placement = None if run.identify is None else run.identify.placement
+    if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):
+        raise ValueError(
+            "identify.placement.mounting is of rigid bodies, and markers.rigid_bodies is empty: leave it out."
+        )
     if data is None or markers is None:
         return
+    if run.release.sideways and data.rest != "held":
+        raise ValueError(
+            f"release.sideways is {run.release.sideways:g} m, but data.rest is {data.rest}, which gives the markers on "
+            "the undeformed body: set release.sideways to 0."
+        )
+    if run.release.sideways and not any(run.gravity):
+        raise ValueError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
     if data.base_motion == "reference" and len(markers.reference) < 3:
         raise ValueError(
             "data.base_motion is reference: name three markers or more, not on a line, in markers.reference."
@@ -132,36 +150,21 @@ def _check_view(run: RunKeys) -> None:
             "them out."
         )
     whole = markers.plane is None and markers.frame == "body"
-    if not whole and run.identify is not None and run.identify.placement is not None:
+    if not whole and placement is not None:
         raise ValueError(
             "identify.placement is set, but with markers.plane, or markers.frame own, recordings do not determine "
             "positions of markers and pose of the body: set it to null."
         )
 
 
-def _check_identification(run: RunKeys) -> None:
-    """Checks the law beside the material, and parameters of which trials or sessions have their own values."""
+def _check_law(run: RunKeys) -> None:
+    """Checks the law beside the material that it takes the place of."""
     if run.law is not None and run.simulation.regions:
         raise ValueError("law: the simulator has materials by region, and one law is for one material: leave law out.")
     if run.law is not None and run.law.file is None and run.simulation.model == "law":
         raise ValueError(
             "law: simulation.model is law already: identify its parameters in identify.parameters, or take another one."
         )
-    if run.identify is None or run.pictures is not None:
-        return
-    tables = [group.trials for group in (run.recorded, run.laboratory) if group is not None]
-    named = any(trial.session for table in tables for trial in table.values())
-    placement, markers = run.identify.placement, run.markers
-    if placement is not None and placement.mounting is not None and (markers is None or not markers.rigid_bodies):
-        raise ValueError(
-            "identify.placement.mounting is of rigid bodies, and markers.rigid_bodies is empty: leave it out."
-        )
-    for name, limits in run.identify.parameters.items():
-        key = f"identify.parameters.{name}.per"
-        if limits.per == "material":
-            raise ValueError(f"{key} is material, which is for data.kind pictures: leave it out.")
-        if limits.per == "session" and not named:
-            raise ValueError(f"{key} is session, but no trial names one: set data.trials.NAME.session.")
 
 
 def _check_control(run: RunKeys) -> None:

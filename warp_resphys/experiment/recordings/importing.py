@@ -41,15 +41,15 @@ def import_recordings(context: StageContext) -> None:
         DataFileError: a recording cannot be read or used; the message names the file and the marker.
         InputError: a configured value is invalid.
     """
-    recorded = RegisteredTrials(context)
+    recorded = RegisteredTrials(context.settings, context.run_dir)
     _check_input_unit(recorded)
     names, sessions = [trial.name for trial in recorded.trials], [trial.session for trial in recorded.trials]
     if text := sessions_text({n: r.rate for n, r in zip(names, recorded.measured, strict=True)}, sessions):
         log.warning("import: %s", text)
-    training = names if recorded.settings.learned is None else recorded.settings.learned
+    training = names if context.settings.learned is None else context.settings.learned
     offsets = _offsets(recorded)
     bound = _bound(recorded, offsets, training)
-    bound_markers(recorded.markers, recorded.simulator.body.mesh, bound, recorded.tracked)  # Refuses a far marker.
+    bound_markers(recorded.markers, recorded.body.mesh, bound, recorded.tracked)  # Refuses a far marker.
     mountings = _mountings(recorded, bound, offsets, training)
     verticals, gravity = _verticals(recorded)
     shifts = _shifts(recorded, bound, offsets)
@@ -73,7 +73,8 @@ def import_scaled(context: StageContext) -> None:
     Raises:
         DataFileError: a recording cannot be read or used.
     """
-    recorded, dataset = RegisteredTrials(context), Trials.read(context.run_dir / DATASET)
+    recorded = RegisteredTrials(context.settings, context.run_dir)
+    dataset = Trials.read(context.run_dir / DATASET)
     assert dataset.bound is not None
     shifts = _shifts(recorded, dataset.bound, _offsets(recorded))
     _dataset(recorded, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
@@ -262,7 +263,7 @@ def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, 
         gravity=gravity,
         time_step=settings.time_step,
         bound=bound,
-        smoothed=smoothed if settings.data.cutoff is not None or {*begins} <= {*RESTING} else None,
+        smoothed=smoothed if recorded.data.cutoff is not None or {*begins} <= {*RESTING} else None,
         base=_motion(recorded, "the base", [r.base for r in recorded.moving], at_steps) if moved else None,
         obstacles=obstacles,
         sessions=sessions if any(sessions) else (),
@@ -328,7 +329,7 @@ def _motion(
     recorded: RegisteredTrials, what: str, poses: Sequence[FloatArray | None], at_steps: FloatArray
 ) -> FloatArray:
     """(R, K + 1, 6) motion of the base or of an obstacle at the steps (K + 1,), from the poses at the frames."""
-    motion, points = np.zeros((len(poses), len(at_steps), 6)), recorded.simulator.body.mesh.vertices
+    motion, points = np.zeros((len(poses), len(at_steps), 6)), recorded.body.mesh.vertices
     for row, (trial, moving, at_frames) in enumerate(zip(recorded.trials, recorded.moving, poses, strict=True)):
         if at_frames is not None:
             zero = 0.0 if trial.is_released else moving.start  # of the simulation

@@ -4,27 +4,30 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...data.marker_names import assign
 from ...data.marker_view import MarkerView
+from ...data.markers import follow_vertices
 from ...data.recordings.processing import obstacle_motion
 from ...data.recordings.recording import Recording
 from ...data.recordings.recording_files import read_recording
 from ...data.registration import axes_rotation, unit_vector
 from ...data.rigid_bodies import corners_of, motion_between, owners, with_corners
-from ...data.trials import STATIC, payload_inputs
+from ...data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
+from ...dynamics.simulator import Simulator
 from ...io.arrays import FloatArray
-from ...io.errors import DataFileError, InputError, listed
-from ...io.resuming import StageContext
+from ...io.errors import DataFileError, InputError, listed, naming, number_of
+from ...mesh.selection import select_vertices
 from ...settings.data_kinds import ReadingSettings
 from ...settings.performed import Trial
-from ...settings.stage_keys import StageSettings
+from ...settings.run import RunSettings
 from ...stepping.inputs import Inputs
 from ..actuators import drive_of
-from ..build import bound_markers, build_simulator, marker_view_of, nominal_places
+from ..build import bound_markers, build_body, build_simulator, marker_view_of, mounted_on, nominal_places
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +40,9 @@ class Reader:
     """Reads recordings, and computes the expected places of their markers.
 
     Args:
-        context: context of the stage.
+        settings: of the run, or of its stage.
+        trials: the trials that are read.
+        folder: run folder, with the recordings of a simulated laboratory.
 
     Attributes:
         drive: input that drives the body; None without actuators.
@@ -46,24 +51,98 @@ class Reader:
         rotation: (3, 3) rotation from the frame of the recordings to the frame of the body; None if registration
             determines it.
         vertical: upward directions in the frames of the recordings and of the body; None if either is unknown.
-        enough: number of reference markers that suffice to register a recording.
+        enough: number of reference markers that suffice to register a recording: 1 with known rotation, 2 with known
+            vertical, else 3.
+
+    Raises:
+        InputError: the trials cannot be read, registered or driven with these settings.
+        MeshError: no vertex lies at a place.
     """
 
-    def __init__(self, context: StageContext) -> None:
-        settings: StageSettings = context.settings
+    def __init__(self, settings: RunSettings, trials: Sequence[Trial], folder: Path) -> None:
         assert settings.markers is not None
+        assert isinstance(settings.data, ReadingSettings)
         self.data: ReadingSettings = settings.data
-        self.settings, self.markers = settings, settings.markers
-        self.simulator = build_simulator(settings, settings.simulation, payload_at=settings.payload_at)
-        self.drive = drive_of(settings, self.simulator.body)
+        self.settings, self.markers, self.trials = settings, settings.markers, trials
+        self.body = build_body(settings, settings.payload_at)
+        self.drive = drive_of(settings, self.body)
         self.tracked = list(self.markers.observed)
-        self.nominal = nominal_places(self.markers, self.simulator.body.mesh)
+        self._check_binding()
+        self.nominal = nominal_places(self.markers, self.body.mesh)
         self._reference = np.array([*self.markers.reference.values()], dtype=np.float64).reshape(-1, 3)
-        self.rotation = None if self.data.axes is None else axes_rotation(self.data.axes)
+        with naming("data.axes: "):
+            self.rotation = None if self.data.axes is None else axes_rotation(self.data.axes)
         up, gravity = self.data.up, np.asarray(settings.gravity, dtype=np.float64)
         self.vertical = None if up is None or not gravity.any() else (unit_vector(up), -gravity)
-        self.enough = standing_enough(self.data, settings.gravity)
-        self._run_dir = context.run_dir
+        self.enough = 1 if self.rotation is not None else 3 if self.vertical is None else 2
+        self._folder = folder
+        self._check_trials()
+        self._check_registration()
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """The uncorrected simulator."""
+        return build_simulator(self.settings, self.settings.simulation, self.body)
+
+    def _check_binding(self) -> None:
+        """Refuses places without vertices that markers and rigid bodies could follow."""
+        if self.markers.bind_to is not None:
+            select_vertices(self.body.mesh, **self.markers.bind_to.arguments())
+        for name, mounted in self.markers.rigid_bodies.items():
+            if mounted.part is not None and mounted.part not in self.body.rigid:
+                raise InputError(
+                    f"markers.rigid_bodies.{name}.part is {mounted.part!r}, but the rigid parts of the body are "
+                    f"{listed([*self.body.rigid])}: choose one, or name the vertices of a stiff plate in at."
+                )
+            with naming(f"markers.rigid_bodies.{name}: "):
+                follow_vertices(self.body.mesh, mounted_on(mounted, self.body.mesh), np.zeros((1, 3)))
+
+    def _check_trials(self) -> None:
+        """Refuses trials without markers, durations, limits of their inputs, or a place for their payload."""
+        data, drive, begins = self.data, self.drive, {trial.begins for trial in self.trials}
+        for trial in self.trials:
+            if not self.tracked_in(trial):
+                raise InputError(
+                    f"data.trials.{trial.name}.labels names {listed(trial.labels or ())}, none of which is in "
+                    f"markers.tracked or rigid_bodies: {listed(owners(self.tracked))}."
+                )
+            if trial.begins == STATIC and (data.base_motion is not None or trial.base_motion is not None):
+                raise InputError(f"the trial '{trial.name}' is a static pose: its base cannot move.")
+            if trial.begins == STATIC and (data.obstacle_motion or trial.obstacle_motion):
+                raise InputError(f"the trial '{trial.name}' is a static pose: obstacles cannot move in it.")
+        marker_view_of(self.markers, self.tracked, tuple({tuple(trial.tracked(self.tracked)) for trial in self.trials}))
+        payload_inputs(self.body, self.settings.payload_at, np.array([trial.payload for trial in self.trials]))
+        if begins & {"held", "released"} and data.seconds is None:
+            raise InputError(
+                "data.seconds is not set: give the time after the release of each trial that is used, in s."
+            )
+        if begins & {*RESTING} and data.steps is None and data.folder is None:
+            raise InputError("data.steps is not set: give the number of time steps of a simulated trial.")
+        if drive is not None and data.input_limit is None:
+            raise InputError(
+                f"data.input_limit is not set: give the largest input of the {drive.per}s, in {drive.quantity.unit}."
+            )
+        if drive is not None and data.parts is not None and max(data.parts) > len(drive.parts):
+            raise InputError(f"data.parts names {drive.per} {max(data.parts)}, but the body has {len(drive.parts)}.")
+
+    def _check_registration(self) -> None:
+        """Refuses too few markers for the registration of the trials."""
+        begins, standing, enough = {trial.begins for trial in self.trials}, len(self.markers.reference), self.enough
+        if (count := len(self.markers.tracked) + standing) < enough:
+            raise InputError(
+                f"markers.tracked and markers.reference name {number_of(count, 'marker')}: registration needs at least "
+                "3, or 2 with data.up, or 1 with data.axes."
+            )
+        if self.markers.labels == "assigned" and STATIC in begins and standing < enough:
+            raise InputError(
+                f"markers.labels is assigned, but markers.reference names {standing}: static poses need {enough} "
+                "reference markers" + (", or data.axes and one." if self.data.axes is None else ".")
+            )
+        if UNDER_INPUTS in begins and standing < enough and self.markers.frame != "own":
+            raise InputError(
+                f"trials that begin driven are bent from the first frame on, and markers.reference names {standing}: "
+                f"registration needs {enough} markers on what the body is fixed to, or markers.frame own."
+            )
 
     def tracked_in(self, trial: Trial) -> list[str]:
         """Labels of the tracked markers of a trial."""
@@ -108,7 +187,7 @@ class Reader:
 
     def _posed(self, inputs: Inputs) -> FloatArray:
         """(R, M, 3) tracked markers of the uncorrected simulator in equilibrium [m]."""
-        markers = bound_markers(self.markers, self.simulator.body.mesh, self.nominal, tuple(self.tracked))
+        markers = bound_markers(self.markers, self.body.mesh, self.nominal, tuple(self.tracked))
         places = markers.to(self.simulator.rest_positions)(self.simulator.static_equilibrium(inputs).q)
         return np.asarray(places.cpu().numpy())
 
@@ -153,7 +232,7 @@ class Reader:
         """Reads the recording of a trial, with its rigid bodies, inputs of the body's parts and obstacles."""
         data, drive = self.data, self.drive
         if data.folder is None:
-            recording = read_recording(self._run_dir / trial.recording)
+            recording = read_recording(self._folder / trial.recording)
         else:
             assert trial.file is not None
             recording = read_recording(trial.file, data.units, data.rate, trial.labels, data.table, data.bag)
@@ -252,20 +331,8 @@ class Reader:
             ]
             fields[self.drive.quantity.name] = like.new_tensor(np.stack(last))
         loads = np.array([trial.payload for trial in trials])
-        hung = payload_inputs(self.simulator.body, self.settings.payload_at, loads)
+        hung = payload_inputs(self.body, self.settings.payload_at, loads)
         return Inputs(**fields, **{key: like.new_tensor(masses) for key, masses in hung.items()})
-
-
-def standing_enough(data: ReadingSettings, gravity: Sequence[float]) -> int:
-    """Number of reference markers that suffice for registration: 1 with known rotation, 2 with known vertical, else 3.
-
-    Args:
-        data: how recordings are read.
-        gravity: (3,) gravity in the frame of the body [m/s^2].
-    """
-    if data.axes is not None:
-        return 1
-    return 3 if data.up is None or not any(gravity) else 2
 
 
 def central_places(positions: FloatArray, centre: Callable[..., Any]) -> FloatArray:

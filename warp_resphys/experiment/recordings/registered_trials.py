@@ -4,6 +4,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,8 @@ from ...data.rigid_bodies import corners_of, owners
 from ...data.trials import SLACK, STATIC, UNDER_INPUTS
 from ...io.arrays import BoolArray, FloatArray
 from ...io.errors import DataFileError, listed
-from ...io.resuming import StageContext
 from ...settings.performed import MotionSettings, Trial
+from ...settings.stage_keys import StageSettings
 from ..actuators import Drive
 from .reader import POSE_SECONDS, Reader, central_places
 
@@ -36,10 +37,10 @@ class RegisteredTrials(Reader):
     """The R trials of a stage, read, from time zero on, and registered to the body.
 
     Args:
-        context: context of the stage.
+        settings: of the stage.
+        folder: run folder.
 
     Attributes:
-        trials: their settings.
         measured: recordings of the configured markers as measured, tracked markers first.
         releases: of held bodies; None for other trials.
         moving: tracked markers from time zero on, with short gaps filled and long gaps NaN, in the frame of the
@@ -53,9 +54,8 @@ class RegisteredTrials(Reader):
         DataFileError: a recording cannot be read or used; the message names the file and the marker.
     """
 
-    def __init__(self, context: StageContext) -> None:
-        super().__init__(context)
-        self.trials: Sequence[Trial] = context.settings.trials
+    def __init__(self, settings: StageSettings, folder: Path) -> None:
+        super().__init__(settings, settings.trials, folder)
         timed = [self._timed(*pair) for pair in zip(self.trials, self.read(self.trials), strict=True)]
         self.measured, self.releases = [recording for recording, _ in timed], [release for _, release in timed]
         self._check_reference()

@@ -19,7 +19,15 @@ from ...io.errors import ConvergenceError
 from ...io.parts import Checkpoint
 from ...settings.learning import Bounds
 from ..observed_motions import ObservedMotions
-from ..parameters import Limits, bounds_of, configured_parameters, own_name, split_name
+from ..parameters import (
+    Limits,
+    bounds_of,
+    check_ranges,
+    configured_parameters,
+    identifiable_parameters,
+    own_name,
+    split_name,
+)
 from ..placement import Accuracy, PlainPlacements
 from ..replay import Replay, Start
 from .misfit import Misfit
@@ -73,6 +81,7 @@ def identify(
     """
     trials = motions.trials.names if names is None else tuple(names)
     ranges = {name: bounds_of(limits) for name, limits in parameters.items()}
+    check_ranges(simulator, ranges, identifiable_parameters(simulator), bool(motions.trials.sessions))
     bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
     known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds]), **(first_guess or {})}
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}

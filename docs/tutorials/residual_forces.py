@@ -28,7 +28,7 @@ from warp_resphys.data.markers import MarkerMap
 from warp_resphys.learning.residuals.correction import CorrectedSimulator, known_positions
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
 from warp_resphys.learning.residuals.reconstruction import make_reconstructor
-from warp_resphys.settings.learning import NetworkSettings
+from warp_resphys.settings.learning import NetworkSettings, ReconstructionSettings
 from warp_resphys.stepping.rollout import rollout
 
 wp.config.log_level = wp.LOG_WARNING
@@ -84,9 +84,8 @@ print(
 # Gauss-Newton needs two iterations per step.
 
 # %%
-reconstructor = make_reconstructor(
-    simulator, method="gauss_newton", regularisation=1e-10, tolerance=1e-10, max_iterations=20
-)
+settings = ReconstructionSettings(method="gauss_newton", regularisation=1e-10, tolerance=1e-10, max_iterations=20)
+reconstructor = make_reconstructor(simulator, settings)
 forces, misfit = [], 0.0
 for step in range(STEPS):
     state = State(motion.q[step], motion.v[step])
@@ -161,9 +160,8 @@ middle = select_vertices(mesh, x=0.05)
 corners = [0, 3, 12, 15]  # of the 16 vertices of a section
 seen = torch.as_tensor([*middle[corners], *tip[corners]])
 markers = MarkerMap(seen.view(1, -1, 1), torch.ones(1, len(seen), 1, dtype=torch.float64))
-from_markers = make_reconstructor(
-    simulator, "levenberg_marquardt", regularisation=1e-4, tolerance=1e-6, max_iterations=100, observation=markers
-)
+settings = ReconstructionSettings(method="levenberg_marquardt", regularisation=1e-4, tolerance=1e-6, max_iterations=100)
+from_markers = make_reconstructor(simulator, settings, markers)
 state = State(motion.q[0, 7:8], motion.v[0, 7:8])
 guess, off = None, []
 for step in range(40):

@@ -11,6 +11,7 @@ from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.residuals.reconstruction import follow, make_reconstructor
+from warp_resphys.settings.learning import ReconstructionSettings
 
 INTEGRATORS = ("implicit_euler", "bdf2", "midpoint")
 MESH = box_hexahedra((0.06, 0.03, 0.03), (2, 1, 1))
@@ -20,6 +21,12 @@ TIP = select_vertices(MESH, x=0.06)
 TIGHT = {"tolerance": 1e-12, "max_iterations": 50}
 PUBLISHED = {"tolerance": 1e-15, "max_iterations": 3000}
 STEMS = [[0.06, 0.012, 0.045], [0.03, -0.015, 0.013], [0.075, 0.02, 0.01]]
+
+
+def reconstructor(sim, method, regularisation, tolerance, max_iterations, modes=None, observation=WHOLE_STATE):
+    """The method with these settings."""
+    settings = {"method": method, "regularisation": regularisation, "tolerance": tolerance, "modes": modes}
+    return make_reconstructor(sim, ReconstructionSettings(**settings, max_iterations=max_iterations), observation)
 
 
 def simulator(stiffness_damping=0.0, **settings):
@@ -73,7 +80,7 @@ class TestGaussNewton:
         observed, start = observation()
         sim = simulator(device=device)
         on_device = State(start.q.to(device), start.v.to(device))
-        result = make_reconstructor(sim, "gauss_newton", 0.0, **TIGHT).step(on_device, observed[1].to(device))
+        result = reconstructor(sim, "gauss_newton", 0.0, **TIGHT).step(on_device, observed[1].to(device))
         np.testing.assert_allclose(result.state.q.cpu(), observed[1], rtol=0, atol=1e-16)
         speed = (observed[1] - observed[0]) / sim.time_step
         np.testing.assert_allclose(result.state.v.cpu(), speed, rtol=0, atol=1e-12)
@@ -90,7 +97,7 @@ class TestGaussNewton:
         observed, start = observation(5)
         found, counts = {}, []
         for tolerance in (1e-10, 1e-14):
-            method = make_reconstructor(simulator(), "gauss_newton", regularisation, tolerance, 20)
+            method = reconstructor(simulator(), "gauss_newton", regularisation, tolerance, 20)
             found[tolerance], _ = reconstruct(method, start, observed)
             counts.append(len(made))
         assert counts[0] <= most
@@ -101,14 +108,14 @@ class TestGaussNewton:
         _, start = observation()
         observed = start.q * torch.tensor([0.6, 1.0, 1.0], dtype=torch.float64)
         regularisation = 1e-4
-        solver = make_reconstructor(simulator(), "gauss_newton", regularisation, **TIGHT)
+        solver = reconstructor(simulator(), "gauss_newton", regularisation, **TIGHT)
         q, force = reconstruct(solver, start, torch.stack([start.q, observed]))
         steps = torch.zeros(24, 12, 3, dtype=torch.float64)
         steps[:, FREE] = 1e-6 * torch.eye(24, dtype=torch.float64).view(24, 8, 3)
 
         def missing(x):
             """Forces (B, 24) on the free vertices that bring the body to positions (B, 12, 3)."""
-            exact = make_reconstructor(simulator(), "gauss_newton", 0.0, **TIGHT)
+            exact = reconstructor(simulator(), "gauss_newton", 0.0, **TIGHT)
             state = State(*(field.expand(len(x), -1, -1) for field in (start.q, start.v)))
             return exact.step(state, x).force[:, FREE].flatten(1)
 
@@ -134,7 +141,7 @@ class TestGaussNewton:
             return np.concatenate([misfit, np.sqrt(regularisation) * force])
 
         best = scipy.optimize.least_squares(residuals, np.zeros(modes), "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
-        solver = make_reconstructor(sim, "gauss_newton", regularisation, **TIGHT, modes=modes, observation=markers)
+        solver = reconstructor(sim, "gauss_newton", regularisation, **TIGHT, modes=modes, observation=markers)
         expected = (basis @ torch.as_tensor(best.x)).view(1, 12, 3)
         result = solver.step(start, markers(observed[1]))
         np.testing.assert_allclose(result.force, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
@@ -143,7 +150,7 @@ class TestGaussNewton:
     def test_too_few_iterations(self, name, remedy):
         observed, start = observation()
         settings = {"tolerance": 1e-12, "max_iterations": 1, "observation": OBSERVED[name]}
-        solver = make_reconstructor(simulator(), "gauss_newton", 1e-4, **settings)
+        solver = reconstructor(simulator(), "gauss_newton", 1e-4, **settings)
         with pytest.raises(ConvergenceError, match=rf"moved by .* raise .*reconstruction\.{remedy}"):
             solver.step(start, solver.observation(observed[1]))
 
@@ -151,7 +158,7 @@ class TestGaussNewton:
     def test_errors_of_the_steps_do_not_add_up(self, integrator):
         damping = 1e-3 if integrator == "midpoint" else 0.0  # undamped, it rings
         observed, start = observation(40, damping=damping, integrator=integrator)
-        solver = make_reconstructor(simulator(damping, integrator=integrator), "gauss_newton", 1e-9, **TIGHT)
+        solver = reconstructor(simulator(damping, integrator=integrator), "gauss_newton", 1e-9, **TIGHT)
         q, _ = reconstruct(solver, start, observed)
         missed = (q - observed[1:]).abs().amax((1, 2, 3))
         assert float(missed[20:].max()) < float(missed[:20].max())
@@ -173,7 +180,7 @@ def test_the_published_method_finds_the_same_minimum(name, integrator, regularis
     markers, sim = OBSERVED[name], simulator(damping, integrator=integrator)
     observed, start = observation(1 if name in KINDS else 2, (0.5 if name in KINDS else 0.1,), integrator=integrator)
     (q, force), (q_other, force_other) = (
-        reconstruct(make_reconstructor(sim, *settings, observation=markers, **bounds), start, observed)
+        reconstruct(reconstructor(sim, *settings, observation=markers, **bounds), start, observed)
         for *settings, bounds in (("gauss_newton", regularisation, TIGHT), ("lbfgsb", regularisation, PUBLISHED))
     )
 
@@ -200,7 +207,7 @@ def test_forces_reproduce_the_motion_in_open_loop(method, integrator, name, mode
     sim, markers = simulator(integrator=integrator), OBSERVED[name]
     regularisation, share = (1e-5, 0.2) if name == "whole" else (1e-7, 0.3)
     settings = {"tolerance": 1e-12, "max_iterations": 500, "modes": modes, "observation": markers}
-    q, force = reconstruct(make_reconstructor(sim, method, regularisation, **settings), start, observed)
+    q, force = reconstruct(reconstructor(sim, method, regularisation, **settings), start, observed)
     assert not force[:, :, BODY.fixed_vertices].any()
     replayed = sim.rollout(start, 6, Inputs(force)).q[1:]
     uncorrected = sim.rollout(start, 6).q[1:]
@@ -220,7 +227,7 @@ class TestLevenbergMarquardt:
             seen = markers(target)
             seen[1, 0] = torch.nan
             damped, plain = (
-                make_reconstructor(sim, method, 1e-6, **TIGHT, modes=modes, observation=markers).step(
+                reconstructor(sim, method, 1e-6, **TIGHT, modes=modes, observation=markers).step(
                     state, seen, first_guess=first
                 )
                 for method, state in zip(("levenberg_marquardt", "gauss_newton"), states, strict=True)
@@ -236,7 +243,7 @@ class TestLevenbergMarquardt:
         _, start = observation(1, (0.1, 0.1))
         sim, markers = simulator(), markers_at([6, 11], [6, 11])
         target = markers(start.q) + torch.tensor([[[-0.03, 0.0, 0.05]], [[0.0, 0.0, 1e-3]]], dtype=torch.float64)
-        solver = make_reconstructor(sim, "levenberg_marquardt", 1e-5, 1e-10, 200, observation=markers)
+        solver = reconstructor(sim, "levenberg_marquardt", 1e-5, 1e-10, 200, observation=markers)
         result = solver.step(start, target)
         force = result.force.clone().requires_grad_(True)
         new = sim.step(start, Inputs(force))
@@ -249,12 +256,12 @@ class TestLevenbergMarquardt:
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"method": "adam"}, "reconstruction.method"),
+        ({"method": "adam"}, "ReconstructionSettings.method is 'adam'"),
         ({"method": "lbfgsb", "modes": 3}, "reconstruction.method"),
-        ({"regularisation": -1e-9, "observation": WHOLE_STATE}, "reconstruction.regularisation"),
+        ({"regularisation": -1e-9, "observation": WHOLE_STATE}, "ReconstructionSettings.regularisation"),
         ({"regularisation": 0.0}, "reconstruction.regularisation"),
-        ({"tolerance": 0.0}, "reconstruction.tolerance"),
-        ({"max_iterations": 0}, "reconstruction.max_iterations"),
+        ({"tolerance": 0.0}, "ReconstructionSettings.tolerance"),
+        ({"max_iterations": 0}, "ReconstructionSettings.max_iterations"),
         ({"modes": 25}, "25 vibration modes were asked for, but the body has 1 to 24."),
         ({"observation": markers_at([-1])}, "a marker is on a vertex that the body does not have"),
     ],
@@ -262,5 +269,5 @@ class TestLevenbergMarquardt:
 def test_bad_settings(settings, sentence):
     good = {"observation": markers_at([8]), "method": "gauss_newton", "regularisation": 1e-6, **TIGHT}
     with pytest.raises(InputError) as error:
-        make_reconstructor(simulator(), **{**good, **settings})
+        reconstructor(simulator(), **{**good, **settings})
     assert sentence in str(error.value)

@@ -72,8 +72,7 @@ def check_ablation(run: RunSettings, simulator: Simulator) -> None:
             "refine the mesh."
         )
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    method = dict(run.reconstruction) | {"modes": run.ablation.modes}
-    make_reconstructor(simulator, **method, observation=probe)
+    make_reconstructor(simulator, run.reconstruction.changed(modes=run.ablation.modes), probe)
 
 
 def print_ablation(run: RunSettings, folder: Path) -> None:
@@ -147,8 +146,7 @@ def _from_markers(context: StageContext, count: int, report: Report) -> Arrays:
     motion, like = simulator.tensor(read_motion(context.run_dir)[0]), simulator.rest_positions
     vertices = draw_markers(simulator, count, draws, settings.seed)
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=like.device), like.dtype)
-    more = dict(settings.reconstruction) | {"modes": settings.ablation.modes}
-    method = make_reconstructor(simulator, **more, observation=markers)
+    method = make_reconstructor(simulator, settings.reconstruction.changed(modes=settings.ablation.modes), markers)
     q = motion[0].expand(draws, *like.shape)
     error, misfit = list[torch.Tensor](), list[torch.Tensor]()
     targets = (markers(one.expand_as(q)) for one in motion[1:])

@@ -111,9 +111,7 @@ def _check_learning(run: RunSettings, simulator: Simulator, trials: Sequence[Tri
         with naming(f"shapes.{name}: "):
             check_shape(shape)
     marker = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_reconstructor(
-        simulator, **dict(run.reconstruction), observation=WHOLE_STATE if run.markers is None else marker
-    )
+    make_reconstructor(simulator, run.reconstruction, WHOLE_STATE if run.markers is None else marker)
     if run.identify is not None:
         with naming("identify."):
             _check_identification(run, run.identify, simulator, any(trial.session for trial in trials))

@@ -130,7 +130,7 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
         simulator = replace(simulator, time_step=1e6, integrator="implicit_euler")
     state, method, seconds = simulator.rest_state(len(names)), None, list[float]()
     if reconstructed:
-        method = make_reconstructor(simulator, **dict(settings.reconstruction), observation=replay.observe)
+        method = make_reconstructor(simulator, settings.reconstruction, replay.observe)
         method = method.with_constants(constants)
     support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None] * torch.ones_like(state.q)
     middle = round(float(replay.trials.times.max()) / simulator.time_step) // 2  # where inputs act

@@ -58,22 +58,8 @@ class ReconstructedStep:
 class Reconstructor(ABC):
     """Finds residual forces for a simulator; see `make_reconstructor`."""
 
-    def __init__(
-        self,
-        simulator: Simulator,
-        observation: Observation,
-        regularisation: float,
-        tolerance: float,
-        max_iterations: int,
-    ) -> None:
-        if not regularisation >= 0.0:
-            raise InputError(f"reconstruction.regularisation is {regularisation:g}: it must be zero or more.")
-        if not tolerance > 0.0:
-            raise InputError(f"reconstruction.tolerance is {tolerance:g}: it must be positive.")
-        if not max_iterations > 0:
-            raise InputError(f"reconstruction.max_iterations is {max_iterations}: it must be positive.")
-        self.simulator, self.regularisation = simulator, regularisation
-        self.tolerance, self.max_iterations = tolerance, max_iterations
+    def __init__(self, simulator: Simulator, settings: ReconstructionSettings, observation: Observation) -> None:
+        self.simulator, self.settings, self.regularisation = simulator, settings, settings.regularisation
         self.observation = observation.to(simulator.rest_positions)
         if not isinstance(observation, WholeState):
             self._check_sparse(observation)
@@ -125,13 +111,12 @@ class LeastSquares(Reconstructor):
 
     Args:
         problems: formulations of the same minimum, the fastest first.
-        modes: number of columns of B; any force on the free vertices if None.
-        settings: see `Reconstructor`.
+        arguments: see `Reconstructor`; ``modes`` is the number of columns of B.
     """
 
-    def __init__(self, problems: Sequence[type[StepProblem]], modes: int | None, *settings: Any) -> None:
-        super().__init__(*settings)
-        self._problems = tuple(problems)
+    def __init__(self, problems: Sequence[type[StepProblem]], *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._problems, modes = tuple(problems), self.settings.modes
         self._basis = None if modes is None else vibration_modes(self.simulator, modes)
 
     @override
@@ -146,8 +131,10 @@ class LeastSquares(Reconstructor):
         step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
-                problem = kind(*step, self._basis, self.tolerance)
-                result = minimise(problem, problem.start(first_guess), self.tolerance, self.max_iterations)
+                problem = kind(*step, self._basis, self.settings.tolerance)
+                result = minimise(
+                    problem, problem.start(first_guess), self.settings.tolerance, self.settings.max_iterations
+                )
                 if result.converged or number == len(self._problems):
                     break
                 log.info("full steps moved by %.1e m after %d: damped ones follow", result.last_step, result.iterations)
@@ -199,7 +186,12 @@ class LBFGSB(Reconstructor):
             start.cpu().double().numpy().ravel(),
             jac=True,
             method="L-BFGS-B",
-            options={"maxiter": self.max_iterations, "maxcor": 30, "ftol": self.tolerance, "gtol": 0.0},
+            options={
+                "maxiter": self.settings.max_iterations,
+                "maxcor": 30,
+                "ftol": self.settings.tolerance,
+                "gtol": 0.0,
+            },
         )
         if result.status == 1:  # An early end of the line search is no failure: the change is down to rounding.
             raise ConvergenceError(
@@ -246,30 +238,22 @@ def without_ringing(simulator: Simulator, observation: Observation) -> Simulator
 
 
 def make_reconstructor(
-    simulator: Simulator,
-    method: str,
-    regularisation: float,
-    tolerance: float,
-    max_iterations: int,
-    modes: int | None = None,
-    observation: Observation = WHOLE_STATE,
+    simulator: Simulator, settings: ReconstructionSettings, observation: Observation = WHOLE_STATE
 ) -> Reconstructor:
-    """Returns the reconstruction method of a name.
+    """Returns the reconstruction method that settings name.
 
     Args:
         simulator: to correct.
-        method: ``gauss_newton``, ``lbfgsb``, or for markers ``levenberg_marquardt``.
-        regularisation: lambda, positive for sparse observations [unit^2/N^2].
-        tolerance: see the methods.
-        max_iterations: of a step, after which it has failed.
-        modes: number of vibration modes that span the forces; any force on the free vertices if None.
+        settings: method, tolerances and modes; ``levenberg_marquardt`` and ``modes`` are for markers, which need a
+            positive regularisation.
         observation: C, for as many environments as the states have.
 
     Raises:
-        InputError: an unknown method, modes for a method without them, a number out of range, or a marker on a vertex
-            that the body does not have.
+        InputError: a method or modes that do not fit the observation, or a marker on a vertex that the body does not
+            have.
     """
     problems: dict[str, tuple[type[StepProblem], ...]] = {"gauss_newton": (FullStateProblem,)}
+    method, modes = settings.method, settings.modes
     if not isinstance(observation, WholeState):
         damped = (MarkerForceProblem,)
         problems = {"gauss_newton": (MarkerPositionProblem, *damped), "levenberg_marquardt": damped}
@@ -279,8 +263,8 @@ def make_reconstructor(
         raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
     if modes is not None and method == "lbfgsb":
         raise InputError(f"{modes} modes are asked for, but reconstruction.method=lbfgsb has none: take gauss_newton.")
-    settings = (simulator, observation, regularisation, tolerance, max_iterations)
-    return LBFGSB(*settings) if method == "lbfgsb" else LeastSquares(problems[method], modes, *settings)
+    arguments = (simulator, settings, observation)
+    return LBFGSB(*arguments) if method == "lbfgsb" else LeastSquares(problems[method], *arguments)
 
 
 @dataclass(frozen=True)
@@ -368,7 +352,7 @@ def _reconstructed(
         simulator = replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
         observed = torch.cat([torch.full_like(observed, torch.nan), observed], 1)
         inputs = resting
-    method = make_reconstructor(simulator, **dict(settings), observation=replay.observe)
+    method = make_reconstructor(simulator, settings, replay.observe)
     reached, forces = [state], [torch.zeros_like(state.q)]
     report()
     for step in follow(method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs):

@@ -23,12 +23,12 @@ import torch
 import warp as wp
 
 from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, select_vertices
-from warp_resphys.mesh import ArmGeometry, find_chambers, mesh_arm
+from warp_resphys.mesh import ArmMesh, find_chambers, mesh_arm
 
 wp.config.log_level = wp.LOG_WARNING
 
-geometry = ArmGeometry(chamber_lengths=(0.1,), caps=(0.008, 0.008), radii=(0.022, 0.018))  # m
-mesh, surfaces = mesh_arm(geometry, size=0.008)
+dimensions = ArmMesh(chamber_lengths=(0.1,), caps=(0.008, 0.008), radii=(0.022, 0.018), size=0.008)  # m
+mesh, surfaces = mesh_arm(dimensions)
 chambers = find_chambers(mesh)
 print(f"{len(mesh.vertices)} vertices; surfaces: {', '.join(surfaces)}")
 

@@ -14,7 +14,7 @@ from warp_resphys.io.safe_files import read_array, read_hdf5, read_json
 from warp_resphys.learning.identification.search import Identification
 from warp_resphys.report.identification_section import trials_table
 from warp_resphys.settings.body import MaterialSettings
-from warp_resphys.settings.mesh import FileMesh, GeneratedArm, HexahedralBox, RodMesh, ShippedArm
+from warp_resphys.settings.mesh import ArmMesh, FileMesh, HexahedralBox, RodMesh, ShippedArm
 from warp_resphys.stepping.inputs import Inputs
 
 MODULUS = 420e3  # Pa, of the body that is recorded; the experiment expects 505 kPa
@@ -131,7 +131,7 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
     assert finer(box, 1.5) == box.changed(divisions=[8, 3, 2])
     rod = RodMesh(kind="rod", centreline=[[0, 0, 0], [0, 0, 1]], radii=0.1, layers=4)
     assert finer(rod, 2.0) == rod.changed(layers=8)
-    arm = GeneratedArm(kind="arm_generated", size=0.006)
+    arm = ArmMesh(kind="arm_generated", size=0.006)
     assert finer(arm, 2.0) == arm.changed(size=0.003)
     assert finer(arm.changed(layers=0.01), 2.0) == arm.changed(size=0.003, layers=0.005)
     assert finer(file := FileMesh(kind="file", path="a.vtk"), 2.0) == file.changed(order=2)

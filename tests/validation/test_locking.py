@@ -12,7 +12,8 @@ import torch
 
 from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, SolverSettings, quadratic
 from warp_resphys.mesh import find_chambers
-from warp_resphys.mesh.arm import ArmGeometry, mesh_arm
+from warp_resphys.mesh.arm import mesh_arm
+from warp_resphys.settings.mesh import ArmMesh
 
 RUBBER = Corotated(264e3, 0.499, density=1070.0)
 CONVERGED = 31.63  # mm, under gravity
@@ -45,7 +46,7 @@ MESHES = {  # sizes of elements and layers [mm], nodes of a cell, and ways of th
 
 
 def arm(size, layers, nodes):
-    mesh = mesh_arm(ArmGeometry(), 1e-3 * size, layers=1e-3 * layers)[0]
+    mesh = mesh_arm(ArmMesh(size=1e-3 * size, layers=1e-3 * layers))[0]
     return mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
 
 

@@ -14,8 +14,8 @@ from ..fem.bodies import Body
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
 from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5
-from ..mesh.selection import select_vertices
-from ..settings.mesh import PlaceSettings
+from ..mesh.selection import vertices_at
+from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
 from .base_motion import at_times, contact_inputs
@@ -247,7 +247,7 @@ class Trials:
         return {name: inputs[name] for name in acting}
 
     def acting(
-        self, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float
+        self, names: Sequence[str], body: Body, payload_at: Place | None, time_step: float
     ) -> tuple[Inputs, Inputs]:
         """Returns what acts on trials that begin in the same way, in float64 on the CPU.
 
@@ -286,7 +286,7 @@ def _of_trials(file: h5py.Group, name: str, count: int) -> FloatArray:
     return read_array(file, name, (count, *[None] * (file[name].ndim - 1)) if name in file else None)
 
 
-def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArray) -> dict[str, FloatArray]:
+def payload_inputs(body: Body, payload_at: Place | None, loads: FloatArray) -> dict[str, FloatArray]:
     """Converts payloads to arguments of `Inputs` [kg].
 
     On a body with strings the result is (R, 1) `energies.strings.PAYLOAD`; otherwise it is an (R, N) ``attached_mass``,
@@ -308,7 +308,7 @@ def payload_inputs(body: Body, payload_at: PlaceSettings | None, loads: FloatArr
         return {"attached_mass": masses}
     if payload_at is None:
         raise InputError("a trial has a payload, but data.payload_at is not set: name the vertices that carry it.")
-    carrying = select_vertices(body.mesh, **payload_at.arguments())
+    carrying = vertices_at(body.mesh, payload_at)
     if np.isin(carrying, body.fixed_vertices).all():
         raise InputError("data.payload_at selects fixed vertices only: hang the payload on vertices that can move.")
     masses[:, carrying] = loads[:, None] / len(carrying)

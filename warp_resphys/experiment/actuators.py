@@ -23,11 +23,11 @@ from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
-from ..mesh.selection import select_cells, select_vertices
+from ..mesh.selection import select_cells, vertices_at
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
 from ..settings.contact import SurfaceFile
-from ..settings.mesh import PlaceSettings
+from ..settings.mesh import Place
 from ..stepping.quantity import Quantity
 
 # Driving input by group and the value of its key ``commanded``.
@@ -40,7 +40,7 @@ DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
 }
 
 
-def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSettings | None) -> list[Energy]:
+def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None) -> list[Energy]:
     """Builds the energies of a body besides its material.
 
     Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``payload_string``, ``obstacles`` and
@@ -69,7 +69,7 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: PlaceSetting
     if settings.payload_string is not None:
         if payload_at is None:
             raise InputError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
-        energies.append(Strings([select_vertices(mesh, **payload_at.arguments())], **dict(settings.payload_string)))
+        energies.append(Strings([vertices_at(mesh, payload_at)], **dict(settings.payload_string)))
     if settings.obstacles:
         energies.append(build_contact(settings))
     if settings.self_contact is not None:

@@ -4,8 +4,8 @@ Meshes and bodies are cached by their settings, since checks, stages and reports
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from importlib import resources
 from itertools import pairwise
@@ -28,21 +28,22 @@ from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import digest
 from ..io.errors import InputError, MeshError, naming
 from ..io.machine import available_memory_gib, find_device
-from ..mesh.arm import ArmGeometry, mesh_arm
+from ..io.settings import Settings
+from ..mesh.arm import mesh_arm
 from ..mesh.boxes import box_hexahedra, box_tetrahedra, boxes_hexahedra
 from ..mesh.readers import read_mesh
 from ..mesh.rod import rod
-from ..mesh.selection import select_cells, select_vertices
+from ..mesh.selection import select_cells, vertices_at
 from ..mesh.tetrahedra import fill_surface
 from ..mesh.volume_mesh import Mesh, check_mesh, join, quadratic
 from ..settings.body import BodySettings, MaterialSettings, SimulatorSettings
 from ..settings.mesh import (
+    ArmMesh,
     BoxesMesh,
     FileMesh,
-    GeneratedArm,
     HexahedralBox,
     MeshSettings,
-    PlaceSettings,
+    Place,
     RodMesh,
     ShippedArm,
     SurfaceMesh,
@@ -72,6 +73,34 @@ def simulation_device(name: str) -> torch.device:
     return choose_device("cpu" if name == "auto" else name)
 
 
+def _shipped_arms() -> list[str]:
+    folder = resources.files("warp_resphys") / "meshes"
+    return sorted(file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh"))
+
+
+def shipped_arm(name: str) -> Mesh:
+    """Reads a mesh that is shipped with the package.
+
+    Raises:
+        InputError: the name is unknown.
+    """
+    if name not in (names := _shipped_arms()):
+        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}.")
+    with resources.as_file(resources.files("warp_resphys") / "meshes" / f"{name}.msh") as path:
+        return read_mesh(path)
+
+
+_MAKERS: Mapping[type[Settings], Callable[..., Mesh]] = {
+    HexahedralBox: box_hexahedra,
+    TetrahedralBox: box_tetrahedra,
+    BoxesMesh: boxes_hexahedra,
+    FileMesh: read_mesh,
+    SurfaceMesh: fill_surface,
+    ShippedArm: shipped_arm,
+    RodMesh: rod,
+}
+
+
 def build_mesh(settings: MeshSettings) -> Mesh:
     """Builds the mesh of the group ``mesh``.
 
@@ -93,7 +122,11 @@ def _built_mesh(settings: MeshSettings, file: str | None) -> Mesh:
     """Builds a mesh; ``file`` is the digest of its file."""
     if isinstance(settings, HexahedralBox | TetrahedralBox):
         _check_memory(settings.divisions)
-    mesh = _read_or_generate(settings)
+    if isinstance(settings, ArmMesh):
+        mesh, _ = mesh_arm(settings)
+        mesh = quadratic(mesh) if settings.order == 2 else mesh
+    else:
+        mesh = _MAKERS[type(settings)](**settings.arguments())
     check_mesh(mesh)
     return mesh
 
@@ -106,28 +139,6 @@ def _check_memory(divisions: Sequence[int]) -> None:
             f"mesh.divisions gives {cells:,} cells, which take at least {needed:.3g} GiB, but {limit:.3g} GiB are "
             "free: use fewer."
         )
-
-
-def _read_or_generate(settings: MeshSettings) -> Mesh:
-    match settings:
-        case HexahedralBox():
-            return box_hexahedra(settings.size, settings.divisions, settings.nodes)
-        case TetrahedralBox():
-            return box_tetrahedra(settings.size, settings.divisions, settings.order)
-        case BoxesMesh():
-            return boxes_hexahedra(settings.boxes, settings.size, settings.nodes)
-        case FileMesh():
-            return read_mesh(settings.path, settings.units, settings.order, settings.drop_unreferenced)
-        case SurfaceMesh():
-            return fill_surface(settings.path, settings.size, settings.units, settings.order)
-        case ShippedArm():
-            return shipped_arm(settings.name)
-        case RodMesh():
-            return rod(**{key: value for key, value in dict(settings).items() if key != "kind"})
-        case GeneratedArm():
-            geometry = ArmGeometry(**{field.name: getattr(settings, field.name) for field in fields(ArmGeometry)})
-            mesh, _ = mesh_arm(geometry, settings.size, settings.cells, settings.layers)
-            return quadratic(mesh) if settings.order == 2 else mesh
 
 
 def finer(settings: MeshSettings, times: float) -> MeshSettings:
@@ -143,7 +154,7 @@ def finer(settings: MeshSettings, times: float) -> MeshSettings:
             return settings.changed(size=settings.size / times)
         case RodMesh():
             return settings.changed(layers=math.ceil(times * settings.layers))
-        case GeneratedArm():
+        case ArmMesh():
             layers = None if settings.layers is None else settings.layers / times
             return settings.changed(size=settings.size / times, layers=layers)
         case FileMesh():
@@ -151,23 +162,6 @@ def finer(settings: MeshSettings, times: float) -> MeshSettings:
         case ShippedArm():
             by_size = sorted(_shipped_arms(), key=lambda name: int(name.rpartition("_")[2]))
             return settings.changed(name=dict(pairwise(by_size)).get(settings.name, settings.name))
-
-
-def _shipped_arms() -> list[str]:
-    folder = resources.files("warp_resphys") / "meshes"
-    return sorted(file.name.removesuffix(".msh") for file in folder.iterdir() if file.name.endswith(".msh"))
-
-
-def shipped_arm(name: str) -> Mesh:
-    """Reads a mesh that is shipped with the package.
-
-    Raises:
-        InputError: the name is unknown.
-    """
-    if name not in (names := _shipped_arms()):
-        raise InputError(f"mesh.name is {name!r}: the arms that come with the package are {', '.join(names)}.")
-    with resources.as_file(resources.files("warp_resphys") / "meshes" / f"{name}.msh") as path:
-        return read_mesh(path)
 
 
 def build_material(settings: MaterialSettings, key: str) -> Material | dict[str, Material]:
@@ -183,7 +177,7 @@ def build_material(settings: MaterialSettings, key: str) -> Material | dict[str,
     return materials.get("", materials)
 
 
-def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, mesh: Mesh | None = None) -> Body:
+def build_body(settings: BodySettings, payload_at: Place | None = None, mesh: Mesh | None = None) -> Body:
     """Builds the body of a configuration.
 
     Args:
@@ -202,15 +196,15 @@ def build_body(settings: BodySettings, payload_at: PlaceSettings | None = None, 
 
 
 @lru_cache(maxsize=8)
-def _built_body(settings: BodySettings, payload_at: PlaceSettings | None, files: tuple[str | None, ...]) -> Body:
+def _built_body(settings: BodySettings, payload_at: Place | None, files: tuple[str | None, ...]) -> Body:
     """Builds a body; ``files`` are the digests of the files of its meshes."""
     return _body(settings, payload_at, whole_mesh(settings))
 
 
-def _body(settings: BodySettings, payload_at: PlaceSettings | None, mesh: Mesh) -> Body:
+def _body(settings: BodySettings, payload_at: Place | None, mesh: Mesh) -> Body:
     mesh = _with_regions(mesh, settings)
     energies = build_actuators(settings, mesh, payload_at)
-    fixed = () if settings.fixed is None else select_vertices(mesh, **settings.fixed.arguments())
+    fixed = () if settings.fixed is None else vertices_at(mesh, settings.fixed)
     glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
     planes = _symmetry_planes(settings.symmetry)
     more = {"rigid": settings.rigid, "glued": glued, "symmetry": planes, **dict(settings.physics)}
@@ -255,7 +249,7 @@ def _glue(mesh: Mesh, settings: BodySettings, number: int) -> Glue:
     with naming(f"glued[{number}]: "):
         members = np.unique(mesh.cells[mesh.region(glue.region)])
         mesh.region(glue.to)
-        vertices = np.intersect1d(select_vertices(mesh, **glue.at.arguments()), members)
+        vertices = np.intersect1d(vertices_at(mesh, glue.at), members)
     if not len(vertices):
         raise MeshError(f"glued[{number}].at: no vertex of the region {glue.region!r} lies there.")
     return Glue(vertices, glue.to, glue.tolerance)
@@ -297,7 +291,7 @@ def bound_markers(settings: BindingSettings, mesh: Mesh, places: ArrayLike, labe
             markers = bind_markers(
                 *tracked,
                 kind=settings.bind,
-                vertices=None if to is None else select_vertices(mesh, **to.arguments()),
+                vertices=None if to is None else vertices_at(mesh, to),
                 largest_distance=settings.largest_distance,
                 patch=settings.patch,
             )
@@ -313,7 +307,7 @@ def mounted_on(settings: RigidBodySettings, mesh: Mesh) -> IntArray:
     """
     if settings.part is None:
         assert settings.at is not None
-        return select_vertices(mesh, **settings.at.arguments())
+        return vertices_at(mesh, settings.at)
     return np.unique(mesh.cells[mesh.region(settings.part)])
 
 
@@ -350,7 +344,7 @@ def build_simulator(
     settings: SimulatorSettings,
     material: MaterialSettings,
     body: Body | None = None,
-    payload_at: PlaceSettings | None = None,
+    payload_at: Place | None = None,
     on_failure: str | None = None,
 ) -> Simulator:
     """Builds the simulator of a configuration.

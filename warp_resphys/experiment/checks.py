@@ -18,7 +18,7 @@ from ..io.errors import InputError, naming, number_of
 from ..learning.parameters import MASS_FACTOR, check_names, check_ranges, identifiable_parameters
 from ..learning.residuals.networks import core_factory
 from ..learning.residuals.reconstruction import make_reconstructor
-from ..mesh.selection import select_vertices
+from ..mesh.selection import vertices_at
 from ..settings.data_kinds import ReleaseFromLoad
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.performed import Trial
@@ -49,7 +49,7 @@ def check_run(run: RunSettings) -> None:
     body = build_body(run, run.payload_at)
     drive = drive_of(run, body)
     assert run.tip is not None
-    select_vertices(body.mesh, **run.tip.arguments())
+    vertices_at(body.mesh, run.tip)
     simulator = build_simulator(run, run.simulation, body)
     _check_target(run, body, drive)
     if run.ablation is not None:
@@ -83,7 +83,7 @@ def _check_target(run: RunSettings, body: Body, drive: Drive | None) -> None:
             places = {f"data.others.{name}.at": one.at for name, held in others for one in held if one.at}
             for place, at in {"data.load": run.data.load, **places}.items():
                 with naming(f"{place}: "):
-                    select_vertices(simulator.body.mesh, **at.arguments())
+                    vertices_at(simulator.body.mesh, at)
 
 
 def _check_drive(drive: Drive | None, real: Drive | None) -> None:

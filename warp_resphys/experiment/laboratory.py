@@ -28,7 +28,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
-from ..mesh.selection import select_vertices
+from ..mesh.selection import vertices_at
 from ..settings.performed import Trial
 from ..settings.played import LaboratorySettings
 from ..settings.run import RunSettings
@@ -336,7 +336,7 @@ def _played(settings: StageSettings, names: Sequence[str], frames: int, report: 
         begin = simulator.static_equilibrium(inputs_at(0, 0.0), simulator.prepare(), batch=len(trials))
     elif any(trial.pull for trial in trials):
         pulls = simulator.tensor([trial.pull or (0.0, 0.0, 0.0) for trial in trials])
-        force = distributed(simulator, select_vertices(simulator.body.mesh, **settings.tip.arguments()), pulls)
+        force = distributed(simulator, vertices_at(simulator.body.mesh, settings.tip), pulls)
         begin = simulator.static_equilibrium(inputs_at(0, 0.0).plus(force), simulator.prepare())
         begin = State(begin.q, torch.zeros_like(begin.q))
     else:

@@ -30,7 +30,7 @@ from ..learning.identification.search import Identification
 from ..learning.intervals import half_widths_of
 from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
-from ..mesh.selection import select_vertices
+from ..mesh.selection import vertices_at
 from ..mesh.volume_mesh import Mesh
 from ..report.data import Driven, Film, FollowedPath, Metrics, Placed, Recordings, RunReport, TrialResults
 from ..report.wording import MODELS, models_in_figures
@@ -210,7 +210,7 @@ class RunReader:
             settings=run,
             mesh=body.mesh,
             fixed=body.fixed_vertices,
-            tip=np.empty(0, np.int64) if trials.labels else select_vertices(body.mesh, **run.tip.arguments()),
+            tip=np.empty(0, np.int64) if trials.labels else vertices_at(body.mesh, run.tip),
             chambers=self._driven_chambers(),
             tendons=routes_of(body),
             obstacles=ObstacleSurface.of(body, identification.get("sysid", Identification()).parameters),

@@ -19,10 +19,10 @@ from ..io.progress import Progress
 from ..io.resuming import StageContext
 from ..io.safe_files import read_json, write_json
 from ..learning.metrics import marker_errors, summarise
-from ..mesh.selection import select_vertices
+from ..mesh.selection import vertices_at
 from ..report.data import ShapeErrors
 from ..settings.body import BodySettings, SimulatorSettings
-from ..settings.mesh import PlaceSettings
+from ..settings.mesh import Place
 from ..settings.played import ShapeSettings
 from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
@@ -77,7 +77,7 @@ def check_shape(shape: ShapeSettings) -> None:
         if given != driven_parts(shape):
             raise InputError(f"inputs has {given} values for {driven_parts(shape)} parts: give one for each.")
     elif shape.held.at is not None:
-        face = select_vertices(target.mesh, **shape.held.at.arguments())
+        face = vertices_at(target.mesh, shape.held.at)
         if np.isin(face, target.fixed_vertices).all():
             raise InputError("held.at selects fixed vertices only: hang the weight on vertices that can move.")
 
@@ -123,7 +123,7 @@ def _held(simulator: Simulator, shape: ShapeSettings) -> State:
     if shape.held is not None:
         if shape.held.twist_deg:
             return replace(simulator.rest_state(), q=twist(simulator, shape.held))
-        return simulator.static_equilibrium(Inputs(loads(simulator, [shape.held], PlaceSettings(), "held.at")))
+        return simulator.static_equilibrium(Inputs(loads(simulator, [shape.held], Place(), "held.at")))
     quantity = driving_quantity(shape)
     assert quantity is not None
     return simulator.static_equilibrium(Inputs(**{quantity.name: simulator.tensor([list(shape.inputs or ())])}))

@@ -27,12 +27,12 @@ from ..io.arrays import FloatArray, IntArray
 from ..io.errors import InputError, MeshError
 from ..io.parts import Arrays, Parts, Report, TrialPart
 from ..io.resuming import StageContext
-from ..mesh.selection import select_vertices
+from ..mesh.selection import vertices_at
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import SimulatorSettings, SteppedSettings, TargetSettings
 from ..settings.data_kinds import MovingBase, ReadingSettings, ReleaseFromTwist, SimulatedData
-from ..settings.mesh import PlaceSettings
+from ..settings.mesh import Place
 from ..settings.performed import HeldSettings, MotionSettings, Trial
 from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
@@ -263,7 +263,7 @@ def twist(simulator: Simulator, held: HeldSettings) -> torch.Tensor:
     return twisted(simulator.rest_positions, angle, "xyz".index(held.twist_axis))
 
 
-def loads(simulator: Simulator, held: Sequence[HeldSettings], load: PlaceSettings, key: str) -> torch.Tensor:
+def loads(simulator: Simulator, held: Sequence[HeldSettings], load: Place, key: str) -> torch.Tensor:
     """Nodal forces (1, N, 3) of weights that act at the same time [N].
 
     Args:
@@ -283,13 +283,13 @@ def loads(simulator: Simulator, held: Sequence[HeldSettings], load: PlaceSetting
     return total
 
 
-def weights(simulator: Simulator, load: PlaceSettings, forces: FloatArray, key: str = "data.load") -> torch.Tensor:
+def weights(simulator: Simulator, load: Place, forces: FloatArray, key: str = "data.load") -> torch.Tensor:
     """Nodal forces (B, N, 3) of total forces (B, 3) in equal shares on the vertices of a place [N].
 
     Raises:
         InputError: all vertices of the place are fixed.
     """
-    face = select_vertices(simulator.body.mesh, **load.arguments())
+    face = vertices_at(simulator.body.mesh, load)
     if np.isin(face, simulator.body.fixed_vertices).all():
         raise InputError(f"{key} selects fixed vertices only: hang the weights on vertices that can move.")
     return distributed(simulator, face, simulator.tensor(forces))

@@ -20,7 +20,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
 from ..io.errors import ConvergenceError, InputError
 from ..settings.learning import ActuationSettings, ReleaseSettings
-from ..settings.mesh import PlaceSettings
+from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .parameters import split_name
@@ -72,7 +72,7 @@ class ObservedMotions:
     trials: Trials
     observe: Observation = WHOLE_STATE
     release: ReleaseSettings = field(default_factory=ReleaseSettings)
-    payload_at: PlaceSettings | None = None
+    payload_at: Place | None = None
     actuation: ActuationSettings = field(default_factory=ActuationSettings)
     train_fraction: float = 1.0
 

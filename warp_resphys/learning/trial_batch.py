@@ -9,7 +9,7 @@ import torch
 from ..data.trials import STATIC, Trials
 from ..fem.bodies import Body
 from ..io.errors import InputError
-from ..settings.mesh import PlaceSettings
+from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
 
 
@@ -31,9 +31,7 @@ class TrialBatch:
     session: str = ""  # in which all of them were recorded, if there are several
 
     @classmethod
-    def of(
-        cls, trials: Trials, names: Sequence[str], body: Body, payload_at: PlaceSettings | None, time_step: float
-    ) -> Self:
+    def of(cls, trials: Trials, names: Sequence[str], body: Body, payload_at: Place | None, time_step: float) -> Self:
         """Returns trials that begin in the same way and are of one session, in float64 on the CPU; see `Trials.acting`.
 
         Raises:

@@ -1,6 +1,6 @@
 """Rest shapes: meshes, readers, mesh quality, surfaces, chambers, and parametric pneumatic arms."""
 
-from .arm import ArmGeometry as ArmGeometry
+from ..settings.mesh import ArmMesh as ArmMesh
 from .arm import mesh_arm as mesh_arm
 from .chambers import find_chambers as find_chambers
 from .readers import read_surfaces as read_surfaces

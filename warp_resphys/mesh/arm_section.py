@@ -95,7 +95,7 @@ class Section:
 
     radius: float  # largest radius of the outline [m]
     count: int  # number of chambers
-    profile: str  # as in `ArmGeometry`, like all that follows
+    profile: str  # as in `ArmMesh`, like all that follows
     outline: str
     wall: float  # [m]
     web: float  # [m]

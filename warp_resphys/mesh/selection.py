@@ -1,61 +1,17 @@
 """Vertices in planes, slabs and boxes, and cells in boxes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from ..io.arrays import BoolArray, FloatArray, IntArray
+from ..io.arrays import IntArray
 from ..io.errors import MeshError
+from ..io.settings import parse
+from ..settings.mesh import Place
 from .elements import ELEMENTS
 from .volume_mesh import Mesh
 
 Extent = float | Sequence[float]  # a coordinate, or a range of coordinates
-
-
-@dataclass(frozen=True)
-class Place:
-    """A plane, a slab or a box: each coordinate is free, one value, or a range.
-
-    Raises:
-        MeshError: no coordinate is given, or one is not a finite number or an ascending pair.
-    """
-
-    x: Extent | None = None  # [m]
-    y: Extent | None = None
-    z: Extent | None = None
-    tolerance: float = 1e-9  # [m]
-
-    def __post_init__(self) -> None:
-        """Checks the coordinates."""
-        if not self._given:
-            raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
-        for axis, at in self._given.items():
-            ends = np.atleast_1d(np.asarray(at, dtype=np.float64))
-            if ends.shape not in ((1,), (2,)) or not np.isfinite(ends).all() or ends[-1] < ends[0]:
-                raise MeshError(f"a selection of vertices at {axis} = {at}: give one number, or two that rise, in m")
-
-    @property
-    def _given(self) -> dict[str, Extent]:
-        named = {"x": self.x, "y": self.y, "z": self.z}
-        return {axis: at for axis, at in named.items() if at is not None}
-
-    def _spans(self) -> dict[str, tuple[float, float]]:
-        return {axis: (float(np.min(at)), float(np.max(at))) for axis, at in self._given.items()}
-
-    def holds(self, points: FloatArray) -> BoolArray:
-        """Returns (N,) whether points (N, 3) [m] lie in the place."""
-        inside = np.ones(len(points), dtype=bool)
-        for axis, (first, last) in self._spans().items():
-            along = points[:, "xyz".index(axis)]
-            inside &= (along >= first - self.tolerance) & (along <= last + self.tolerance)
-        return inside
-
-    def __str__(self) -> str:
-        return ", ".join(
-            f"{axis} = {first:g}" + (f" to {last:g}" if last > first else "")
-            for axis, (first, last) in self._spans().items()
-        )
 
 
 def select_vertices(
@@ -71,17 +27,29 @@ def select_vertices(
         tolerance: Tolerance of the coordinates [m].
 
     Raises:
-        MeshError: No coordinate or an invalid one, or no vertex lies there.
+        InputError: an invalid coordinate.
+        MeshError: No coordinate, or no vertex lies there.
     """
-    place = Place(x, y, z, tolerance)
+    given = {"x": x, "y": y, "z": z}
+    values = {axis: np.asarray(at, dtype=np.float64).tolist() for axis, at in given.items() if at is not None}
+    return vertices_at(mesh, parse(Place, {**values, "tolerance": tolerance}, "select_vertices"))
+
+
+def vertices_at(mesh: Mesh, place: Place) -> IntArray:
+    """Returns the vertices (S,) in a place, sorted.
+
+    Raises:
+        MeshError: the place has no coordinate, or no vertex lies there.
+    """
+    if not place.spans:
+        raise MeshError("a selection of vertices needs at least one of the coordinates x, y and z")
     chosen = np.flatnonzero(place.holds(mesh.vertices))
     if not len(chosen):
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        axes = [axis for axis, at in zip("xyz", (x, y, z), strict=True) if at is not None]
+        low, high, axes = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0), [*place.spans]
         there = ", ".join(f"{axis} from {low['xyz'.index(axis)]:g} to {high['xyz'.index(axis)]:g}" for axis in axes)
         raise MeshError(
-            f"no vertex lies within {tolerance:g} m of {place} m: the mesh reaches {there} m; give a range for a face "
-            f"that is not flat, as in {axes[0]}=[{low['xyz'.index(axes[0])]:.3g}, "
+            f"no vertex lies within {place.nearness:g} m of {place} m: the mesh reaches {there} m; give a range for a "
+            f"face that is not flat, as in {axes[0]}=[{low['xyz'.index(axes[0])]:.3g}, "
             f"{low['xyz'.index(axes[0])] + 0.1 * float(np.ptp(mesh.vertices[:, 'xyz'.index(axes[0])])):.3g}], or a "
             "larger tolerance"
         )

@@ -34,7 +34,7 @@ from ..learning.residuals.networks import NextState, restore
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.learning import NetworkSettings
-from ..settings.mesh import PlaceSettings
+from ..settings.mesh import Place
 from ..settings.observed import MarkerSettings
 from ..settings.stage_keys import StageSettings
 
@@ -55,7 +55,7 @@ _PLAIN: Final = (  # fields that are written unchanged
 _SETTINGS: Final[Mapping[str, type[Settings]]] = {
     "settings": SimulatorSettings,
     "material": MaterialSettings,
-    "payload_at": PlaceSettings,
+    "payload_at": Place,
     "markers": MarkerSettings,
 }
 
@@ -73,7 +73,7 @@ class Description:
     parameters: Mapping[str, float] = field(default_factory=dict)
     # standard deviations and correlations of the parameters, if identification estimated them
     uncertainty: Uncertainty | None = None
-    payload_at: PlaceSettings | None = None  # the vertices that a payload hangs on; None for none
+    payload_at: Place | None = None  # the vertices that a payload hangs on; None for none
     markers: MarkerSettings | None = None  # settings of the markers; None if every vertex is observed
     labels: tuple[str, ...] = ()  # of the M markers
     sets: tuple[tuple[int, ...], ...] = ()  # groups of markers, by their numbers

@@ -8,7 +8,7 @@ from typing_extensions import override
 from ..io.classes import ClassSettings, package_of
 from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
 from .contact import ContactSettings, ObstacleSettings, SurfaceContactSettings
-from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, PlaceSettings, SymmetrySettings
+from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, Place, SymmetrySettings
 
 SolverName = Literal["quasi_newton", "newton", "projective_dynamics"]
 LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"]
@@ -126,7 +126,7 @@ class GlueSettings(Settings):
     """Glue between regions whose cells do not match: vertices that follow another region, by `fem.bodies.Glue`."""
 
     region: Word = setting(description="region with the glued vertices")
-    at: PlaceSettings = setting(description="where the glued vertices of that region lie")
+    at: Place = setting(description="where the glued vertices of that region lie")
     to: Word = setting(description="region that they follow")
     tolerance: Positive = setting(1.0e-3, "largest distance from that region", "m")
 
@@ -256,7 +256,7 @@ class BodySettings(Settings):
     glued: Many[GlueSettings] = setting((), "glue between meshes that do not match")
     regions: dict[str, BoxSettings] = setting({}, "cells by region, beside the regions of a mesh file")
     rigid: dict[str, Rigid] = setting({}, "rigid regions")
-    fixed: PlaceSettings | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
+    fixed: Place | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
     symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers")

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Share, Some, Word, setting
-from .mesh import Direction, LengthUnit, PlaceSettings
+from .mesh import Direction, LengthUnit, Place
 from .performed import (
     Axis,
     BaseMotion,
@@ -49,7 +49,7 @@ class ReleaseFromLoad(_Simulated):
     """Bodies that are released from rest under weights."""
 
     kind: Literal["release_from_load"]
-    load: PlaceSettings = setting(description="vertices that carry the weights, in equal shares")
+    load: Place = setting(description="vertices that carry the weights, in equal shares")
     weights_g: AmountSettings = setting(description="weights", unit="g")
     others: dict[str, Held] = setting(
         {}, "further test trials by name, held in other ways: by a load, or by a list of weights"
@@ -117,7 +117,7 @@ class ReadingSettings(Settings):
     obstacle_motion: dict[str, MotionSettings | Literal["recorded"]] = setting(
         {}, "motion of obstacles, given or recorded"
     )
-    payload_at: PlaceSettings | None = setting(None, "vertices that carry payloads, in equal shares")
+    payload_at: Place | None = setting(None, "vertices that carry payloads, in equal shares")
     up: SignedAxis | Direction | None = setting(
         None, "direction against gravity in the recordings; null: as configured"
     )

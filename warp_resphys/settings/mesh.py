@@ -1,15 +1,18 @@
 """Settings of meshes, and of places and cells on them."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
-from ..io.settings import Many, Natural, Pair, Positive, Settings, Some, Vector, Word, setting
+from ..io.arrays import BoolArray, FloatArray
+from ..io.settings import Many, Pair, Positive, Settings, Some, Vector, Word, setting
 
 Divisions = Annotated[int, Field(ge=1, le=10_000)]
 LengthUnit = Literal["m", "cm", "mm"]
 Order = Literal[1, 2]
 Nodes = Literal[8, 20, 27]
+_NEAR = 1e-9  # default of `Place.tolerance` [m]
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -29,13 +32,38 @@ Span = Annotated[Pair[float], AfterValidator(_rising)]
 Curve = Annotated[Many[Vector], Field(min_length=2)]
 
 
-class PlaceSettings(Settings):
+class Place(Settings):
     """Vertices on a plane, or between two planes."""
 
     x: float | Span | None = setting(None, "coordinate, or two between which the vertices lie", "m")
     y: float | Span | None = setting(None, "coordinate along y, or two", "m")
     z: float | Span | None = setting(None, "coordinate along z, or two", "m")
     tolerance: Positive | None = setting(None, "largest distance from the plane; null: 1e-9", "m")
+
+    @property
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest coordinate along the axes that are given [m]."""
+        given = {"x": self.x, "y": self.y, "z": self.z}
+        return {axis: at if isinstance(at, tuple) else (at, at) for axis, at in given.items() if at is not None}
+
+    @property
+    def nearness(self) -> float:
+        """Largest distance from the plane [m]."""
+        return _NEAR if self.tolerance is None else self.tolerance
+
+    def holds(self, points: FloatArray) -> BoolArray:
+        """Returns (N,) whether points (N, 3) [m] lie in the place."""
+        inside = np.ones(len(points), dtype=bool)
+        for axis, (first, last) in self.spans.items():
+            along = points[:, "xyz".index(axis)]
+            inside &= (along >= first - self.nearness) & (along <= last + self.nearness)
+        return inside
+
+    def __str__(self) -> str:
+        return ", ".join(
+            f"{axis} = {first:g}" + (f" to {last:g}" if last > first else "")
+            for axis, (first, last) in self.spans.items()
+        )
 
 
 class SymmetrySettings(Settings):
@@ -133,12 +161,18 @@ class ShippedArm(Settings):
     name: Word = setting(description="name of the arm, such as arm_hexahedra_1400")
 
 
-class GeneratedArm(Settings):
-    """A pneumatic arm of given dimensions, by default those of SoPrA."""
+class ArmMesh(Settings):
+    """A pneumatic arm of given dimensions, by default those of SoPrA (Toshimitsu et al. 2021).
 
-    kind: Literal["arm_generated"]
-    size: Positive = setting(0.01, "size of the cells", "m")
-    cells: Word = setting("hexahedra", "hexahedra or tetrahedra")
+    From base to tip, solid caps alternate with the chambers of a segment, beginning and ending with a cap. The arm
+    tapers linearly along chambers; caps are cylinders.
+    """
+
+    kind: Literal["arm_generated"] = "arm_generated"
+    size: Positive = setting(
+        0.01, "size of the cells; of hexahedra, the average in the section, for walls, flat sides and arcs apart", "m"
+    )
+    cells: Literal["hexahedra", "tetrahedra"] = setting("hexahedra")
     layers: Positive | None = setting(None, "length along the arm; null: 2.5 times the size", "m")
     order: Order = setting(1, "2 adds edge midpoints to tetrahedra")
     chamber_lengths: Some[Positive] = setting((0.120, 0.120), "lengths of the chambers, one per segment", "m")
@@ -146,9 +180,11 @@ class GeneratedArm(Settings):
     radii: Some[Positive] = setting(
         (0.0283923, 0.0212942, 0.0165622), "radii before the first chambers and after those of every segment", "m"
     )
-    chambers: Natural = setting(3, "chambers per segment")
-    profile: Word = setting("half_disc", "half_disc, disc or sector")
-    outline: Word = setting("lobed", "lobed, around the chambers, or round")
+    chambers: Annotated[int, Field(ge=2, le=8)] = setting(3, "chambers per segment")
+    profile: Literal["half_disc", "disc", "sector"] = setting(
+        "half_disc", "section of a chamber: half_disc, with the flat side towards the axis; sector of an annulus"
+    )
+    outline: Literal["lobed", "round"] = setting("lobed", "lobed, parallel to each chamber, or round")
     wall: Positive = setting(0.004, "thickness of the wall", "m")
     web: Positive = setting(0.004, "thickness between neighbouring chambers", "m")
     core: Positive | None = setting(None, "distance of the chambers from the axis at the base; null: the least", "m")
@@ -156,8 +192,23 @@ class GeneratedArm(Settings):
         (), "rotations of the chambers, one per segment; for tetrahedra and a round outline", "degrees"
     )
 
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        count = len(self.chamber_lengths)
+        needed = {"caps": count + 1, "radii": count + 1, "rotations": count if self.rotations else 0}
+        for name, number in needed.items():
+            given = len(getattr(self, name))
+            if given != number:
+                raise ValueError(f"{name} has {given} numbers, but {count} chamber_lengths need {number}.")
+        if self.outline == "lobed" and (self.profile == "sector" or any(self.rotations)):
+            what = "sectors" if self.profile == "sector" else "rotations"
+            raise ValueError(f"outline is lobed, which does not go with {what}: set it to round.")
+        if self.cells == "tetrahedra" and self.layers is not None:
+            raise ValueError("layers is for hexahedra: set it to null, or cells to hexahedra.")
+        return self
+
 
 MeshSettings = Annotated[
-    HexahedralBox | TetrahedralBox | BoxesMesh | FileMesh | SurfaceMesh | RodMesh | ShippedArm | GeneratedArm,
+    HexahedralBox | TetrahedralBox | BoxesMesh | FileMesh | SurfaceMesh | RodMesh | ShippedArm | ArmMesh,
     Field(discriminator="kind"),
 ]

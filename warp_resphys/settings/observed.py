@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from ..io.classes import ClassSettings
 from ..io.settings import Many, Positive, Settings, Vector, Word, setting
-from .mesh import PlaceSettings
+from .mesh import Place
 from .performed import CORNERS, Axis, Labels, different
 
 
@@ -18,7 +18,7 @@ class RigidBodySettings(Settings):
     """
 
     part: Word | None = setting(None, "rigid part that it is mounted on")
-    at: PlaceSettings | None = setting(None, "vertices of a stiff plate that it is mounted on instead")
+    at: Place | None = setting(None, "vertices of a stiff plate that it is mounted on instead")
     position_deviation: Annotated[float, Field(gt=0.0, le=0.05)] = setting(1.0e-3, "expected error of a position", "m")
     orientation_deviation: Annotated[float, Field(gt=0.0, le=45.0)] = setting(
         1.0, "expected error of an orientation", "degrees"
@@ -45,7 +45,7 @@ class BindingSettings(Settings):
     )
     reference: dict[str, Vector] = setting({}, "positions of fixed markers, for the registration", "m")
     bind: Literal["normal", "frame", "rigid", "patch"] = setting("normal", "how tracked markers follow the body")
-    bind_to: PlaceSettings | None = setting(None, "vertices that rigid markers follow")
+    bind_to: Place | None = setting(None, "vertices that rigid markers follow")
     patch: Positive = setting(0.02, "radius of a patch", "m")
     largest_distance: Positive = setting(0.02, "largest distance from the surface of the body", "m")
     observation: ClassSettings | None = setting(

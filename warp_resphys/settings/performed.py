@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Some, Vector, Word, setting
-from .mesh import Direction, PlaceSettings
+from .mesh import Direction, Place
 
 # Held at rest until the release; released with the first frame; at rest until inputs are applied; at rest under the
 # inputs of the first frame; at rest as those do not act, such as of a slack tendon; a static pose.
@@ -131,7 +131,7 @@ class HeldSettings(Settings):
 
     weight_g: NotNegative = setting(0.0, "weight", unit="g")
     direction: Direction = setting((0.0, 0.0, -1.0), "direction in which it pulls")
-    at: PlaceSettings | None = setting(None, "vertices that carry it, in equal shares; null: data.load")
+    at: Place | None = setting(None, "vertices that carry it, in equal shares; null: data.load")
     twist_deg: float = setting(0.0, "angle of the high end of a twisted body", "degrees")
     twist_axis: Axis = setting("x", "axis along which the angle grows")
 

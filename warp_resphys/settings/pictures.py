@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
-from .mesh import LengthUnit, PlaceSettings
+from .mesh import LengthUnit, Place
 from .performed import LimitSettings, MotionSettings, different
 
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -72,7 +72,7 @@ class TagSettings(Settings):
 class ReleasedForceSettings(Settings):
     """A force that holds a body at rest and is then released."""
 
-    at: PlaceSettings = setting(description="vertices that carry it, in equal shares")
+    at: Place = setting(description="vertices that carry it, in equal shares")
     force: Vector = setting(description="force in the axes of the scene", unit="N")
     time: float = setting(0.0, "time of the release, on the clock of the frames", "s")
 

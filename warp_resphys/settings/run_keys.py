@@ -22,7 +22,7 @@ from .learning import (
     TrainerSettings,
     TrainingSettings,
 )
-from .mesh import PlaceSettings
+from .mesh import Place
 from .observed import BindingSettings, MarkerSettings
 from .performed import MotionSettings, by_file
 from .pictures import PictureData
@@ -67,7 +67,7 @@ class RunKeys(SimulatorSettings):
     seed: Annotated[int, Field(ge=0, lt=2**63, json_schema_extra={"wanted": "between 0 and 2^63 - 1"})] = setting(
         0, "seed of all random numbers"
     )
-    tip: PlaceSettings | None = setting(None, "vertices whose mean motion is reported, where there are no markers")
+    tip: Place | None = setting(None, "vertices whose mean motion is reported, where there are no markers")
     simulation: MaterialSettings = setting(description="material of the simulator to correct")
     target: TargetSettings | None = setting(
         None, "simulation that stands in for the real body where data are simulated"
@@ -154,7 +154,7 @@ class RunKeys(SimulatorSettings):
         return {"": self, **{f"{key}.": target for key, target in self.targets.items()}}
 
     @property
-    def payload_at(self) -> PlaceSettings | None:
+    def payload_at(self) -> Place | None:
         """Vertices that carry payloads."""
         return None if self.recorded is None else self.recorded.payload_at
 

@@ -16,7 +16,7 @@ from .body import SimulatorSettings, TargetSettings
 from .control import ControlSettings, FigureSettings
 from .data_kinds import ReadingSettings
 from .learning import AblationSettings, IdentifySettings, LawSettings, TrainingSettings
-from .mesh import PlaceSettings
+from .mesh import Place
 from .observed import BindingSettings
 from .performed import Split, Trial
 from .played import LaboratorySettings, PlaySettings
@@ -73,7 +73,7 @@ class StageSettings(RunSettings):
 
     if TYPE_CHECKING:  # A stage with a group is part of runs that have it.
         data: Any
-        tip: PlaceSettings
+        tip: Place
         target: TargetSettings
         laboratory: LaboratorySettings
         identify: IdentifySettings

@@ -22,11 +22,11 @@ from ..mesh.arm import name_surfaces
 from ..mesh.chambers import find_chambers, open_cavities
 from ..mesh.quality import cell_volumes, is_one_cell_thick, scaled_jacobian
 from ..mesh.readers import read_mesh, read_surfaces, read_vertices, write_mesh
-from ..mesh.selection import Place, select_vertices
+from ..mesh.selection import vertices_at
 from ..mesh.tetrahedra import SURFACE_SUFFIXES
 from ..mesh.volume_mesh import Mesh, boundary_triangles, connected_parts, quadratic
 from ..report.body_picture import MeshSummary, mesh_picture
-from ..settings.mesh import FileMesh, GeneratedArm, MeshSettings, PlaceSettings, SurfaceMesh
+from ..settings.mesh import ArmMesh, FileMesh, MeshSettings, Place, SurfaceMesh
 from .recording_quality import RecordingInspection, inspect_recording
 
 _MOST_UNKNOWNS: Final = 40_000  # of quadratic cells, which are solved in some seconds
@@ -42,7 +42,7 @@ class Inspection(RecordingInspection):
 
     files: Many[Word]
     mesh: MeshSettings | None
-    fixed: PlaceSettings
+    fixed: Place
     density: Positive = setting(unit="kg/m^3")
     picture: bool
     save: Word | None
@@ -89,9 +89,7 @@ def inspect(settings: Inspection, folder: Path) -> None:
             print(f"Written: {', '.join(written)}")
 
 
-def inspect_mesh(
-    settings: MeshSettings, fixed: PlaceSettings, density: float, picture: Path | None, file: Path | None
-) -> str:
+def inspect_mesh(settings: MeshSettings, fixed: Place, density: float, picture: Path | None, file: Path | None) -> str:
     """Returns a table of a mesh, draws it, and writes it with the names of its surfaces.
 
     Args:
@@ -119,9 +117,8 @@ def inspect_mesh(
     else:
         mesh = build_mesh(settings)
         points = mesh.vertices
-    where = fixed.arguments()
-    place = Place(**where) if where.keys() & {"x", "y", "z"} else None
-    vertices = np.empty(0, dtype=np.int64) if place is None else select_vertices(mesh, **where)
+    place = fixed if fixed.spans else None
+    vertices = np.empty(0, dtype=np.int64) if place is None else vertices_at(mesh, place)
     summary = MeshSummary(mesh, vertices, find_chambers(mesh))
     rows += summary_rows(summary, density)
     if place is not None:
@@ -137,7 +134,7 @@ def inspect_mesh(
         if thin := [name for name, cells in mesh.regions.items() if is_one_cell_thick(mesh, cells)]:
             rows.append(("one cell thick", f"{', '.join(thin)}: if stiffer than the rest, take quadratic cells"))
     if file is not None:
-        if isinstance(settings, GeneratedArm):
+        if isinstance(settings, ArmMesh):
             if settings.order == 2 and settings.cells != "tetrahedra":
                 raise MeshError("mesh.order is 2: choose 1, or 2 for tetrahedra with edge midpoints.")
             surfaces = name_surfaces(mesh)

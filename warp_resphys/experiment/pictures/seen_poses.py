@@ -20,7 +20,7 @@ from ...io.errors import DataFileError, InputError, listed, naming, number_of
 from ...io.resuming import StageContext
 from ...io.safe_files import atomic_hdf5, create, read_array, read_hdf5
 from ...mesh.readers import METRES, read_mesh
-from ...mesh.selection import select_vertices
+from ...mesh.selection import vertices_at
 from ...mesh.volume_mesh import Mesh, quadratic
 from ...pictures.clouds import Cloud
 from ...pictures.outlines import ClosedSurface, Outline
@@ -121,7 +121,7 @@ def released_force(name: str, pose: PoseSettings, mesh: Mesh) -> ReleasedForce |
     if wanted is None:
         return None
     with naming(f"data.poses.{name}.release.at: "):
-        return ReleasedForce(select_vertices(mesh, **wanted.at.arguments()), wanted.force, wanted.time)
+        return ReleasedForce(vertices_at(mesh, wanted.at), wanted.force, wanted.time)
 
 
 def import_pictures(context: StageContext) -> None:
@@ -360,7 +360,7 @@ class SeenPoses:
             return mesh, clamps
         if self.settings.fixed is None:
             raise InputError(f"{scene.path} has no clamps, and fixed is null: give one of them.")
-        return mesh, (select_vertices(mesh, **self.settings.fixed.arguments()),)
+        return mesh, (vertices_at(mesh, self.settings.fixed),)
 
 
 def _with_midpoints(mesh: Mesh, corners: IntArray) -> IntArray:

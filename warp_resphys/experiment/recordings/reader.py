@@ -21,7 +21,7 @@ from ...data.trials import RESTING, STATIC, UNDER_INPUTS, payload_inputs
 from ...dynamics.simulator import Simulator
 from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, InputError, listed, naming, number_of
-from ...mesh.selection import select_vertices
+from ...mesh.selection import vertices_at
 from ...settings.data_kinds import ReadingSettings
 from ...settings.performed import Trial
 from ...settings.run import RunSettings
@@ -87,7 +87,7 @@ class Reader:
     def _check_binding(self) -> None:
         """Refuses places without vertices that markers and rigid bodies could follow."""
         if self.markers.bind_to is not None:
-            select_vertices(self.body.mesh, **self.markers.bind_to.arguments())
+            vertices_at(self.body.mesh, self.markers.bind_to)
         for name, mounted in self.markers.rigid_bodies.items():
             if mounted.part is not None and mounted.part not in self.body.rigid:
                 raise InputError(

@@ -77,7 +77,7 @@ def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
     trials = pulled["laboratory"]["trials"]
     for pull in ([0.0, 0.1, 0.0], None):
         trials["m10"]["pull"] = pull
-        with pytest.raises(InputError, match=r"data.rest is file, but the simulated bodies are held undeformed"):
+        with pytest.raises(InputError, match=r"data\.rest is file, but the simulated bodies are held undeformed"):
             check(changed(pulled, "data/rest", "file"))
     for trial in trials.values():
         trial["pull"] = [0.0, 0.1, 0.0]

@@ -2,6 +2,9 @@
 
 YAML reads ``001``, ``on`` and ``1e3`` as numbers and truth values. Here all keys are texts, and so are values of keys
 that take text alone, by the JSON Schema of a run's settings.
+
+Hydra merges a group with those of the files before it. With ``_replace_: true`` in it, it replaces them: directly
+before such a file, Hydra also reads a file ``NAME.emptying`` that does not exist, in which these groups are null.
 """
 
 from __future__ import annotations
@@ -21,13 +24,13 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import OmegaConf
 
+from .io.setting_errors import Path as KeyPath
 from .io.setting_errors import Schema, is_text
 from .io.text import read_text
 from .settings.run import RunSettings
 
-_QUOTE: Final = "'"
-_REPLACE: Final = "_replace_"  # in a group of settings: it replaces that of the files below, which Hydra would merge
-_EMPTYING: Final = ".emptying"  # end of the name of a file that does not exist, in which such groups are null
+_REPLACE: Final = "_replace_"
+_EMPTYING: Final = ".emptying"
 
 
 class _OptionSource(file_config_source.FileConfigSource):
@@ -42,27 +45,21 @@ class _OptionSource(file_config_source.FileConfigSource):
         text = read_text(path)
         header = self._get_header_dict(text)
         package = header["package"] or name.rpartition("/")[0].replace("/", ".")
-        config = OmegaConf.load(_with_quotes(text, () if package == "_global_" else tuple(package.split(".")), path))
-        values: Any = OmegaConf.to_container(config)
-        if isinstance(values, dict) and (empty := _without_marks(values)):
-            if name == config_path:  # The other file comes directly before this one.
-                defaults = values.setdefault("defaults", [])
-                defaults += [] if "_self_" in defaults else ["_self_"]
-                last = (at for at, entry in enumerate(defaults) if entry == "_self_" or _is_override(entry))
-                defaults.insert(next(last), name.rpartition("/")[2] + _EMPTYING)
-            config = OmegaConf.create(values if name == config_path else empty)
+        quoted = _with_quotes(text, () if package == "_global_" else tuple(package.split(".")), path)
+        values: Any = OmegaConf.to_container(OmegaConf.load(_stream(quoted, path)))
+        replaced = _without_marks(values) if isinstance(values, dict) else {}
+        if name != config_path:
+            values = replaced
+        elif replaced:
+            _add_before(values, name.rpartition("/")[2] + _EMPTYING)
+        config = OmegaConf.create(values)
         return ConfigResult(config=config, path=f"{self.scheme()}://{self.path}", provider=self.provider, header=header)
-
-
-def _is_override(entry: Any) -> bool:
-    """Whether an entry of a defaults list chooses another option, as in ``override /trainer: short``; they are last."""
-    return isinstance(entry, dict) and str(next(iter(entry))).startswith("override ")
 
 
 @contextmanager
 def names_are_texts() -> Iterator[None]:
     """Lets Hydra read the files of folders as this module describes; its registry of sources is restored at the end."""
-    Plugins.instance()  # registers Hydra's own sources
+    Plugins.instance()  # registers Hydra's sources
     sources, scheme = SourcesRegistry.instance().types, _OptionSource.scheme()
     before, sources[scheme] = sources[scheme], _OptionSource
     try:
@@ -77,46 +74,56 @@ def run_schema() -> Schema:
     return RunSettings.model_json_schema()
 
 
-def _with_quotes(text: str, package: tuple[str, ...], path: Path) -> io.StringIO:
-    """The text of a YAML file with quotes around keys, and around values that are texts."""
-    schema, places = run_schema(), set[tuple[int, int]]()
-
-    def visit(node: yaml.Node | None, path: tuple[str | int, ...]) -> None:
-        if isinstance(node, yaml.MappingNode):
-            for key, value in node.value:
-                add(key)
-                visit(value, path if key.value == "<<" else (*path, str(key.value)))
-        elif isinstance(node, yaml.SequenceNode):
-            for at, item in enumerate(node.value):
-                visit(item, (*path, at))
-        elif isinstance(node, yaml.ScalarNode) and path and is_text(schema, path, node.value):
-            add(node)
-
-    def add(node: yaml.Node) -> None:
-        """Notes the place of a scalar without quotes."""
-        if isinstance(node, yaml.ScalarNode) and node.style is None and node.value not in ("", "<<"):
+def _with_quotes(text: str, package: KeyPath, path: Path) -> str:
+    """Puts quotes around the keys of a YAML file, and around values that are texts."""
+    places = set[tuple[int, int]]()
+    for node in _texts(yaml.compose(_stream(text, path), Loader=yaml.SafeLoader), package):
+        if node.style is None and node.value not in ("", "<<"):
             start, end = node.start_mark.index, node.end_mark.index
-            start += len(re.match(r"(?:&\S+\s+)?", text[start:end])[0])  # type: ignore[index]
-            if text[start] != "!":
+            anchor = re.match(r"&\S+\s+", text[start:end])
+            start += anchor.end() if anchor else 0
+            if text[start] != "!":  # A tag gives the type.
                 places.add((start, end))
-
-    def stream() -> io.StringIO:
-        stream = io.StringIO(text)
-        stream.name = str(path)  # for YAML's errors
-        return stream
-
-    visit(yaml.compose(stream(), Loader=yaml.SafeLoader), package)
     for start, end in sorted(places, reverse=True):
-        text = f"{text[:start]}'{text[start:end].replace(_QUOTE, _QUOTE * 2)}'{text[end:]}"
-    return stream()
+        written = text[start:end].replace("'", "''")
+        text = f"{text[:start]}'{written}'{text[end:]}"
+    return text
+
+
+def _stream(text: str, path: Path) -> io.StringIO:
+    """Returns a stream with the name of a file, which errors of YAML tell."""
+    stream = io.StringIO(text)
+    stream.name = str(path)
+    return stream
+
+
+def _texts(node: yaml.Node | None, path: KeyPath) -> Iterator[yaml.ScalarNode]:
+    """Yields the keys, and the values that are texts, of the part of a file that stands at a path of the settings."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            yield from [key] if isinstance(key, yaml.ScalarNode) else []
+            yield from _texts(value, path if key.value == "<<" else (*path, str(key.value)))
+    elif isinstance(node, yaml.SequenceNode):
+        for at, item in enumerate(node.value):
+            yield from _texts(item, (*path, at))
+    elif isinstance(node, yaml.ScalarNode) and path and is_text(run_schema(), path, node.value):
+        yield node
 
 
 def _without_marks(values: dict[str, Any]) -> dict[str, Any]:
     """Removes the marks of groups that replace others, and returns these groups with null in place of their keys."""
-    empty: dict[str, Any] = {}
+    replaced: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, dict):
             replaces, inside = value.pop(_REPLACE, False), _without_marks(value)
             if replaces or inside:
-                empty[key] = None if replaces else inside
-    return empty
+                replaced[key] = None if replaces else inside
+    return replaced
+
+
+def _add_before(values: dict[str, Any], file: str) -> None:
+    """Adds a file to the defaults list, directly before the file that has the list; overrides stay at its end."""
+    defaults = values.setdefault("defaults", [])
+    defaults += [] if "_self_" in defaults else ["_self_"]
+    at_its_end = [entry == "_self_" or str(next(iter(entry))).startswith("override ") for entry in defaults]
+    defaults.insert(at_its_end.index(True), file)

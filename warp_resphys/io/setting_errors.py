@@ -6,6 +6,7 @@ Types, ranges and units come from the JSON Schema of the settings class.
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from pydantic_core import ErrorDetails
@@ -17,6 +18,34 @@ Path = Sequence[str | int]  # keys and list indices that lead to a value
 
 _NOUNS: Final = {"string": "word", "number": "number", "integer": "whole number"}
 _NUMBERS: Final = ("no", "one", "two", "three", "four", "five", "six")
+_WORDS: Final = {"object": "a group of settings", "boolean": "true or false", "string": "a word"}
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A value in nested settings."""
+
+    schema: Schema  # of the whole class
+    node: Schema  # of the value
+    value: Any  # None if it is missing
+    path: tuple[str | int, ...] = ()  # keys and indices that lead to it
+    group: "_Place | None" = None  # in which it lies
+
+    @property
+    def kinds(self) -> list[Schema]:
+        """JSON Schemas of the types that the value may have, first that of the kind it names, such as ``kind: rod``."""
+
+        def names(option: Schema) -> bool:
+            fixed = {key: one["const"] for key, one in option.get("properties", {}).items() if "const" in one}
+            return isinstance(self.value, Mapping) and all(self.value.get(key) == word for key, word in fixed.items())
+
+        return sorted(options(self.schema, self.node), key=lambda option: not names(option))
+
+    def within(self, part: str | int) -> "_Place":
+        """Returns the place of a key or of an entry of a list."""
+        value = self.value.get(_key(self.value, part)) if isinstance(self.value, Mapping) else self.value[part]
+        node = next(filter(None, (_below(option, part) for option in self.kinds)), self.node)
+        return _Place(self.schema, node, value, (*self.path, part), self)
 
 
 def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDetails]) -> str:
@@ -29,36 +58,51 @@ def sentence(schema: Schema, values: Any, where: str, errors: Sequence[ErrorDeta
         errors: of pydantic.
     """
 
-    def rank(located: tuple[ErrorDetails, Path]) -> tuple[bool, int, bool]:
-        error, path = located
-        return error["type"] == "extra_forbidden", len(path), error["type"] == "value_error"
+    def rank(located: tuple[ErrorDetails, _Place]) -> tuple[bool, int, bool]:
+        error, place = located
+        return error["type"] == "extra_forbidden", len(place.path), error["type"] == "value_error"
 
-    error, path = max(((error, _path(values, error)) for error in errors), key=rank)
-    key, kind, context = _dotted(path, where), error["type"], error.get("ctx", {})
+    whole = _Place(schema, schema, values)
+    error, place = max(((error, _place(whole, error)) for error in errors), key=rank)
+    kind, value, key = error["type"], place.value, _dotted(place.path, where)
     if kind == "extra_forbidden":
-        return _unknown(schema, values, where, path)
-    value, node = _value(values, path), _node(schema, path, values)
+        return _unknown(place, where)
     if error["loc"][-1:] == ("[key]",):
-        return (
-            f"{_dotted(error['loc'][:-2], where)} has the name {_shown(error['input'])}, not a text: put it in quotes."
-        )
-    if kind == "missing" and path[-1:] == [error["loc"][-1]]:
-        return f"{key} is missing: it must be {in_words(node, schema)}."
+        group = _dotted(error["loc"][:-2], where)
+        return f"{group} has the name {_shown(error['input'])}, not a text: put it in quotes."
+    if kind == "missing" and place.path[-1:] == error["loc"][-1:]:
+        return f"{key} is missing: it must be {_in_words(place.node, schema)}."
+    if kind.startswith("union_tag") and isinstance(value, Mapping):
+        tag = str(error["ctx"]["discriminator"]).strip("'")
+        words = [str(word) for option in options(schema, place.node) for word in _words_of(option["properties"][tag])]
+        return f"{_dotted([tag], key)} is {_shown(value.get(tag))}: it must be one of {', '.join(words)}."
     if kind.startswith("union_tag"):
-        tag = str(context.get("discriminator", "")).strip("'")
-        kinds = [str(word) for option in options(schema, node) for word in _words_of(option["properties"][tag])]
-        if not isinstance(value, Mapping):
-            return f"{key} is {_shown(value)}: it must be a group of settings."
-        return f"{_dotted([tag], key)} is {_shown(value.get(tag))}: it must be one of {', '.join(kinds)}."
+        return f"{key} is {_shown(value)}: it must be a group of settings."
+    if kind == "value_error" and isinstance(value, Mapping):
+        return _dotted([str(error["ctx"]["error"])], key)
     if kind == "value_error":
-        message = str(context["error"])
-        if not isinstance(value, Mapping):
-            return f"{key} is {_shown(value)}: {message}"
-        return f"{key}.{message}" if key else message
+        return f"{key} is {_shown(value)}: {error['ctx']['error']}"
     texts = value if isinstance(value, (list, tuple)) else [value]
     is_number = kind == "string_type" and any(isinstance(text, (bool, int, float)) for text in texts)
-    quoted = ", in quotes" if is_number else ""
-    return f"{key} is {_shown(value)}: it must be {in_words(node, schema)}{quoted}."
+    return f"{key} is {_shown(value)}: it must be {_in_words(place.node, schema)}{', in quotes' if is_number else ''}."
+
+
+def _place(whole: _Place, error: ErrorDetails) -> _Place:
+    """Returns the place of an error; for an entry of a list, that of the list."""
+    here = keyed = whole
+    for part in error["loc"]:
+        if isinstance(here.value, Mapping):
+            is_missing = error["type"] == "missing" and part == error["loc"][-1]
+            if is_missing or _key(here.value, part) in here.value:  # else a name that pydantic gives to a type
+                here = keyed = here.within(str(part))
+        elif isinstance(here.value, (list, tuple)) and isinstance(part, int) and part < len(here.value):
+            here = here.within(part)
+    return keyed
+
+
+def _key(values: Mapping[Any, Any], part: str | int) -> Any:
+    """Returns a key of a mapping by its text, in which YAML may have read a number; the text itself without one."""
+    return next((key for key in values if str(key) == str(part)), part)
 
 
 def _shown(value: Any) -> str:
@@ -66,23 +110,27 @@ def _shown(value: Any) -> str:
     return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
 
 
-def _unknown(schema: Schema, values: Any, where: str, path: Path) -> str:
+def _dotted(path: Path, where: str = "") -> str:
+    parts = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    return f"{where}{parts}".removeprefix(".")
+
+
+def _unknown(place: _Place, where: str) -> str:
     """Message for an unknown key: the most similar keys, else all keys of its group."""
-    group, name = path[:-1], str(path[-1])
-    inside = _value(values, group)
-    choices = sorted(options(schema, _node(schema, group, values)), key=lambda option: not _fits(option, inside))
-    near = list(next((option["properties"] for option in choices if "properties" in option), {}))
-    every, key = list(keys(schema)), _dotted(path, where)
-    kinds = [option["properties"] for option in choices if "kind" in option.get("properties", {})]
+    group, name, key = place.group, str(place.path[-1]), _dotted(place.path, where)
+    assert group is not None
+    kinds = [option["properties"] for option in group.kinds if "properties" in option]
     for other in kinds[1:]:
-        if name in other:
+        if name in other and "kind" in other and "kind" in kinds[0]:
             kind = _words_of(other["kind"])[0]
-            return f"{key} is a setting of kind {kind}, not of {inside['kind']}: remove it with ~{key}."
+            return f"{key} is a setting of kind {kind}, not of {group.value['kind']}: remove it with ~{key}."
+    near, every = list(kinds[0]) if kinds else [], list(keys(place.schema))
     same = [known for known in every if known.rpartition(".")[2] == name]
-    hint = did_you_mean(name, same, preferred=same) or did_you_mean(name, near) or did_you_mean(_dotted(path), every)
-    hint = hint or f": {_dotted(group, where) or 'a configuration'} has {', '.join(near)}."
-    if "files" in near and re.fullmatch(r".+\.[a-z]\w*", str(value := _value(values, path)), re.IGNORECASE):
-        hint += f" There is no file {key}={value} either: check its path; in quotes it is 'files=[\"{key}={value}\"]'."
+    hint = did_you_mean(name, same, same) or did_you_mean(name, near) or did_you_mean(_dotted(place.path), every)
+    hint = hint or f": {_dotted(group.path, where) or 'a configuration'} has {', '.join(near)}."
+    if "files" in near and re.fullmatch(r".+\.[a-z]\w*", str(place.value), re.IGNORECASE):
+        file = f"{key}={place.value}"
+        hint += f" There is no file {file} either: check its path; in quotes it is 'files=[\"{file}\"]'."
     return f"unknown key '{key}'{hint}"
 
 
@@ -110,6 +158,14 @@ def options(schema: Schema, node: Schema) -> list[Schema]:
     return [node] if choices is None else [option for choice in choices for option in options(schema, choice)]
 
 
+def _below(option: Schema, part: str | int) -> Schema | None:
+    """Returns the JSON Schema of a key or of an entry of a list of one type; None if it has no such part."""
+    if isinstance(part, int):
+        return option.get("items")
+    below = option.get("properties", {}).get(part) or option.get("additionalProperties")
+    return below if isinstance(below, Mapping) else None
+
+
 def is_text(schema: Schema, path: Path, written: str) -> bool:
     """Returns whether a value is a text, whatever it looks like: 001, on, or null in a list of names.
 
@@ -118,31 +174,20 @@ def is_text(schema: Schema, path: Path, written: str) -> bool:
         path: keys and list indices that lead to the value; ``defaults`` is that of Hydra.
         written: the value in YAML or on the command line.
     """
-    nodes: list[Schema] = [schema]
+    choices = options(schema, schema)
     for part in path:
-        choices = [option for node in nodes for option in options(schema, node)]
-        below = [
-            option.get("items")
-            if isinstance(part, int)
-            else option.get("properties", {}).get(part) or option.get("additionalProperties")
-            for option in choices
-        ]
-        nodes = [node for node in below if isinstance(node, Mapping)]
-    types = {option.get("type") for node in nodes for option in options(schema, node)}
-    types |= {"string"} if path[:1] == ("defaults",) else set()
-    brackets = {"object": "{", "array": "["}
-    is_group = any(written.startswith(bracket) for kind, bracket in brackets.items() if kind in types)
+        parts = [_below(option, part) for option in choices]
+        choices = [option for node in parts if node is not None for option in options(schema, node)]
+    types = {option.get("type") for option in choices} | ({"string"} if path[:1] == ("defaults",) else set())
+    if "string" not in types or types & {"number", "integer", "boolean"}:
+        return False
+    is_group = any(kind in types and written.startswith(mark) for kind, mark in (("object", "{"), ("array", "[")))
     is_null = written.lower() in ("null", "~", "") and (isinstance(path[-1], str) or "null" in types)
-    return "string" in types and not types & {"number", "integer", "boolean"} and not is_null and not is_group
+    return not is_group and not is_null
 
 
-def in_words(node: Schema, schema: Schema) -> str:
-    """Describes the valid values, as in "a positive number, in m".
-
-    Args:
-        node: JSON Schema of the value.
-        schema: JSON Schema of the whole class.
-    """
+def _in_words(node: Schema, schema: Schema) -> str:
+    """Describes the valid values of a key, as in "a positive number, in m"."""
     choices = options(schema, node)
     types = [option for option in choices if option.get("type") != "null"]
     unit = f", in {node['unit']}" if "unit" in node else ""
@@ -159,9 +204,7 @@ def _type(node: Schema, schema: Schema) -> str:
     kind = node.get("type", "")
     if kind == "array":
         return _array(node, schema)
-    if kind in ("number", "integer"):
-        return _range(node)
-    return {"object": "a group of settings", "boolean": "true or false", "string": "a word"}.get(kind, "anything")
+    return _range(node) if kind in ("number", "integer") else _WORDS.get(kind, "anything")
 
 
 def _words_of(node: Schema) -> list[Any]:
@@ -170,10 +213,10 @@ def _words_of(node: Schema) -> list[Any]:
 
 
 def _array(node: Schema, schema: Schema) -> str:
+    """Describes a list, as in "three numbers" or "a list of two or more words"."""
     items = node.get("prefixItems", [node.get("items", {})])
-    members = in_words(items[0], schema).removeprefix("a ")
+    members = re.sub(r"^a |^one (?=of )", "", _in_words(items[0], schema))
     members = re.sub(r"\b(number|word|list|group)\b", r"\1s", members, count=1)
-    members = members.removeprefix("one ") if members.startswith("one of ") else members
     members = f"lists of {members}" if members.partition(" ")[0] in _NUMBERS else members
     least, most = node.get("minItems", 0), node.get("maxItems")
     if least == most and least < len(_NUMBERS):
@@ -190,60 +233,9 @@ def _range(node: Schema) -> str:
     if (low, high, below) == (None, None, None) and above == 0:
         return f"a positive {noun}"
     if low in (0, 1) and (above, high, below) == (None, None, None):
-        return f"a {noun}, {_NUMBERS[int(low)].replace('no', 'zero')} or more"
+        return f"a {noun}, {'zero' if low == 0 else 'one'} or more"
     if low is not None and high is not None:
         return f"a {noun} from {low:,g} to {high:,g}"
     limits = {"at least": low, "above": above, "at most": high, "below": below}
     words = " and ".join(f"{name} {limit:,g}" for name, limit in limits.items() if limit is not None)
-    return f"a {noun}{f' {words}' if words else ''}"
-
-
-def _path(values: Any, error: ErrorDetails) -> Path:
-    """Keys that lead to an error, without pydantic's names of types; for a list member, the path of the list."""
-    path: list[str | int] = []
-    length = 0
-    for part in error["loc"]:
-        if isinstance(values, Mapping):
-            name = next((key for key in values if str(key) == str(part)), None)
-            if name is None and not (part == error["loc"][-1] and error["type"] == "missing"):
-                continue
-            values = None if name is None else values[name]
-            path.append(str(part))
-            length = len(path)
-        elif isinstance(values, (list, tuple)) and isinstance(part, int) and part < len(values):
-            values = values[part]
-            path.append(part)
-    return path[:length]
-
-
-def _dotted(path: Path, where: str = "") -> str:
-    parts = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
-    return f"{where}{parts}".removeprefix(".")
-
-
-def _value(values: Any, path: Path) -> Any:
-    for part in path:
-        if isinstance(values, Mapping):
-            values = next((value for key, value in values.items() if str(key) == str(part)), None)
-        else:
-            values = values[int(part)]
-    return values
-
-
-def _node(schema: Schema, path: Path, values: Any) -> Schema:
-    """JSON Schema at a path; for a group of several kinds, the kind that the values name is preferred."""
-    node = schema
-    for at, part in enumerate(path):
-        inside = _value(values, path[:at])
-        for option in sorted(options(schema, node), key=lambda option: not _fits(option, inside)):
-            below = option.get("properties", {}).get(part) or option.get("additionalProperties") or option.get("items")
-            if isinstance(below, Mapping):
-                node = below
-                break
-    return node
-
-
-def _fits(option: Schema, values: Any) -> bool:
-    """Whether values have the fixed words of a kind of group, such as ``kind: rod``."""
-    fixed = {name: member["const"] for name, member in option.get("properties", {}).items() if "const" in member}
-    return isinstance(values, Mapping) and all(values.get(name) == word for name, word in fixed.items())
+    return f"a {noun} {words}".rstrip()

@@ -51,9 +51,9 @@ reference = {"Base": [0.03, 0.0, 0.005]}
 
 mesh = rod([[0.0, 0.0, 0.0], [0.0, 0.0, -length]], radii, layers=14)
 along = np.linspace(0.0, 1.0, 21)[:, None]
-paths = [(1 - along) * np.array(start) + along * np.array(end) for start, end in routes.values()]
-paths[0] += [0.001, 0.0, 0.0]  # unknown to the simulator
-body = Body(mesh, select_vertices(mesh, z=0.0), energies=[Tendons(paths, labels=tuple(routes))])
+paths = {name: (1 - along) * np.array(start) + along * np.array(end) for name, (start, end) in routes.items()}
+paths["first"] += [0.001, 0.0, 0.0]  # unknown to the simulator
+body = Body(mesh, select_vertices(mesh, z=0.0), energies=[Tendons(paths)])
 laboratory = Simulator(body, StableNeoHookean(310e3, 0.48, density=1120.0))
 pulled = torch.tensor(list(tensions.values()), dtype=torch.float64)  # (B, 2) N
 poses = laboratory.static_equilibrium(Inputs(tendon_tension=pulled), batch=len(pulled)).q

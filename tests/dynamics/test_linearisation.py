@@ -14,12 +14,14 @@ from warp_resphys.dynamics.linearisation import Linearisation
 from warp_resphys.energies import Gent
 from warp_resphys.fem.coordinates import DeviceCoordinates
 from warp_resphys.mesh.boxes import box_hexahedra
+from warp_resphys.settings.body import Route
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import central_difference
 
 BOX = box_hexahedra((0.06, 0.02, 0.02), (3, 1, 1))
 MESH = Mesh(BOX.vertices, BOX.cells, {"beam": np.array([0, 1]), "cap": np.array([2])})
-TENDON = Tendons([[[x, 0.01, 0.02] for x in (0.0, 0.01, 0.03, 0.04)]], 400.0, directions=[[[0.0, 0.0, 1.0]]])
+GUIDES = [[x, 0.01, 0.02] for x in (0.0, 0.01, 0.03, 0.04)]
+TENDON = Tendons([Route(guides=GUIDES, offsets=[[0.0, 0.0, 1.0]])], 400.0)
 
 
 def linearised(rigid):

@@ -10,6 +10,7 @@ from support.slopes import check_rows, check_slopes
 from warp_resphys import Body, Corotated, Inputs, Simulator, State, Tendons, box_hexahedra, select_vertices
 from warp_resphys.dynamics import statics
 from warp_resphys.io.errors import ConvergenceError, InputError
+from warp_resphys.settings.body import Route
 from warp_resphys.studies.gradient_check import check_gradients
 
 SIZE = (0.12, 0.04, 0.02)
@@ -21,6 +22,7 @@ STRAIGHT = np.column_stack([np.linspace(0.0, SIZE[0], 7), np.full(7, 0.02), np.f
 # Around two corners of 90 degrees, and a straight one that ends earlier.
 CORNERS = np.array([[0.0, 0.01, 0.01], [0.08, 0.01, 0.01], [0.08, 0.03, 0.01], [0.12, 0.03, 0.01]])
 SHORT = STRAIGHT[:3]
+DOWN = [[0.0, 0.0, -1.0]]
 
 
 def simulator(*routes, material=SOFT, fixed=CLAMP, integrator="implicit_euler", **more):
@@ -51,7 +53,7 @@ def test_the_tension_of_a_hard_body_is_the_play_of_a_capstan():
 def test_at_rest_the_tension_falls_by_the_angles_of_the_pose():
     """The forces on the vertices of the solution are those of segments with Euler's tensions."""
     pull, entry = 5.0, 0.7
-    s, free = simulator(STRAIGHT, entry_angle=entry), simulator(STRAIGHT, friction=0.0)
+    s, free = simulator(Route(guides=STRAIGHT, entry_angle=entry)), simulator(STRAIGHT, friction=0.0)
     q = s.static_equilibrium(tension(pull)).q
     assert float((q - free.static_equilibrium(tension(pull)).q).abs().max()) > 3e-4
     above, below = (q[0].numpy()[select_vertices(BEAM, y=0.02, z=z)] for z in (0.02, 0.0))
@@ -68,7 +70,7 @@ def test_at_rest_the_tension_falls_by_the_angles_of_the_pose():
 @pytest.mark.parametrize(("acting", "forgets"), [(tension(2.0), True), (Inputs(tendon_contraction=6e-3), False)])
 def test_a_step_from_rest_holds_the_pose(acting, forgets):
     """Also where an environment is reset, whose memory is zero."""
-    s = simulator(STRAIGHT, entry_angle=0.3, stiffness=400.0)
+    s = simulator(Route(guides=STRAIGHT, entry_angle=0.3), stiffness=400.0)
     pose = s.static_equilibrium(acting)
     zero = {"tendon_segment_tension": torch.zeros(1, 6, dtype=torch.float64)} if forgets else {}
     trajectory = s.rollout(State(pose.q, pose.v, memory=zero), 5, acting)
@@ -94,7 +96,7 @@ def test_a_slide_takes_the_tension_to_its_bound_over_the_bristle_length():
 @pytest.mark.parametrize(
     ("integrator", "routes", "more"),
     [
-        ("implicit_euler", (STRAIGHT,), {"entry_angle": 0.5, "directions": [[[0.0, 0.0, -1.0]]], "stiffness": 300.0}),
+        ("implicit_euler", (Route(guides=STRAIGHT, entry_angle=0.5, offsets=DOWN),), {"stiffness": 300.0}),
         ("bdf2", (CORNERS, SHORT), {"stiffness": 300.0}),
         ("midpoint", (CORNERS,), {}),
     ],
@@ -110,7 +112,7 @@ def test_gradients_of_a_rollout_equal_differences(integrator, routes, more):
 
 
 def test_gradients_of_a_pose_equal_differences():
-    s = simulator(STRAIGHT, stiffness=400.0, entry_angle=0.2, directions=[[[0.0, 0.0, -1.0]]])
+    s = simulator(Route(guides=STRAIGHT, entry_angle=0.2, offsets=DOWN), stiffness=400.0)
     values = {"tendon_friction": MU, "youngs_modulus": 264e3, "tendon_offset_1": 0.0, "tension": 1.5, "shorter": 8e-3}
     sizes = {"tendon_friction": 1e-2, "youngs_modulus": 2e3, "tendon_offset_1": 1e-4, "tension": 1e-2, "shorter": 1e-4}
     weights = torch.linspace(-1.0, 1.0, s.rest_positions.numel()).double().reshape(s.rest_positions.shape)
@@ -138,18 +140,27 @@ def test_gradients_from_a_straight_rest_are_finite_and_right():
     [
         (STRAIGHT, {"friction": -0.1}, "tendon_friction is -0.1"),
         (STRAIGHT, {"bristle_length": 0.0}, "tendon_bristle_length is 0"),
-        (STRAIGHT, {"friction": None, "entry_angle": 1.0}, "acts by friction"),
+        (Route(guides=STRAIGHT, entry_angle=1.0), {"friction": None}, "acts by friction"),
         (STRAIGHT, {"friction": None, "bristle_length": -1.0}, "tendon_bristle_length is -1"),
-        (STRAIGHT, {"entry_angle": -1.0}, "the entry angle of tendons is -1.0"),
-        (STRAIGHT, {"entry_angle": [0.1, 0.2]}, "give one angle, or 1"),
-        (CORNERS, {"fixed_guides": [[4]]}, "it has guides 0 to 3"),
-        (SHORT, {"fixed_guides": [[0, 1, 2]]}, "it does not pull on the body"),
         ([[0.3, 0.0, 0.0], [SIZE[0], 0.02, 0.02]], {}, r"lies 180 mm outside .*: .* name it among the fixed guides"),
     ],
 )
-def test_bad_friction_and_fixed_guides_are_refused(route, more, words):
+def test_bad_friction_is_refused(route, more, words):
     with pytest.raises(InputError, match=words):
         simulator(route, **more)
+
+
+@pytest.mark.parametrize(
+    ("guides", "keys", "words"),
+    [
+        (STRAIGHT, {"entry_angle": -1.0}, r"Route.entry_angle is -1\.0: it must be a number, zero or more, in rad"),
+        (CORNERS, {"fixed_guides": [4]}, "the route has guides 0 to 3"),
+        (SHORT, {"fixed_guides": [0, 1, 2]}, "the tendon does not pull on the body"),
+    ],
+)
+def test_bad_routes_are_refused(guides, keys, words):
+    with pytest.raises(InputError, match=words):
+        Route(guides=guides, **keys)
 
 
 def test_friction_that_no_pose_holds_is_said(monkeypatch):
@@ -170,7 +181,7 @@ def test_memory_of_another_body_is_refused():
 def test_guides_in_the_world_pull_as_a_cable_to_a_post():
     """The force of a cable from the tip to a post, over a pulley above it, is its tension along the line."""
     post, pulley, end = [0.3, 0.02, -0.1], [0.25, 0.02, 0.1], [SIZE[0], 0.02, 0.02]
-    s = simulator([post, pulley, end], fixed_guides=[[0, 1]], friction=0.3)
+    s = simulator(Route(guides=[post, pulley, end], fixed_guides=[0, 1]), friction=0.3)
     state = s.rest_state()
     force = s.linearise(state, tension(2.0)).residual(state.q)[0].numpy()
     corner = math.acos(np.dot(*(x / np.linalg.norm(x) for x in (np.subtract(pulley, post), np.subtract(end, pulley)))))

@@ -11,6 +11,7 @@ from support.clamped import clamped
 from support.slopes import check_rows
 from warp_resphys import Corotated, Inputs, Simulator, SolverSettings, Tendons, box_hexahedra, box_tetrahedra
 from warp_resphys.io.errors import InputError
+from warp_resphys.settings.body import Route
 from warp_resphys.stepping.integrators import INTEGRATORS
 from warp_resphys.studies.gradient_check import POSES, check_gradients
 
@@ -81,7 +82,8 @@ def test_a_tendon_that_is_off_is_one_that_was_routed_there(solver, offset):
     settings = SolverSettings(name=solver, relative_tolerance=1e-10)
     tapering = np.linspace([0.0, 1.0, 0.0], [0.0, 0.2, 0.0], 7), np.linspace([0.0, 0.0, 0.1], [0.0, 0.0, 1.0], 7)
     drive = Inputs(tendon_tension=0.5, tendon_contraction=4e-3)
-    tendons = Tendons([route(0.013, depth=0.013)], stiffness=2000.0, directions=[tapering])
+    off = Route(guides=route(0.013, depth=0.013), offsets=[way.tolist() for way in tapering])
+    tendons = Tendons([off], stiffness=2000.0)
     sims = [
         Simulator(clamped(BEAM, energies=(own,)), SOFT, gravity=WEIGHTLESS, solver=settings)
         for own in (tendons, tendons.rerouted([offset]))
@@ -100,10 +102,10 @@ def test_gradients(start, integrator, poissons_ratio):
     """With a winch and a commanded tension at once, and by where tendons run."""
     solver = SolverSettings(relative_tolerance=1e-11, linear_solver="banded")
     turning = np.linspace([0.0, 1.0, 0.2], [0.0, -0.5, 1.0], 7)
-    directions, stiffness = [ACROSS, [turning, [0.3, 0.0, 1.0]]], np.array([400.0, 900.0])
-    routes = route(0.018), route(0.006, depth=0.004)
+    low = Route(guides=route(0.006, depth=0.004), offsets=[turning.tolist(), [0.3, 0.0, 1.0]])
+    routes, stiffness = (Route(guides=route(0.018), offsets=ACROSS), low), np.array([400.0, 900.0])
     material = replace(SOFT, poissons_ratio=poissons_ratio, stiffness_damping=1e-3)
-    sim = simulator(*routes, stiffness=stiffness, directions=directions, solver=solver, material=material)
+    sim = simulator(*routes, stiffness=stiffness, solver=solver, material=material)
     sim = replace(sim, integrator=integrator, gravity=(0.0, 0.0, -9.8))
     names = "tendon_tension", "tendon_contraction", "tendon_offset_1"
     each = (f"tendon_{name}, each tendon" for name in ("stiffness", "offset_1", "offset_2"))
@@ -114,23 +116,23 @@ def test_gradients(start, integrator, poissons_ratio):
     ("make", "said"),
     [
         (lambda: Tendons([]), "there is no tendon"),
-        (lambda: Tendons([[[0.0, 0.0, 0.0]]]), "tendon 1 has guides of shape (1, 3)"),
-        (lambda: Tendons([route(0.01), np.full((2, 3), np.nan)]), "tendon 2 has a guide that is not finite"),
-        (lambda: Tendons([route(0.01)[[0, 1, 1]]]), "two guides in a row at one place"),
+        (
+            lambda: Tendons([[[0.0, 0.0, 0.0]]]),
+            "tendon_1.guides is [[0.0, 0.0, 0.0]]: it must be a list of two or more",
+        ),
+        (lambda: Tendons([route(0.01), np.full((2, 3), np.nan)]), "tendon_2.guides is [[nan"),
+        (lambda: Tendons([route(0.01)[[0, 1, 1]]]), "tendon_1.guides has two in a row at one place"),
         (lambda: Tendons([route(0.01)], stiffness=-1.0), "tendon_stiffness is"),
         (lambda: Tendons([route(0.01)], toe=0.0), "the toe of tendons is 0"),
         (
-            lambda: Tendons([route(0.01)], directions=[ACROSS, ACROSS]),
-            "2 tendons have directions of offsets, but there are 1",
+            lambda: Tendons([route(0.01), Route(guides=route(0.02), offsets=ACROSS)]),
+            "the tendons have [0, 2] directions of offsets",
         ),
-        (
-            lambda: Tendons([route(0.01)], directions=[[*ACROSS, ACROSS[0]]]),
-            "the tendons have [3] directions of offsets",
-        ),
-        (lambda: Tendons([route(0.01)], directions=[["up"]]), "a direction that is not an array: 'up'"),
-        (lambda: Tendons([route(0.01), route(0.02)], labels=("a", "a")), "tendons are called a, a"),
-        (lambda: Tendons([route(0.01)], directions=[[[1.0, 0.0]]]), "of shape (2,)"),
-        (lambda: Tendons([route(0.01)], directions=[[np.zeros(3)]]), "a direction of offsets that is zero"),
+        (lambda: Route(guides=route(0.01), offsets=[*ACROSS, ACROSS[0]]), "Route.offsets is"),
+        (lambda: Route(guides=route(0.01), offsets=["up"]), "Route.offsets is ['up']"),
+        (lambda: Route(guides=route(0.01), offsets=[[1.0, 0.0]]), "Route.offsets is [[1.0, 0.0]]"),
+        (lambda: Route(guides=route(0.01), offsets=[ACROSS]), "offsets has a direction for 2 guides"),
+        (lambda: Route(guides=route(0.01), offsets=[[0.0, 0.0, 0.0]]), "not all zero"),
         (lambda: simulator(route(0.018)).static_equilibrium(Inputs(tendon_tension=-1.0)), "tendon_tension is"),
         (lambda: simulator(route(0.01), route(0.03)), "guide 1 of tendon 2, at [0.0, 0.01, 0.03] m, lies 10 mm"),
     ],

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from support.configured import check, composed, settings
-from warp_resphys.experiment.actuators import build_muscles, build_tendons
+from warp_resphys.energies.tendons import Tendons
+from warp_resphys.experiment.actuators import build_muscles
 from warp_resphys.experiment.build import build_simulator
 from warp_resphys.io.settings import parse
 from warp_resphys.mesh.boxes import box_hexahedra
-from warp_resphys.settings.body import MuscleSettings, TendonSettings
+from warp_resphys.settings.body import MuscleSettings, Route
 
 HALVES = [
     "mesh={kind: box_hexahedra, size: [0.05, 0.03, 0.03], divisions: [5, 2, 2]}",
@@ -56,9 +57,9 @@ def test_tendons_run_straight_between_their_guides():
         "left": {"guides": [[0, 0, 0], [0.3, 0, 0], [0.3, 0.4, 0]], "pieces": 5},
         "right": {"guides": [[0, 0, 1], [0, 1, 1]]},
     }
-    tendons = build_tendons(parse(TendonSettings, {"routes": routes, "commanded": "tension", "stiffness": 0.0}))
+    tendons = Tendons({name: Route(**route) for name, route in routes.items()})
     assert tendons.names == ("left", "right")
-    left, right = (np.asarray(route) for route in tendons.routes)
+    left, right = tendons.guides
     assert (len(left), len(right)) == (11, 2)
     np.testing.assert_allclose(np.linalg.norm(np.diff(left, axis=0), axis=1), [0.06] * 5 + [0.08] * 5)
     np.testing.assert_allclose(left[[0, 5, 10]], routes["left"]["guides"])

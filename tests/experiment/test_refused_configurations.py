@@ -170,7 +170,7 @@ CASES = {
             "no cell has its centre within x from 1 to 2",
             "muscles={commanded:null,stiffness:1e4,bundles:{a:{direction:[0,0,1],within:{x:[1,2]}}}}",
         ),
-        ("all guides of tendon 2 are fixed in the world", "+tendons.routes.left.fixed_guides=[0,1]"),
+        ("routes.left.fixed_guides has all guides", "+tendons.routes.left.fixed_guides=[0,1]"),
         ("the route has guides 0 to 1", "+tendons.routes.left.fixed_guides=[2]"),
     ],
     ("experiment=tendon_rod_control", "mesh.layers=3", "mesh.nodes=20"): [

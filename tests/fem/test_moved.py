@@ -10,6 +10,7 @@ from warp_resphys import Corotated, Fibres, Inputs, Muscles, Pressure, Simulator
 from warp_resphys.energies import Muscle
 from warp_resphys.io.errors import InputError
 from warp_resphys.mesh import find_chambers
+from warp_resphys.settings.body import Route
 
 ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 SHIFT = np.array([0.1, -0.2, 0.05])  # m
@@ -19,7 +20,7 @@ CHAMBER = [max(find_chambers(HOLLOW), key=lambda own: len(own.faces))]  # longer
 ROUTE = [[0.0, 0.015, 0.01], [0.05, 0.015, 0.012], [0.1, 0.015, 0.01]]
 BODIES = {
     "tendon": (
-        clamped(BOX, energies=[Tendons([ROUTE], directions=[[[0.0, 0.0, 1.0]]])]),
+        clamped(BOX, energies=[Tendons([Route(guides=ROUTE, offsets=[[0.0, 0.0, 1.0]])])]),
         {"tendon_tension": 0.4},
         {"tendon_offset_1": 2e-3},
     ),

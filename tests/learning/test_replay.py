@@ -88,8 +88,8 @@ def test_sets_of_parameters_at_once_are_those_one_by_one():
 
 def test_parts_have_their_own_parameters():
     """The parameter of one part leaves the other parts at their own or their common value."""
-    routes = [[[0.0, 0.01, z], [0.1, 0.01, z]] for z in (0.005, 0.015)]
-    tendons = Tendons(routes, stiffness=[300.0, 400.0], labels=("low", "high"))
+    routes = {name: [[0.0, 0.01, z], [0.1, 0.01, z]] for name, z in (("low", 0.005), ("high", 0.015))}
+    tendons = Tendons(routes, stiffness=[300.0, 400.0])
     sim = Simulator(Body(MESH, select_vertices(MESH, x=0.0), energies=(tendons,)))
     replay = Replay(sim, lambda q: q, blank(masses=(0.0, 0.0)))
     assert {"tendon_stiffness", "tendon_stiffness_low", "tendon_stiffness_high"} <= {*replay.parameter_names}

@@ -1,5 +1,6 @@
 """Energies of a body: materials, actuators, contact and surroundings."""
 
+from ..settings.body import Route as Route
 from ..settings.contact import Box as Box
 from ..settings.contact import Capsule as Capsule
 from ..settings.contact import FrictionPair as FrictionPair

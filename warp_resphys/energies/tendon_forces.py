@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 import torch
 import warp as wp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..kernels import tendon_segments as kernels
@@ -156,10 +156,10 @@ class BoundTendons(BoundEnergy):
         tendons: the tendons.
         site: the simulator as they see it.
         toe: elongation at which a spring reaches its full stiffness [m].
-        entry_angle: of contact before the first guide, one or (T,) [rad].
+        entry_angle: (T,) of contact before the first guide [rad].
     """
 
-    def __init__(self, tendons: Energy, site: EnergySite, toe: float, entry_angle: ArrayLike) -> None:
+    def __init__(self, tendons: Energy, site: EnergySite, toe: float, entry_angle: Sequence[float]) -> None:
         super().__init__(tendons, site)
         (points,) = site.points
         assert isinstance(points, TendonPoints)
@@ -173,7 +173,7 @@ class BoundTendons(BoundEnergy):
         starts = torch.as_tensor(first[:-1] + np.arange(count), device=device)
         self._chain = torch.cat([starts, self._segments]).argsort()
         entry = np.zeros(len(part))
-        entry[first[:-1]] = np.broadcast_to(np.asarray(entry_angle, dtype=np.float64), count)
+        entry[first[:-1]] = entry_angle
         self._entry = site.tensor(entry)
         self.memory = (Memory(SEGMENT_TENSION, "N", (len(part),), "segment"),)
 

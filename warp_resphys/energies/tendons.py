@@ -20,17 +20,22 @@ offsets must be small compared with the cells. L_0 is the length of the offset t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
+from ..io.settings import parse
 from ..kernels import tendon_segments as kernels
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
+from ..settings.body import Route
 from ..stepping.quantity import Parameter, Quantity
 from .base import BoundEnergy, Energy, EnergySite
 from .launcher import Launcher
@@ -58,90 +63,65 @@ class Tendons(Energy):
     ``tendon_offset_2`` [m], zero by default; all with one value per tendon.
 
     Raises:
-        InputError: no tendon, one with fewer than two guides, guides that are not finite, a negative stiffness,
-            friction or angle, or directions of offsets that do not fit the guides.
+        InputError: no tendon, a route that is none, a value out of range, or different numbers of offsets.
     """
 
     inputs: ClassVar[tuple[Quantity, ...]] = (TENSION, CONTRACTION)
     is_load: ClassVar[bool] = True
 
-    routes: Sequence[ArrayLike]  # (G, 3) guides of each tendon on the undeformed body, in order [m]
+    # routes, by name or numbered, or the guides (G, 3) alone, on the undeformed body, in order [m]
+    routes: Mapping[str, Route | ArrayLike] | Sequence[Route | ArrayLike]
     # k [N/m], parameter ``tendon_stiffness``: a number, (T,), (B, 1) or (B, T) values; zero for commanded tension
     stiffness: Parameter = 0.0
     toe: float = 1e-4  # elongation at which the spring reaches its full stiffness [m]
     reach: float = 1e-3  # largest distance of a guide from the body [m]
-    labels: Sequence[str] = ()  # names of the tendons; numbered if empty
-    # offset directions of each tendon, one or two for all tendons: (3,) for all guides of a tendon, or (G, 3) one per
-    # guide; displacement of the guide per metre of offset
-    directions: Sequence[Sequence[ArrayLike]] = ()
-    fixed_guides: Sequence[Sequence[int]] = ()  # numbers of the guides of each tendon, from 0, that stay in the world
     friction: Parameter | None = None  # coefficient mu in the guides, parameter ``tendon_friction``; None: no friction
     bristle_length: Parameter = 1e-4  # slide over which friction reverses [m]
-    entry_angle: ArrayLike = 0.0  # of contact before the first guide, such as around pulleys: one, or (T,) [rad]
-
-    @override
-    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Tendons":
-        directions = [[np.asarray(way) @ rotation.T for way in ways] for ways in self.directions]
-        return replace(self, routes=[route @ rotation.T + translation for route in self.guides], directions=directions)
 
     def __post_init__(self) -> None:
         """Checks the values."""
         if not len(self.routes):
             raise InputError("there is no tendon: give the guides of each, or leave the tendons out.")
-        for number, route in enumerate(self.guides, 1):
-            if route.ndim != 2 or route.shape[1] != 3 or len(route) < 2:
-                raise InputError(f"tendon {number} has guides of shape {route.shape}: it needs two or more places.")
-            if not np.isfinite(route).all():
-                raise InputError(f"tendon {number} has a guide that is not finite.")
-            if (np.linalg.norm(np.diff(route, axis=0), axis=1) == 0.0).any():
-                raise InputError(f"tendon {number} has two guides in a row at one place: leave one of them out.")
         for name, value in (("toe", self.toe), ("reach", self.reach)):
             if not (np.isfinite(value) and value > 0.0):
                 raise InputError(f"the {name} of tendons is {value:g}: it must be positive, in m.")
-        if self.labels and len(self.labels) != len(self.routes):
-            raise InputError(f"there are {len(self.labels)} names for {len(self.routes)} tendons.")
         STIFFNESS.check(self.stiffness)
         if self.friction is not None:
             FRICTION.check(self.friction)
-        elif np.any(self.entry_angle):
+        elif any(route.entry_angle for route in self.named_routes.values()):
             raise InputError("an entry angle of tendons acts by friction: give their friction, or leave it out.")
         BRISTLE.check(self.bristle_length)
-        if len(self.fixed_guides) not in (0, self.count):
-            raise InputError(f"fixed guides are way for {len(self.fixed_guides)} of {self.count} tendons: give all.")
-        for number, (route, fixed) in enumerate(zip(self.guides, self.fixed_guides, strict=False), 1):
-            if not set(fixed) <= set(range(len(route))):
-                most = len(route) - 1
-                raise InputError(f"fixed guides of tendon {number} are {list(fixed)}: it has guides 0 to {most}.")
-            if len(set(fixed)) == len(route):
-                raise InputError(f"all guides of tendon {number} are fixed in the world: it does not pull on the body.")
-        angles = np.asarray(self.entry_angle, dtype=np.float64)
-        if angles.shape not in ((), (self.count,)) or not (np.isfinite(angles) & (angles >= 0.0)).all():
-            raise InputError(
-                f"the entry angle of tendons is {self.entry_angle}: give one angle, or {self.count}, of zero or more, "
-                "in rad."
-            )
-        if len(set(self.names)) != self.count:
-            raise InputError(f"tendons are called {', '.join(self.names)}: give each a name of its ways.")
-        if not len(self.directions):
-            return
-        if len(self.directions) != self.count:
-            raise InputError(f"{len(self.directions)} tendons have directions of offsets, but there are {self.count}.")
-        counts = [len(ways) for ways in self.directions]
-        if set(counts) not in ({1}, {2}):
+        counts = [len(route.offsets) for route in self.named_routes.values()]
+        if len({*counts}) > 1:
             raise InputError(f"the tendons have {counts} directions of offsets: give each one, or each two.")
-        for number, (route, ways) in enumerate(zip(self.guides, self.directions, strict=True), 1):
-            for way in ways:
-                try:
-                    direction = np.asarray(way, dtype=np.float64)
-                except (TypeError, ValueError):
-                    raise InputError(f"tendon {number} has a direction that is not an array: {way!r}.") from None
-                if direction.shape not in ((3,), route.shape):
-                    raise InputError(
-                        f"tendon {number} has a direction of offsets of shape {direction.shape}: give three numbers, "
-                        f"or three for each of its {len(route)} guides."
-                    )
-                if not np.isfinite(direction).all() or not direction.any():
-                    raise InputError(f"tendon {number} has a direction of offsets that is zero or not finite.")
+
+    @cached_property
+    def named_routes(self) -> dict[str, Route]:
+        """Routes by name."""
+        routes: Mapping[str, Any] = (
+            self.routes
+            if isinstance(self.routes, Mapping)
+            else {f"tendon_{number}": route for number, route in enumerate(self.routes, 1)}
+        )
+        return {
+            name: route
+            if isinstance(route, Route)
+            else parse(Route, {"guides": np.asarray(route, dtype=np.float64).tolist()}, name)
+            for name, route in routes.items()
+        }
+
+    @cached_property
+    def _lines(self) -> list[tuple[FloatArray, BoolArray, list[FloatArray]]]:
+        """Guides of each tendon, which of them stay in the world, and offset directions; see `divided`."""
+        return [divided(route) for route in self.named_routes.values()]
+
+    @override
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> "Tendons":
+        def turned(route: Route) -> Route:
+            offsets = [(np.asarray(way) @ rotation.T).tolist() for way in route.offsets]
+            return route.changed(guides=np.asarray(route.guides) @ rotation.T + translation, offsets=offsets)
+
+        return replace(self, routes={name: turned(route) for name, route in self.named_routes.items()})
 
     def rerouted(self, offsets: ArrayLike) -> "Tendons":
         """Returns tendons with the guides moved by offsets, and without offset parameters.
@@ -149,17 +129,18 @@ class Tendons(Energy):
         Args:
             offsets: (T, D) offsets of the T tendons along their D directions [m].
         """
-        all_offsets = np.asarray(offsets, dtype=np.float64)
-        routes = [
-            route + sum(o * np.asarray(d, dtype=np.float64) for o, d in zip(amounts, directions, strict=True))
-            for route, amounts, directions in zip(self.guides, all_offsets, self.directions, strict=True)
-        ]
-        return replace(self, routes=routes, directions=())
+
+        def shifted(route: Route, amounts: FloatArray) -> Route:
+            steps = [o * np.asarray(way) for o, way in zip(amounts, route.offsets, strict=True)]
+            return route.changed(guides=np.asarray(route.guides) + sum(steps), offsets=())
+
+        pairs = zip(self.named_routes.items(), np.asarray(offsets, dtype=np.float64), strict=True)
+        return replace(self, routes={name: shifted(route, amounts) for (name, route), amounts in pairs})
 
     @property
     def offset_count(self) -> int:
         """Number of offset directions per tendon."""
-        return len(self.directions[0]) if len(self.directions) else 0
+        return len(next(iter(self.named_routes.values())).offsets)
 
     @property
     @override
@@ -170,7 +151,7 @@ class Tendons(Energy):
     @property
     def guides(self) -> list[NDArray[np.float64]]:
         """Guides (G, 3) of each tendon [m]."""
-        return [np.asarray(route, dtype=np.float64) for route in self.routes]
+        return [guides for guides, _, _ in self._lines]
 
     @property
     @override
@@ -180,7 +161,7 @@ class Tendons(Energy):
     @property
     @override
     def names(self) -> tuple[str, ...]:
-        return tuple(self.labels) or tuple(f"tendon_{number + 1}" for number in range(self.count))
+        return tuple(self.named_routes)
 
     @property
     @override
@@ -201,7 +182,8 @@ class Tendons(Energy):
 
     @override
     def bind(self, site: EnergySite) -> BoundEnergy:
-        return super().bind(site) if self.friction is None else BoundTendons(self, site, self.toe, self.entry_angle)
+        entry = [route.entry_angle for route in self.named_routes.values()]
+        return super().bind(site) if self.friction is None else BoundTendons(self, site, self.toe, entry)
 
     @override
     def points(self, mesh: Mesh) -> tuple[TendonPoints, ...]:
@@ -211,8 +193,7 @@ class Tendons(Energy):
             InputError: a guide outside of the body.
         """
         nodes, operators, tendon, rest, anchors = [], [], [], [], []
-        for number, route in enumerate(self.guides):
-            in_world = np.isin(np.arange(len(route)), self.fixed_guides[number] if len(self.fixed_guides) else ())
+        for number, (route, in_world, directions) in enumerate(self._lines):
             places = locate(
                 mesh, np.where(in_world[:, None], route[~in_world][:1], route)
             )  # those in the world have no place
@@ -226,8 +207,8 @@ class Tendons(Energy):
             weights = np.zeros((*places.weights.shape, 3))  # (G, K, 3): position, and its derivatives by the offsets
             shape = np.zeros((len(route), 3, 3))
             weights[..., 0], shape[..., 0] = places.weights, route
-            for k in range(self.offset_count):
-                step = kernels.OFFSET_UNIT * np.broadcast_to(self.directions[number][k], route.shape)
+            for k, direction in enumerate(directions):
+                step = kernels.OFFSET_UNIT * direction
                 weights[..., 1 + k] = np.einsum("gki,gi->gk", places.gradients, step)
                 shape[..., 1 + k] = step
             weights[in_world] = 0.0
@@ -254,6 +235,28 @@ class Tendons(Energy):
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> "TendonTerm":
         return TendonTerm(launcher, sets, self.count, self.toe, self.friction is not None)
+
+
+def divided(route: Route) -> tuple[FloatArray, BoolArray, list[FloatArray]]:
+    """Divides the straight parts of a route in the body into its pieces.
+
+    Returns:
+        Guides (G, 3) [m], whether they stay in the world (G,), and D directions of offsets (G, 3).
+    """
+    guides = np.asarray(route.guides, dtype=np.float64)
+    held = np.isin(np.arange(len(guides)), route.fixed_guides)
+    pieces = np.where(held[1:] | held[:-1], 1, route.pieces)
+    in_world = np.zeros(pieces.sum() + 1, dtype=bool)
+    in_world[np.concatenate([[0], np.cumsum(pieces)])[held]] = True
+
+    def between(values: FloatArray) -> FloatArray:
+        parts = [
+            np.linspace(*ends, number, endpoint=False) for ends, number in zip(pairwise(values), pieces, strict=True)
+        ]
+        return np.concatenate([*parts, values[-1:]])
+
+    ways = [np.broadcast_to(np.asarray(offset, dtype=np.float64), guides.shape) for offset in route.offsets]
+    return between(guides), in_world, [between(way) for way in ways]
 
 
 def _difference(

@@ -2,11 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Final, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Final, cast
 
 from ..energies.base import Energy
 from ..energies.contact.obstacle_contact import Contact
@@ -25,7 +21,7 @@ from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.selection import select_cells, vertices_at
 from ..mesh.volume_mesh import Mesh
-from ..settings.body import BodySettings, ChamberSettings, MuscleSettings, TendonSettings
+from ..settings.body import BodySettings, ChamberSettings, MuscleSettings
 from ..settings.contact import SurfaceFile
 from ..settings.mesh import Place
 from ..stepping.quantity import Quantity
@@ -61,7 +57,7 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None
             raise InputError("fibres is set, but chambers is null: fibres need chambers, so leave them out.")
         energies.append(Fibres(chambers, axis=settings.chambers.axis, **dict(settings.fibres)))
     if settings.tendons is not None:
-        energies.append(build_tendons(settings.tendons))
+        energies.append(Tendons(**{key: value for key, value in settings.tendons if key != "commanded"}))
     if settings.muscles is not None:
         energies.append(build_muscles(settings.muscles, mesh))
     if settings.medium is not None:
@@ -158,35 +154,6 @@ def drive_of(settings: BodySettings, body: Body) -> Drive | None:
         return None
     names = next(energy.names for energy in cast(Sequence[Energy], body.energies) if quantity in energy.inputs)
     return Drive(quantity, names)
-
-
-def build_tendons(settings: TendonSettings) -> Tendons:
-    """Builds the tendons of a group; routes and their offsets are subdivided into ``pieces`` between guides.
-
-    Raises:
-        InputError: see `Tendons`.
-    """
-    routes, directions, fixed = [], [], []
-    for route in settings.routes.values():
-        guides = np.asarray(route.guides, dtype=np.float64)
-        held = np.isin(np.arange(len(guides)), route.fixed_guides)
-        pieces = np.where(held[1:] | held[:-1], 1, route.pieces)  # Guides lie in the body alone.
-        routes.append(_divided(guides, pieces))
-        fixed.append(np.concatenate([[0], np.cumsum(pieces)])[held].tolist())
-        own = [np.broadcast_to(np.asarray(offset, dtype=np.float64), guides.shape) for offset in route.offsets]
-        directions.append([_divided(offset, pieces) for offset in own])
-    more: dict[str, Any] = {"directions": directions} if any(directions) else {}
-    if any(fixed):
-        more["fixed_guides"] = fixed
-    more |= {key: getattr(settings, key) for key in ("stiffness", "toe", "reach", "friction", "bristle_length")}
-    entry = [route.entry_angle for route in settings.routes.values()]
-    return Tendons(routes, labels=tuple(settings.routes), entry_angle=entry, **more)
-
-
-def _divided(values: NDArray[np.float64], pieces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Interpolates values (G, 3) at guides linearly, with (G - 1,) intervals between neighbours."""
-    parts = [np.linspace(*ends, own, endpoint=False) for ends, own in zip(pairwise(values), pieces, strict=True)]
-    return np.concatenate([*parts, values[-1:]])
 
 
 def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:

@@ -48,11 +48,12 @@ class Settings(BaseModel):
     )
 
     def __init__(self, /, **values: Any) -> None:
-        """Checks the keys.
+        """Checks the keys; NumPy's numbers and arrays of one or two axes are taken as numbers and lists.
 
         Raises:
             InputError: as `parse`; the message names the class.
         """
+        values = {name: value.tolist() if getattr(value, "ndim", 3) < 3 else value for name, value in values.items()}
         with _in_words(type(self), values, type(self).__name__):
             self.__pydantic_validator__.validate_python(values, self_instance=self)
 

@@ -1,5 +1,6 @@
 """Settings of a body (material, parts, actuators, loads) and of its simulator."""
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
@@ -146,7 +147,7 @@ class FibreSettings(Settings):
     stiffness: NotNegative = setting(description="stiffness of a family, per length", unit="N/m")
 
 
-class RouteSettings(Settings):
+class Route(Settings):
     """The route of a tendon."""
 
     guides: Curve = setting(description="points through which it runs", unit="m")
@@ -157,11 +158,28 @@ class RouteSettings(Settings):
         (), "directions of identified offsets, common or per guide"
     )
 
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        count, fixed = len(self.guides), {*self.fixed_guides}
+        if any(first == second for first, second in pairwise(self.guides)):
+            raise ValueError("guides has two in a row at one place: leave one of them out.")
+        if not fixed <= {*range(count)}:
+            raise ValueError(f"fixed_guides is {list(self.fixed_guides)}: the route has guides 0 to {count - 1}.")
+        if len(fixed) == count:
+            raise ValueError("fixed_guides has all guides, so that the tendon does not pull on the body: take one out.")
+        for offset in self.offsets:
+            if isinstance(offset[0], tuple) and len(offset) != count:
+                raise ValueError(
+                    f"offsets has a direction for {len(offset)} guides: give three numbers, or three for each of its "
+                    f"{count} guides."
+                )
+        return self
+
 
 class TendonSettings(Settings):
     """Tendons that pull on the body."""
 
-    routes: dict[str, RouteSettings] = setting(description="routes by name")
+    routes: dict[str, Route] = setting(description="routes by name")
     commanded: Literal["tension", "contraction"] = setting(description="input of the tendons")
     stiffness: NotNegative = setting(description="required for commanded contractions", unit="N/m")
     toe: Positive = setting(1.0e-4, "contraction over which a tendon becomes taut", "m")
@@ -173,18 +191,6 @@ class TendonSettings(Settings):
     def _pulls(self) -> Self:
         if self.commanded == "contraction" and not self.stiffness > 0.0:
             raise ValueError("stiffness is 0, but contractions are commanded, which act through it: set it, in N/m.")
-        for name, route in self.routes.items():
-            if not set(route.fixed_guides) <= set(range(len(route.guides))):
-                raise ValueError(
-                    f"routes.{name}.fixed_guides is {list(route.fixed_guides)}: the route has guides 0 to "
-                    f"{len(route.guides) - 1}."
-                )
-            for offset in route.offsets:
-                if isinstance(offset[0], tuple) and len(offset) != len(route.guides):
-                    raise ValueError(
-                        f"routes.{name}.offsets has a direction for {len(offset)} guides: give three numbers, or three "
-                        f"for each of its {len(route.guides)} guides."
-                    )
         return self
 
 

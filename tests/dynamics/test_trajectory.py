@@ -9,8 +9,8 @@ import torch
 
 from support.clamped import clamped
 from warp_resphys import Contact, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
-from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.energies import Box, Sphere
+from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 
 MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)

@@ -12,8 +12,8 @@ from gymnasium.vector import AutoresetMode
 import warp_resphys
 from warp_resphys import InputError, Robot, State
 from warp_resphys.control.worlds import World
-from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.data.registration import kabsch
+from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv

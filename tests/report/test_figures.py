@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from warp_resphys.data.obstacle_surface import ObstacleSurface
+from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report import figures

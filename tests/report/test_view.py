@@ -12,8 +12,8 @@ from support.browser import until
 from support.made_up_run import arm_settings, vertex_settings, write_arm_run, write_vertex_run
 from support.report_page import FAILING, Page, report
 from warp_resphys import Body, Contact, box_hexahedra
-from warp_resphys.data.obstacle_surface import ObstacleSurface
 from warp_resphys.energies import Capsule, Sphere
+from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.report import render
 from warp_resphys.report.body_motions import ComparedMotion

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..data.obstacle_surface import ObstacleSurface
 from ..data.registration import kabsch
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
 from ..experiment.laboratory import make_setup
@@ -235,7 +235,7 @@ class Laboratory(RobotWorld):
 
     @override
     def obstacles(self) -> ObstacleSurface:
-        return super().obstacles().carried(self._frame)
+        return super().obstacles().carried(self._frame.rotation, self._frame.translation)
 
     def seen(self, state: State, number: int) -> FloatArray:
         """Returns noisy markers (B, M, 3) after a number of steps [m]; the step number seeds the noise."""

@@ -15,7 +15,7 @@ import torch
 from ..energies.base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory, PlacedEnergy
 from ..energies.contact.barrier import ContactForces
 from ..energies.contact.obstacle_contact import BoundContact
-from ..energies.contact.obstacle_poses import ObstacleMotion
+from ..energies.contact.obstacle_poses import Pose
 from ..energies.contact.surface_contact import BoundSurfaceContact
 from ..energies.hysteresis import Hysteresis
 from ..energies.materials import Material
@@ -227,20 +227,19 @@ class EnergySet:
                 out[f"{self.placed[k].prefix}{others}"] = bound.forces(self._step(step, k), x)
         return out
 
-    def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[ObstacleMotion, ...]:
-        """Returns the motions of all obstacles, with the prefixes of their energies.
+    def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[Pose, ...]:
+        """Returns the poses of all obstacles in each state; none without obstacles.
 
         Args:
             states: successive states of a roll-out, whose memory has the poses of obstacles that move.
             constants: constants of the simulator.
         """
-        motions: list[ObstacleMotion] = []
+        contacts: list[list[Pose]] = []
         for item, bound, values in zip(self.placed, self._bound, constants.values, strict=True):
             if isinstance(bound, BoundContact):
                 memories = [_without(item.prefix, state.memory) for state in states]
-                seen = bound.motions(memories, values, states[0].batch)
-                motions += [replace(motion, name=f"{item.prefix}{motion.name}") for motion in seen]
-        return tuple(motions)
+                contacts.append(bound.poses(memories, values, states[0].batch))
+        return tuple(Pose.joined(poses) for poses in zip(*contacts, strict=True))
 
     def outside(self, q: torch.Tensor, state: State, constants: Constants) -> torch.Tensor:
         """Returns positions (B, N, 3) [m] pushed out of obstacles that stand still, for a step from there.

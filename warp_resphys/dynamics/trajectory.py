@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from ..energies.contact.obstacle_poses import ObstacleMotion
+from ..energies.contact.obstacle_poses import Pose
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, number_of
@@ -31,7 +32,7 @@ class Motion:
         body: the body.
         time_step: h [s].
         reports: T solver reports.
-        obstacles: motions of the obstacles that the body touches.
+        obstacles: T + 1 poses of the obstacles that the body touches; empty without obstacles.
         name: name of a robot and its model.
         markers: (T + 1, B, M, 3) as `Robot.observe` returns them [m]; without a robot, the vertices.
         labels: names of the markers of a robot; empty where these are the vertices.
@@ -49,7 +50,7 @@ class Motion:
     body: Body
     time_step: float
     reports: Sequence[SolveReport] = ()
-    obstacles: tuple[ObstacleMotion, ...] = ()
+    obstacles: Sequence[Pose] = ()
     name: str = ""
     markers: torch.Tensor = field(default=None)  # type: ignore[assignment]
     labels: tuple[str, ...] = ()
@@ -94,6 +95,10 @@ class Motion:
             return self.markers.expand(len(wanted), -1, -1, -1)
         batch = self.q.shape[1]
         return sample(self.markers.transpose(0, 1), wanted.expand(batch, -1), self.time_step).transpose(0, 1)
+
+    def surface(self, environment: int = 0) -> ObstacleSurface:
+        """Returns the surfaces of the obstacles in an environment, at all times."""
+        return ObstacleSurface.along(self.body, self.obstacles, environment)
 
     def save(self, path: str | Path) -> Path:
         """Writes times, positions and velocities to an HDF5 file.
@@ -195,8 +200,7 @@ class Motion:
             DataFileError: the files cannot be written.
         """
         q, v, markers = (self._of(values, environment) for values in (self.q, self.v, self._labelled))
-        obstacles = [motion.surface(environment) for motion in self.obstacles]
-        return write_vtk(Path(path), self.body.mesh, self.times, q, v, markers, obstacles)
+        return write_vtk(Path(path), self.body.mesh, self.times, q, v, markers, self.surface(environment).solids)
 
     def write_usd(self, path: str | Path, environment: int = 0) -> Path:
         """Writes the moving surfaces of the body and its obstacles, and its markers, to a USD file (extra ``usd``).
@@ -210,8 +214,7 @@ class Motion:
             DataFileError: the file cannot be written.
         """
         q, markers = (self._of(values, environment) for values in (self.q, self._labelled))
-        obstacles = [motion.surface(environment) for motion in self.obstacles]
-        return write_usd(Path(path), self.body.mesh, self.times, q, markers, obstacles)
+        return write_usd(Path(path), self.body.mesh, self.times, q, markers, self.surface(environment).solids)
 
     @property
     def _labelled(self) -> torch.Tensor:

@@ -15,8 +15,8 @@ from ..control.plan import tracked_of
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
-from ..data.obstacle_surface import ObstacleSurface
 from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..energies.contact.surface_contact import SurfaceContact
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray, IntArray

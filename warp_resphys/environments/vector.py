@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from ..control.worlds import World
 from ..data.camera import frame_of, side_axes
-from ..data.obstacle_surface import ObstacleSurface
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from ..report.layers import INK, Layer, RenderScene, View, body_layers, chain, obstacle_layers

@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
-from ..data.obstacle_surface import ObstacleSurface
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..data.rigid_bodies import as_markers, owners
 from ..data.trials import STATIC, Trials
 from ..energies.catalogue import LawContent
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..fem.bodies import Body
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray

@@ -3,7 +3,6 @@
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -16,23 +15,9 @@ from ..io.errors import InputError
 from ..io.safe_files import write_text
 from .volume_mesh import Mesh, boundary_triangles, surface_vertices
 
+Solid = tuple[FloatArray, IntArray]  # corners and triangles
 _USD = (".usd", ".usda", ".usdc")
 _MARKER_SHARE = 0.02  # diameter of a marker, over the body's size
-
-
-@dataclass(frozen=True, eq=False)
-class MovingSurface:
-    """A surface that moves in space.
-
-    Attributes:
-        name: of the thing whose surface it is.
-        points: (T + 1, P, 3) corners [m].
-        triangles: (S, 3) counter-clockwise seen from outside.
-    """
-
-    name: str
-    points: FloatArray
-    triangles: IntArray
 
 
 def input_columns(name: str, parts: Sequence[str], unit: str, values: FloatArray) -> dict[str, FloatArray]:
@@ -67,7 +52,7 @@ def write_vtk(
     q: FloatArray,
     v: FloatArray,
     markers: FloatArray,
-    obstacles: Sequence[MovingSurface] = (),
+    obstacles: Mapping[str, Solid],
 ) -> Path:
     """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
@@ -78,7 +63,8 @@ def write_vtk(
         q: (T + 1, N, 3) positions of the vertices [m].
         v: (T + 1, N, 3) velocities [m/s].
         markers: (T + 1, M, 3) markers, written to ``NAME_markers.pvd`` unless M is 0 [m].
-        obstacles: surfaces, written to ``NAME_obstacles.pvd`` if there are any, numbered by ``obstacle``.
+        obstacles: corners (T + 1, P, 3) [m] and triangles (S, 3) by name, counter-clockwise seen from outside; written
+            to ``NAME_obstacles.pvd`` if there are any, numbered by ``obstacle``.
     """
     if path.suffix != ".pvd":
         raise InputError(f"{path} does not end in .pvd: give such a name, which ParaView opens as a time series.")
@@ -89,10 +75,11 @@ def write_vtk(
         place = path.with_name(f"{path.stem}_markers.pvd")
         _write_series(place, times, markers, ("vertex", dots[:, None]), ({"marker": dots} for _ in times))
     if obstacles:
-        sizes = [surface.points.shape[1] for surface in obstacles]
+        corners, solids = zip(*obstacles.values(), strict=True)
+        sizes = [points.shape[1] for points in corners]
         firsts, number = np.cumsum([0, *sizes[:-1]]), np.repeat(np.arange(len(sizes)), sizes)
-        triangles = np.concatenate([solid.triangles + first for solid, first in zip(obstacles, firsts, strict=True)])
-        points = np.concatenate([surface.points for surface in obstacles], axis=1)
+        triangles = np.concatenate([solid + first for solid, first in zip(solids, firsts, strict=True)])
+        points = np.concatenate(corners, axis=1)
         place = path.with_name(f"{path.stem}_obstacles.pvd")
         _write_series(place, times, points, ("triangle", triangles), ({"obstacle": number} for _ in times))
     return path
@@ -115,12 +102,7 @@ def _write_series(
 
 
 def write_usd(
-    path: Path,
-    mesh: Mesh,
-    times: FloatArray,
-    q: FloatArray,
-    markers: FloatArray,
-    obstacles: Sequence[MovingSurface] = (),
+    path: Path, mesh: Mesh, times: FloatArray, q: FloatArray, markers: FloatArray, obstacles: Mapping[str, Solid]
 ) -> Path:
     """Writes the surfaces of a body and its obstacles, and its markers, with their motion to a USD file.
 
@@ -144,17 +126,17 @@ def write_usd(
     stage.SetEndTimeCode(len(q) - 1.0)
     root = UsdGeom.Xform.Define(stage, "/robot")
     stage.SetDefaultPrim(root.GetPrim())
-    meshes = {"/robot/body": MovingSurface("body", q[:, surface], triangles)}
-    meshes |= {f"/robot/obstacles/{Tf.MakeValidIdentifier(solid.name)}": solid for solid in obstacles}
+    meshes = {"/robot/body": (q[:, surface], triangles)}
+    meshes |= {f"/robot/obstacles/{Tf.MakeValidIdentifier(name)}": solid for name, solid in obstacles.items()}
     if obstacles:
         UsdGeom.Xform.Define(stage, "/robot/obstacles")
     surfaces: list[tuple[Any, FloatArray]] = []
-    for place, solid in meshes.items():
+    for place, (corners, sides) in meshes.items():
         shape = UsdGeom.Mesh.Define(stage, place)
         shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(solid.triangles), 3, dtype=np.int32)))
-        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(solid.triangles.astype(np.int32).ravel()))
-        surfaces.append((shape, solid.points))
+        shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(sides), 3, dtype=np.int32)))
+        shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(sides.astype(np.int32).ravel()))
+        surfaces.append((shape, corners))
     if markers.shape[1]:
         dots = UsdGeom.Points.Define(stage, "/robot/markers")
         size = _MARKER_SHARE * float(np.ptp(mesh.vertices, axis=0).max())

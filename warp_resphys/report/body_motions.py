@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from ..data.camera import axes_from_below, frame_of, height_of, motion_axes, path_axes
-from ..data.obstacle_surface import ObstacleSurface
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..learning.metrics import mean_distance
 from ..mesh.surface import closest_points

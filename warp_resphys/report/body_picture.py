@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from ..data.camera import frame_of, view_axes
-from ..data.obstacle_surface import ObstacleSurface
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..mesh.chambers import Chamber

@@ -8,10 +8,10 @@ from typing import NotRequired, TypedDict
 
 import numpy as np
 
-from ..data.obstacle_surface import ObstacleSurface
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..energies.catalogue import LawContent
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import FloatArray, IntArray
 from ..learning.baselines import BASELINES
 from ..learning.error_tables import ErrorTables

@@ -9,8 +9,6 @@ import torch
 import warp as wp
 
 from ..control.control_stages import driven_settings, replay
-from ..data.obstacle_surface import ObstacleSurface
-from ..energies.contact.contact_points import MOTION
 from ..experiment.files import METRICS, OPEN
 from ..io.errors import InputError
 from ..io.progress import show
@@ -124,10 +122,7 @@ def motion_of(run: Path, trial: str, models: Sequence[str], seconds: float = np.
     bound = robot.observe(robot.state(mesh.vertices))[0].double().cpu().numpy()[some]
     gravity = np.asarray(robot.simulator.gravity, dtype=np.float64)
     from_below, _ = hangs(mesh, robot.simulator.body.fixed_vertices, gravity)
-    seen, obstacles = played.markers[frames][:, some], ObstacleSurface.of(robot.simulator.body, robot.parameters)
-    acting = {name: values[:, 0].double().cpu().numpy() for name, values in whole.inputs.items()}
-    steps = np.clip(np.rint(times / robot.time_step).astype(int) - 1, 0, None)
-    obstacles = obstacles.moved({q.name: acting[q.name][steps] for q in MOTION if q.name in acting})
+    seen, obstacles = played.markers[frames][:, some], whole.surface().at(np.rint(times / robot.time_step).astype(int))
     shared = run / read_json(run / "stages" / "evaluate.json")["settings"]["shared"] / "stages"
     simulated = (text for stage, text in _PLAYED.items() if (shared / f"{stage}.json").is_file())
     observed = next(simulated, MEASURED_MARKERS)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import warp as wp
 
-from ..data.obstacle_surface import ObstacleSurface
+from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.errors import InputError, ResphysError
 from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting

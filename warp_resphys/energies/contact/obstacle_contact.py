@@ -57,7 +57,7 @@ from .contact_points import (
     vertex_areas,
     vertex_factors,
 )
-from .obstacle_poses import ObstacleMotion, ObstacleSet, Pose
+from .obstacle_poses import ObstacleSet, Pose
 from .obstacle_term import ContactTerm
 from .obstacles import DistanceGrid
 
@@ -235,23 +235,18 @@ class BoundContact(BoundEnergy):
             parts = [value_of(values, name) for name in (*POSE, GROWTH.name)]
         return Pose(*(part.expand(batch, *part.shape[1:]) for part in parts))
 
-    def motions(
-        self, memories: Sequence[Mapping[str, torch.Tensor]], values: Values, batch: int
-    ) -> tuple[ObstacleMotion, ...]:
-        """Returns the motions of the obstacles.
+    def poses(self, memories: Sequence[Mapping[str, torch.Tensor]], values: Values, batch: int) -> list[Pose]:
+        """Returns the poses of the obstacles in successive states.
 
         Args:
-            memories: the memory in successive states.
+            memories: the memory in these states.
             values: values of `prepare`.
             batch: number of environments.
         """
-        still, poses = self._pose(values, {}, batch), []
+        still, poses = self._pose(values, {}, batch), list[Pose]()
         for memory in memories:
             poses.append(Pose(memory.get(POSE[0], still.place), memory.get(POSE[1], still.turn), still.growth))
-        return tuple(
-            ObstacleMotion(name, obstacle, self.site.body.vertices, tuple(pose.of(k) for pose in poses))
-            for k, (name, obstacle) in enumerate(self._contact.obstacles.items())
-        )
+        return poses
 
     @override
     def begin_step(self, step: EnergyStep) -> dict[str, torch.Tensor | None]:

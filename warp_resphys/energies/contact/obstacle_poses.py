@@ -1,5 +1,6 @@
 """Poses of obstacles, and distances and normals of points from them, differentiable."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,13 +10,11 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from ...io.arrays import FloatArray
 from ...kernels.contact import signed_distances as kernels
-from ...mesh.motion_files import MovingSurface
 from ...settings.contact import Obstacle
 from ...stepping.adjoints import AdjointFunction, first_derivatives
 from ..launcher import Launcher, struct_of, warp_view
-from .obstacles import KINDS, DistanceGrid, surface_of
+from .obstacles import KINDS, DistanceGrid
 
 
 @dataclass(frozen=True)
@@ -26,9 +25,11 @@ class Pose:
     turn: torch.Tensor
     growth: torch.Tensor
 
-    def of(self, number: int) -> "Pose":
-        """Returns the poses of one obstacle."""
-        return Pose(*(value[:, number, None] for value in (self.place, self.turn, self.growth)))
+    @classmethod
+    def joined(cls, poses: "Sequence[Pose]") -> "Pose":
+        """Returns the poses of several sets of obstacles as those of one."""
+        parts = [(pose.place, pose.turn, pose.growth) for pose in poses]
+        return cls(*(torch.cat(fields, 1) for fields in zip(*parts, strict=True)))
 
     def local(self, x: torch.Tensor) -> torch.Tensor:
         """Returns positions (B, P, O, 3) in the axes of the obstacles, from those in the world."""
@@ -140,31 +141,3 @@ class _Distances(AdjointFunction):
             sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
             needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
             return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)
-
-
-@dataclass(frozen=True, eq=False)
-class ObstacleMotion:
-    """Motion of an obstacle in a roll-out of T steps.
-
-    Attributes:
-        name: of the obstacle, with that of its body if there are several.
-        obstacle: its shape.
-        beside: (N, 3) vertices of the body at rest, beside which the plate of a half-space lies [m].
-        poses: (T + 1,) poses of B environments, of this obstacle alone.
-    """
-
-    name: str
-    obstacle: Obstacle
-    beside: FloatArray
-    poses: tuple[Pose, ...]
-
-    def surface(self, environment: int) -> MovingSurface:
-        """Returns the moving triangles of an environment."""
-        growth = float(self.poses[0].growth[environment, 0].detach())
-        own, triangles = surface_of(self.obstacle, growth, self.beside)
-        local = torch.as_tensor(own)[None, :, None]
-        points = []
-        for pose in self.poses:
-            here = (value[environment, None].detach().cpu().double() for value in (pose.place, pose.turn, pose.growth))
-            points.append(Pose(*here).world(local)[0, :, 0].numpy())
-        return MovingSurface(self.name, np.stack(points), triangles)

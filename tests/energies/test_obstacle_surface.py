@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys import Body, Contact, Cylinder, HalfSpace, box_hexahedra
-from warp_resphys.data.obstacle_surface import ObstacleSurface
+from warp_resphys import Body, Contact, Cylinder, HalfSpace, Scene, box_hexahedra
 from warp_resphys.energies import Box, Capsule, Sphere
 from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
+from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
 from warp_resphys.report.layers import obstacle_layers
 from warp_resphys.stepping.rotations import rotations
 
@@ -59,6 +59,17 @@ def test_parameters_move_the_obstacle_that_they_name():
     half = len(still) // 2
     np.testing.assert_array_equal(moved[:half], still[:half])
     np.testing.assert_allclose(moved[half:] - still[half:], np.tile([0.0, 0.01, 0.0], (half, 1)), atol=1e-15)
+
+
+def test_obstacles_of_a_scene_have_the_names_and_parameters_of_their_bodies():
+    ball = Contact({"ball": SHAPES["sphere"]})
+    scene = Scene({"left": Body(MESH, energies=[ball]), "right": Body(MESH, energies=[ball])})
+    moved = ObstacleSurface.of(scene, {"left_obstacle_y": 0.01, "right_obstacle_growth": 0.01}).solids
+    one, triangles = ObstacleSurface.of(Body(MESH, energies=[ball])).solids["ball"]
+    assert [*moved] == ["left_ball", "right_ball"]
+    np.testing.assert_allclose(moved["left_ball"][0], one + [0.0, 0.01, 0.0], atol=1e-15)
+    assert np.ptp(moved["right_ball"][0], axis=0) == pytest.approx(np.ptp(one, axis=0) + 0.02)
+    assert all(np.array_equal(faces, triangles) for _, faces in moved.values())
 
 
 def test_a_body_without_obstacles_draws_none():

@@ -1,18 +1,19 @@
-"""Surfaces of rigid obstacles, for pictures of bodies that touch them."""
+"""Surfaces of rigid obstacles, for pictures and files of bodies that touch them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from ..energies.contact.contact_points import GROWTH, MOTION, SHIFT, TURN
-from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacles import surface_of
-from ..fem.bodies import Body
-from ..io.arrays import FloatArray, IntArray
-from .registration import RigidTransform
+from ...fem.bodies import Body
+from ...io.arrays import FloatArray, IntArray
+from .contact_points import GROWTH, MOTION, SHIFT, TURN
+from .obstacle_contact import Contact
+from .obstacle_poses import Pose
+from .obstacles import Obstacle, surface_of
 
 _NEAR: Final = 0.2  # Width of the space around a body in which its obstacles are shown, over its size.
 
@@ -21,6 +22,7 @@ _NEAR: Final = 0.2  # Width of the space around a body in which its obstacles ar
 class ObstacleSurface:
     """Triangles of all O obstacles of a body, at rest or at T times."""
 
+    names: tuple[str, ...] = ()  # Of the obstacles, with those of their bodies if there are several.
     # (P, 3) in the axes of the obstacles [m].
     local: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
     triangles: IntArray = field(default_factory=lambda: np.empty((0, 3), dtype=np.int64))  # (S, 3).
@@ -39,22 +41,35 @@ class ObstacleSurface:
             body: With or without obstacles.
             parameters: Identified values by name, such as `obstacle_x_bar`; others are zero.
         """
-        known, points, triangles = parameters or {}, [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)]
-        energies = [energy for _, part, _ in body.members for energy in part.energies]
-        contacts = [energy for energy in energies if isinstance(energy, Contact)]
-        obstacles = [item for contact in contacts for item in contact.obstacles.items()]
-        for name, obstacle in obstacles:
-            corners, faces = surface_of(obstacle, _value(known, GROWTH.name, name), body.vertices)
+        known, obstacles = parameters or {}, _obstacles(body)
+        values = [[_value(known, prefix, x, q.name) for q in (GROWTH, *SHIFT, *TURN)] for prefix, x, _ in obstacles]
+        return cls._made(body, obstacles, np.reshape(np.array(values, dtype=np.float64), (-1, 7)))
+
+    @classmethod
+    def along(cls, body: Body, poses: Sequence[Pose], environment: int = 0) -> "ObstacleSurface":
+        """Returns the obstacles of a body at their T poses in an environment of a roll-out."""
+        if not poses:
+            return cls()
+        fields = [(pose.place[environment], pose.turn[environment].flatten(1)) for pose in poses]
+        series = torch.stack([torch.cat(field, 1) for field in fields]).detach().cpu().double().numpy()
+        values = np.zeros((series.shape[1], 7))
+        values[:, 0] = poses[0].growth[environment].detach().cpu()
+        return replace(cls._made(body, _obstacles(body), values), poses=series)
+
+    @classmethod
+    def _made(cls, body: Body, obstacles: Sequence[tuple[str, str, Obstacle]], values: FloatArray) -> "ObstacleSurface":
+        """Returns obstacles by the prefixes of their bodies and their names, with growth and offsets (O, 7)."""
+        points, triangles = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int64)]
+        for (_, _, obstacle), growth in zip(obstacles, values[:, 0], strict=True):
+            corners, faces = surface_of(obstacle, float(growth), body.vertices)
             triangles.append(faces + sum(map(len, points)))
             points.append(corners)
-        offsets = np.array(
-            [[_value(known, q.name, name) for q in (*SHIFT, *TURN)] for name, _ in obstacles], dtype=np.float64
-        ).reshape(-1, 6)
-        places = offsets[:, :3] + np.reshape([o.position for _, o in obstacles], (-1, 3))
-        axes = np.reshape([o.turn for _, o in obstacles], (-1, 3, 3))
+        offsets = values[:, 1:]
+        places = offsets[:, :3] + np.reshape([o.position for *_, o in obstacles], (-1, 3))
+        axes = np.reshape([o.turn for *_, o in obstacles], (-1, 3, 3))
         owners = np.repeat(np.arange(len(obstacles)), [len(corners) for corners in points[1:]])
-        poses = _poses(places, offsets[:, 3:], axes)
-        return cls(np.concatenate(points), np.concatenate(triangles), owners, poses, offsets, axes)
+        poses, names = _poses(places, offsets[:, 3:], axes), tuple(f"{prefix}{name}" for prefix, name, _ in obstacles)
+        return cls(names, np.concatenate(points), np.concatenate(triangles), owners, poses, offsets, axes)
 
     def moved(self, inputs: Mapping[str, FloatArray]) -> "ObstacleSurface":
         """Returns the obstacles where inputs (O,) or (T, O) of contact by name put them; itself without such inputs."""
@@ -87,11 +102,21 @@ class ObstacleSurface:
         """Returns the obstacles at one or some of their times."""
         return replace(self, poses=self.poses[frames]) if self.moves else self
 
-    def carried(self, frame: RigidTransform) -> "ObstacleSurface":
-        """Returns the obstacles in another frame."""
-        turns = frame.rotation @ self.poses[..., 3:].reshape(*self.poses.shape[:-1], 3, 3)
-        poses = np.concatenate([frame.apply(self.places), turns.reshape(*self.poses.shape[:-1], 9)], axis=-1)
-        return replace(self, poses=poses)
+    def carried(self, rotation: FloatArray, translation: FloatArray) -> "ObstacleSurface":
+        """Returns the obstacles in another frame, by a map p -> R p + t."""
+        turns = rotation @ self.poses[..., 3:].reshape(*self.poses.shape[:-1], 3, 3)
+        places = self.places @ rotation.T + translation
+        return replace(self, poses=np.concatenate([places, turns.reshape(*self.poses.shape[:-1], 9)], axis=-1))
+
+    @property
+    def solids(self) -> dict[str, tuple[FloatArray, IntArray]]:
+        """Corners (..., P, 3) [m] and triangles (S, 3) of each obstacle by name."""
+        points, solids = self.points, dict[str, tuple[FloatArray, IntArray]]()
+        for number, name in enumerate(self.names):
+            corners = np.flatnonzero(self.owners == number)
+            own = self.owners[self.triangles[:, 0]] == number
+            solids[name] = points[..., corners, :], np.searchsorted(corners, self.triangles[own])
+        return solids
 
     def near(self, points: FloatArray) -> FloatArray:
         """Returns corners (Q, 3) [m] of the surface within the frame of points (P, 3) of a body and a margin."""
@@ -106,6 +131,13 @@ def _poses(places: FloatArray, turns: FloatArray, axes: FloatArray) -> FloatArra
     return np.concatenate([places, matrices.reshape(*places.shape[:-1], 9)], axis=-1)
 
 
-def _value(parameters: Mapping[str, Any], name: str, part: str) -> float:
+def _obstacles(body: Body) -> list[tuple[str, str, Obstacle]]:
+    """Returns the obstacles of a body or a scene, with the prefixes of their bodies and their names."""
+    energies = [(f"{name}_" if name else "", energy) for name, part, _ in body.members for energy in part.energies]
+    contacts = [(prefix, energy) for prefix, energy in energies if isinstance(energy, Contact)]
+    return [(prefix, *item) for prefix, contact in contacts for item in contact.obstacles.items()]
+
+
+def _value(parameters: Mapping[str, Any], prefix: str, part: str, name: str) -> float:
     """Returns the value of a parameter for an obstacle."""
-    return float(parameters.get(f"{name}_{part}", parameters.get(name, 0.0)))
+    return float(parameters.get(f"{prefix}{name}_{part}", parameters.get(f"{prefix}{name}", 0.0)))

@@ -97,7 +97,7 @@ def test_trials_have_their_values_sessions_their_marker_places_and_finished_sear
     scale = found.parameters["youngs_modulus"] / 264e3  # of all forces, which places hide
     assert scale == pytest.approx(1.0, rel=0.1)
     assert ratios == pytest.approx([scale] * 3, rel=0.02)
-    places = {session: placed["offsets"]["0"] for session, placed in found.placement["sessions"].items()}
+    places = {session: placed["offsets"]["a"] for session, placed in found.placement["sessions"].items()}
     assert np.subtract(places["friday"], places["monday"]) == pytest.approx([0.0, 1e-3, 0.0], abs=2e-4)
     assert np.shape(found.placement["new_session"]) == (15, 15)
     monkeypatch.setattr(Misfit, "linearise", None)  # No search is needed again, but that of the first frames.
@@ -180,8 +180,6 @@ def test_workers_training_through_the_simulator_and_recurrent_networks_are_for_f
 
 def test_models_of_one_simulator_have_the_derivatives_of_their_parameters(robot):
     motions = let_go(robot, 0.05, 0.1, markers=MARKERS)
-    bound = MARKERS(robot.rest_positions[None])[0].numpy()
-    motions = replace(motions, trials=replace(motions.trials, labels=("a", "b", "c"), bound=bound))
     found, simulator = identify(beam(180e3), motions, {"youngs_modulus": (1e5, 1e6)}), beam(180e3)
     models = {
         "close": Model(simulator, found),
@@ -191,6 +189,9 @@ def test_models_of_one_simulator_have_the_derivatives_of_their_parameters(robot)
     spreads = [Comparison(some, motions, names, {"1": names}).spreads for some in (models, {"soft": models["soft"]})]
     np.testing.assert_allclose(spreads[0]["soft"], spreads[1]["soft"], rtol=1e-6)
     assert np.nanmax(spreads[0]["soft"]) > 2.0 * np.nanmax(spreads[0]["close"])
+    calibrated = Comparison(models, motions, names[:1], {"1": names[1:]}, names[:1])
+    assert [*calibrated.errors()["per_marker"]["close"]] == ["a", "b", "c"]
+    assert calibrated.errors()["intervals"]["models"].keys() == {"rest", *models}
 
 
 def test_forces_from_markers_bring_the_markers_there(robot):

@@ -151,7 +151,6 @@ class MarkerView:
 class ViewedMarkers(Markers):
     """Markers in the view of the recordings."""
 
-    vertices: torch.Tensor
     markers: Markers  # in the frame of the body
     view: MarkerView
 

@@ -19,7 +19,7 @@ All reproduce the markers at rest, and carry them rigidly where the body moves r
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Final, Self
 
 import numpy as np
@@ -43,10 +43,12 @@ class Observation(ABC):
     Attributes:
         unit: of the measured coordinates.
         dimension: D, number of coordinates of a measured point.
+        labels: names of the M points; empty where they have none.
     """
 
     unit: ClassVar[str] = "m"
     dimension: ClassVar[int] = 3
+    labels: tuple[str, ...] = ()
 
     @abstractmethod
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
@@ -71,7 +73,7 @@ class Observation(ABC):
 
     def to(self, like: torch.Tensor) -> Self:
         """Returns the observation on the device and in the precision of a tensor."""
-        changed: dict[str, Any] = {field.name: _to(getattr(self, field.name), like) for field in fields(self)}  # type: ignore[arg-type]
+        changed: dict[str, Any] = {item.name: _to(getattr(self, item.name), like) for item in fields(self)}  # type: ignore[arg-type]
         return replace(self, **changed)  # type: ignore[type-var]
 
 
@@ -95,10 +97,12 @@ def _to(value: Any, like: torch.Tensor) -> Any:
     return value.to(like) if hasattr(value, "to") else value
 
 
+@dataclass(frozen=True)
 class Markers(Observation):
     """A map from the vertices of a body to M markers."""
 
     vertices: torch.Tensor  # indices of the vertices that the markers depend on, in any shape
+    labels: tuple[str, ...] = field(default=(), kw_only=True)
 
     @classmethod
     def bind(cls, mesh: Mesh, places: NDArray[np.float64], labels: Sequence[str]) -> "Markers":
@@ -320,7 +324,7 @@ def bind_markers(
             )
         parts.append(follow_vertices(mesh, near, points[number][None]))
         places.append([number])
-    return JoinedMarkers.of(parts, places)
+    return replace(JoinedMarkers.of(parts, places), labels=tuple(names))
 
 
 def _check_bound(points: FloatArray, names: Sequence[str], kinds: Sequence[str]) -> None:

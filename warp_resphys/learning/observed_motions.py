@@ -112,7 +112,8 @@ class ObservedMotions:
             )
         count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
         observation = observation.to(like)
-        if observed.shape[2] != (seen := observation(like.expand(count, -1, -1)).shape[1]):
+        at_rest = observation(like.expand(count, -1, -1))
+        if observed.shape[2] != (seen := at_rest.shape[1]):
             kind = "vertices of the body" if isinstance(observation, WholeState) else "points of the observation"
             raise InputError(f"{observed.shape[2]} points were observed, but there are {seen} {kind}.")
         points = _array(observed.transpose(0, 1))
@@ -122,7 +123,7 @@ class ObservedMotions:
             raise InputError(f"start has {len(start.q)} states, but {count} motions were observed: give as many.")
         trials = Trials(
             names=tuple(f"motion {number}" for number in range(count)),
-            labels=(),
+            labels=observation.labels,
             begins=(UNDER_INPUTS if start is None else GIVEN,) * count,
             times=np.tile(simulator.time_step * np.arange(frames), (count, 1)),
             observed=points,
@@ -130,6 +131,7 @@ class ObservedMotions:
             payload=np.zeros(count),
             gravity=np.asarray(simulator.gravity, dtype=np.float64),
             time_step=simulator.time_step,
+            bound=_array(at_rest[0]) if observation.labels and isinstance(observation, Markers) else None,
             initial=None if start is None else _array(torch.stack([start.q, start.v], 1)),
             inputs={name: _array(x if axis == 0 else x.transpose(0, 1)) for name, (x, axis) in acting.axes().items()},
             resting={name: _array(x) for name, x in before.fields.items()},
@@ -316,7 +318,7 @@ def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None)
         y = y[first]
         if np.isfinite(held[r, m]).all() and (not len(t) or t[0] > 1e-9):
             t, y = np.concatenate([[0.0], t]), np.concatenate([held[r, m][None], y])
-        if len(t) < 4:
+        if len(t) < min(4, len(times[r])):
             continue
         nearest = np.abs(steps[:, None] - t).min(1)
         near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)

@@ -160,7 +160,6 @@ def placement_of(plain: PlainPlacements, labels: Sequence[str], session: str = "
 class PlacedMarkers(Markers):
     """Markers at their placed offsets, in the frame of the recordings."""
 
-    vertices: torch.Tensor
     markers: Markers  # at their offsets, in the frame of the body
     placement: Placement
 

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import meshio
 import numpy as np
@@ -20,11 +21,13 @@ from support.configured import composed, settings
 from support.main_job import IN_RUN, QUIET
 from support.tags import draw_tag
 from warp_resphys.energies.catalogue import read_law
+from warp_resphys.experiment.pictures import picture_stages as stages
 from warp_resphys.experiment.pictures.camera_laboratory import depth_image, noisy_mask
 from warp_resphys.experiment.pictures.picture_stages import picture_stages
 from warp_resphys.io.resuming import run_stages
 from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
+from warp_resphys.learning.identification import search
 from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
 from warp_resphys.pictures.scene_files import read_tracked
@@ -67,7 +70,11 @@ def succeeded(*arguments):
 
 @pytest.mark.slow
 class TestSimulatedLaboratory:
-    def test_the_material_comes_back_from_outlines(self, folder):
+    def test_the_material_comes_back_from_outlines_and_a_finished_search_is_kept(self, folder, monkeypatch):
+        monkeypatch.setattr(stages, "law_content", MagicMock(side_effect=KeyboardInterrupt))
+        assert outcome(*SIMULATED, IN_RUN).code
+        monkeypatch.undo()
+        monkeypatch.setattr(search, "search_parameters", None)
         out = succeeded(*SIMULATED, IN_RUN)
         check_modulus(folder / "run")
         (tested,) = [row for row in poses(folder / "run").values() if row["tested"]]

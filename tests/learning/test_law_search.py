@@ -2,19 +2,19 @@
 
 import math
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from support.regions import beam
 from warp_resphys import Body, Corotated, Inputs, ObservedMotions, Simulator, box_hexahedra, evaluate, select_vertices
 from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification.law import LawClass, branches_of, strong_names
 from warp_resphys.learning.identification.law_scores import Score
-from warp_resphys.learning.identification.law_search import _LawSearch, identify_law
+from warp_resphys.learning.identification.law_search import identify_law, tried_without_states
 from warp_resphys.settings.learning import LawSettings
 
 SHEAR = 100e3  # Pa
@@ -101,13 +101,9 @@ def search_from_markers(errors, guess=None, lost=()):
         kept["c10"] = 0.0 if "elastic" in law.groups else law.parameters["c10"]  # as if other terms took its place
         return Refined(LawClass(law.groups, kept, math.nan), Score((np.array([errors[law.groups] ** 2] * 2),)))
 
-    settings = SimpleNamespace(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
-    search = object.__new__(_LawSearch)
-    vertices = np.array([[0.0, 0.0, 0.0], [0.01, 0.2, 0.01]])
-    base = SimpleNamespace(body=SimpleNamespace(mesh=SimpleNamespace(vertices=vertices)))
-    guess = {"c10": 0.5 * SHEAR, "bulk_1": 60e3, **(guess or {})}
-    vars(search).update(_refine=refine, settings=settings, guess=guess, base=base)
-    return [own.law.groups for own in search._from_markers()], began
+    settings = LawSettings(relaxation_times=(0.01, 1.0), terms=("c01", "ogden_3"), branches=3, families=1)
+    mesh, guess = box_hexahedra((0.01, 0.2, 0.01), (1, 1, 1)), {"c10": 0.5 * SHEAR, "bulk_1": 60e3, **(guess or {})}
+    return [own.law.groups for own in tried_without_states(refine, guess, settings, mesh)], began
 
 
 def test_a_law_is_identified_from_observed_motions_and_simulates_on():
@@ -136,9 +132,10 @@ def test_a_law_is_identified_from_observed_motions_and_simulates_on():
 
 
 def test_materials_of_regions_have_no_law():
-    regions = SimpleNamespace(materials={"tip": None, "base": None})
+    robot = Simulator(Body(beam()), {"beam": Corotated(), "cap": Corotated()})
+    motions = ObservedMotions.of(robot, robot.rest_positions.expand(2, 1, -1, -1))
     with pytest.raises(InputError, match="a law describes one material"):
-        identify_law(regions, None)
+        identify_law(robot, motions)
 
 
 WHOLE = ("elastic", "branches", "fibres")

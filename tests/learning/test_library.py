@@ -9,8 +9,7 @@ import torch
 import warp_resphys as wr
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.fan_out import Workers
-from warp_resphys.io.parts import Checkpoint, Parts
-from warp_resphys.io.resuming import StageContext
+from warp_resphys.io.parts import Parts
 from warp_resphys.learning.comparison import Comparison, Model
 from warp_resphys.learning.evaluation import evaluate
 from warp_resphys.learning.identification.identification import identify
@@ -30,9 +29,9 @@ MARKERS = wr.bind_markers(
 STEPS = 25
 
 
-def beam(youngs_modulus, **options):
+def beam(youngs_modulus, time_step=0.01):
     material = wr.Corotated(youngs_modulus, 0.45, density=1070.0, stiffness_damping=3e-3)
-    return wr.Simulator(BODY, material, time_step=0.01, **options)
+    return wr.Simulator(BODY, material, time_step=time_step)
 
 
 def pulled(*newtons):
@@ -65,7 +64,7 @@ def test_youngs_modulus_is_recovered(robot):
     assert float(evaluate(beam(180e3), motion).mean()) > 1e-4
 
 
-def test_trials_have_their_values_sessions_their_marker_places_and_finished_searches_are_kept(tmp_path, monkeypatch):
+def test_trials_have_their_values_sessions_their_places_and_finished_searches_are_kept(tmp_path, monkeypatch, capsys):
     """Tensions that differ from their logs, and a marker that sits 1 mm elsewhere in one of two sessions."""
     cable = wr.Tendons([[[0.0, 0.01, 0.0], [0.05, 0.01, 0.0], [0.1, 0.01, 0.0]]])
     body = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[cable])
@@ -85,10 +84,9 @@ def test_trials_have_their_values_sessions_their_marker_places_and_finished_sear
         ),
     }
 
-    def identified():
-        kept = Checkpoint(StageContext("identify", tmp_path, "fingerprint", None))
+    def identified(**more):
         options = {"names": ["motion 0", "motion 1"], "held_out": ["motion 2"], "accuracy": Accuracy(markers=1e-3)}
-        return identify(wrong, motions, ranges, kept=kept, **options)
+        return identify(replace(wrong), motions, ranges, kept=tmp_path / "searches", **options, **more)
 
     found = identified()
     assert found.parameters["tendon_tension_factor"] == 1.0
@@ -104,7 +102,12 @@ def test_trials_have_their_values_sessions_their_marker_places_and_finished_sear
     with pytest.raises(TypeError):
         identified()
     monkeypatch.undo()
+    capsys.readouterr()
     assert identified().own == found.own
+    assert f"evaluation {sum(map(len, found.history))} (limit 30)" in capsys.readouterr().err  # those of the file
+    monkeypatch.setattr(Misfit, "linearise", None)
+    with pytest.raises(TypeError):  # Searches of other arguments are not used.
+        identified(tolerance=1e-3)
 
 
 def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
@@ -228,8 +231,50 @@ def test_invalid_motions_are_refused(robot):
         identify(robot, motion, {"youngs_modulus": 2e5})
     with pytest.raises(wr.InputError, match="there is no trial 'motion 1': there are motion 0"):
         evaluate(robot, motion, names=["motion 1"])
+    with pytest.raises(wr.InputError, match="observed every 10 ms, but the step of the simulator is 4 ms"):
+        reconstruct(beam(2e5, time_step=0.004), motion)
     found = reconstruct(robot, motion)
     with pytest.raises(wr.InputError, match=r"trainer\.sequence is missing"):
         fit_force(robot, motion, found, network=NetworkSettings(recurrent=4))
     with pytest.raises(wr.InputError, match="the trial 'motion 0' was not reconstructed"):
         fit_force(robot, motion, replace(found, names=("other",)))
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda r, m, f: fit_force(r, m, f.read("force")), "reconstructed is an array of shape .*ReconstructedTrials"),
+        (lambda r, m, f: fit_force(r, m, f, network={"width": 3}), "network is of type dict: .*NetworkSettings"),
+        (lambda r, m, f: evaluate(r, m, f.read("force")), "force is an array of shape .*Learned or a function or None"),
+        (lambda r, m, f: evaluate(r, m.trials), "motions is of type Trials: it must be .*ObservedMotions"),
+        (lambda r, m, f: identify(BODY, m, {}), "simulator is of type Body: it must be .*Simulator"),
+        (lambda r, m, f: wr.identify_law(r, m, ["density"]), "is of type list: it must be a mapping or None"),
+        (lambda r, m, f: reconstruct(r, m, "motion 0"), "names is of type str: it must be a list or None"),
+        (lambda r, m, f: reconstruct(r, m, parameters={"density": None}), "the parameter density is of type NoneType"),
+        (lambda r, m, f: evaluate(r, m, parameters={"density": np.ones(3)}), r"density is an array of shape \(3,\)"),
+        (lambda r, m, f: evaluate(r, m, lambda state, step: 0.0), "the force of step 0 is of type float: it must be a"),
+        (lambda r, m, f: evaluate(r, m, lambda state, step: state.q[0, 0]), r"the force of step 0 is an array of sha"),
+        (lambda r, m, f: evaluate(r, m, names=[]), "no trials are named: name some of motion 0"),
+        (lambda r, m, f: identify(r, m, {}, held_out=["x"]), "there is no trial 'x'"),
+        (lambda r, m, f: fit_force(r, m, f, validation=["motion 0"]), "no trials are named"),
+        (lambda r, m, f: fit_force(*longer(r), f), "forces on 24 vertices were reconstructed, but the body has 28"),
+    ],
+)
+def test_arguments_of_wrong_types_and_shapes_are_refused(robot, call, sentence):
+    motion = ObservedMotions.of(robot, robot.rollout(robot.rest_state(), 3).q, robot.rest_state())
+    with pytest.raises(wr.InputError, match=sentence):
+        call(robot, motion, reconstruct(robot, motion))
+
+
+def longer(robot):
+    """The robot with a cell more, and a motion of it."""
+    other = replace(robot, body=wr.Body(wr.box_hexahedra(size=(0.12, 0.02, 0.02), divisions=(6, 1, 1))))
+    return other, ObservedMotions.of(other, other.rest_positions.expand(4, 1, -1, -1), other.rest_state())
+
+
+def test_a_force_of_another_body_is_refused(robot):
+    motion = ObservedMotions.of(robot, robot.rollout(robot.rest_state(), 3).q, robot.rest_state())
+    network = NetworkSettings(position_modes=1, velocity_modes=0, force_modes=1, width=2)
+    force = fit_force(robot, motion, reconstruct(robot, motion), network=network, trainer=TrainerSettings(epochs=1))
+    with pytest.raises(wr.InputError, match="a force on 24 vertices was learned, but the body has 28"):
+        evaluate(*longer(robot), force)

@@ -202,6 +202,18 @@ class Trials:
         changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting, "obstacles": obstacles}
         return replace(self, **changed)
 
+    def chosen(self, names: Sequence[str] | None) -> tuple[str, ...]:
+        """Returns some names of trials; all if None.
+
+        Raises:
+            InputError: there is no trial of a name, or no name at all.
+        """
+        names = self.names if names is None else tuple(names)
+        if not names:
+            raise InputError(f"no trials are named: name some of {', '.join(self.names)}.")
+        self.rows(names)
+        return names
+
     def rows(self, names: Sequence[str]) -> list[int]:
         """Returns the indices of trials.
 

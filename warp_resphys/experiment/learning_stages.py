@@ -8,7 +8,7 @@ from ..data.rigid_bodies import corners_of
 from ..data.trials import Trials, evenly
 from ..energies.catalogue import read_law
 from ..io.fan_out import ALONE, Workers
-from ..io.parts import Checkpoint, Parts
+from ..io.parts import Parts
 from ..io.resuming import StageContext, package_versions
 from ..io.safe_files import atomic_hdf5, create, resume_checkpoint, write_checkpoint, write_json
 from ..learning.comparison import Comparison
@@ -41,12 +41,12 @@ def identify(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     wanted, names = settings.identify, settings.split.train
-    experiment, kept, found = Experiment(settings, context.run_dir), dict[str, Checkpoint](), {}
+    experiment, found = Experiment(settings, context.run_dir), {}
+    kept = {model: context.run_dir / f"identify_{model}_parts.safetensors" for model in ("sysid", "sysid_elastic")}
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
     for model, parameters in {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}.items():
         if not parameters:
             continue
-        kept[model] = Checkpoint(context, model)
         result = identification.identify(
             *(experiment.simulator(MODELS[model][0]), experiment.motions, parameters, wanted.first_guess),
             names=names,
@@ -62,8 +62,8 @@ def identify(context: StageContext) -> None:
         )
         found[model] = result.plain()
     write_json(context.run_dir / IDENTIFICATION, found)
-    for checkpoint in kept.values():
-        checkpoint.remove()
+    for path in kept.values():
+        path.unlink(missing_ok=True)
 
 
 def _accuracy(settings: StageSettings, dataset: Trials) -> Accuracy | None:
@@ -87,7 +87,8 @@ def identify_law(context: StageContext) -> None:
         DataFileError: the file of the law is missing, damaged or of another version.
     """
     settings: StageSettings = context.settings
-    experiment, kept, file = Experiment(settings, context.run_dir, "count"), Checkpoint(context), settings.law.file
+    experiment, file = Experiment(settings, context.run_dir, "count"), settings.law.file
+    kept = context.run_dir / f"{context.name}_parts.safetensors"
     known = None if file is None else read_law(file)
     law = law_search.identify_law(
         *(experiment.simulator("identified"), experiment.motions),
@@ -107,7 +108,7 @@ def identify_law(context: StageContext) -> None:
         accepted = known.get("accepted_there", known.get("accepted", True))
         content = {**known, **content, "accepted_there": accepted, "file": file}
     write_json(context.run_dir / LAW_FILE, content)
-    kept.remove()
+    kept.unlink(missing_ok=True)
 
 
 def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:

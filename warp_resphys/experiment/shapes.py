@@ -45,7 +45,8 @@ def try_shapes(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     experiment = Experiment(settings, context.run_dir, "count")
-    kept, results = Checkpoint(context), {}
+    path, results = context.run_dir / f"{context.name}_parts.safetensors", {}
+    kept = Checkpoint(path, context.fingerprint)
     with Progress(context.name, len(settings.shapes), "bodies") as progress:
         for name, shape in settings.shapes.items():
             try:
@@ -56,7 +57,7 @@ def try_shapes(context: StageContext) -> None:
                 raise ConvergenceError(f"shapes.{name}, its target: {error}", error.positions, error.report) from error
             progress.advance(1, body=name)
     write_json(context.run_dir / SHAPES, results)
-    kept.remove()
+    path.unlink(missing_ok=True)
 
 
 def check_shape(shape: ShapeSettings) -> None:

@@ -1,13 +1,32 @@
 """Errors that the user can fix: each is one sentence, and the command line exits with code 2; and warnings."""
 
 import difflib
+import inspect
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from functools import wraps
+from types import NoneType, UnionType
+from typing import (
+    Any,
+    Final,
+    ParamSpec,
+    SupportsFloat,
+    SupportsIndex,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 _LONGEST = 1000
+# Types that count as others, and words for some.
+_WIDER: Final[dict[Any, Any]] = {Sequence: Iterable, float: SupportsFloat, int: SupportsIndex}
+_WORDS: Final[dict[Any, str]] = {Sequence: "a list", Mapping: "a mapping", Callable: "a function", NoneType: "None"}
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class ResphysError(Exception):
@@ -97,3 +116,28 @@ def naming(group: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise type(error)(f"{group}{error}") from error
+
+
+def checks_types(function: Callable[P, R]) -> Callable[P, R]:
+    """Returns a function that raises InputError for arguments of other types than it declares."""
+    signature = inspect.signature(function)
+
+    @wraps(function)
+    def call(*given: P.args, **options: P.kwargs) -> R:
+        hints = get_type_hints(function)
+        for name, value in signature.bind(*given, **options).arguments.items():
+            parts = get_args(hints[name]) if get_origin(hints[name]) in (Union, UnionType) else (hints[name],)
+            kinds = [get_origin(kind) or kind for kind in parts]
+            letters = isinstance(value, str) and str not in kinds  # which are no list of names
+            if Any not in kinds and (letters or not isinstance(value, tuple(_WIDER.get(kind, kind) for kind in kinds))):
+                words = " or ".join(_WORDS.get(kind, f"{kind.__module__}.{kind.__name__}") for kind in kinds)
+                raise InputError(f"{function.__name__}: {name} is {in_short(value)}: it must be {words}.")
+        return function(*given, **options)
+
+    return call
+
+
+def in_short(value: object) -> str:
+    """Returns what a value is, for a message: the shape of an array, otherwise its type."""
+    shape = getattr(value, "shape", None)
+    return f"of type {type(value).__name__}" if shape is None else f"an array of shape {tuple(shape)}"

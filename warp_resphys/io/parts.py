@@ -3,12 +3,13 @@
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from joblib.hashing import NumpyHasher
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -161,32 +162,44 @@ def _compute(parts: Parts, part: TrialPart) -> Arrays | None:
 
 
 class Checkpoint:
-    """Finished parts of the work of a stage, as JSON data in a file that is ignored if the settings changed.
+    """Finished parts of some work, as JSON data in a file that is ignored if the work has changed.
 
     Args:
-        context: of the stage.
-        name: of the work, if a stage has several.
+        path: of the file; None keeps the parts in memory.
+        depends_on: all that the results depend on; objects are compared by their content.
 
     Attributes:
-        title: name of the stage.
+        parts: results of the finished parts by key.
     """
 
-    def __init__(self, context: StageContext, name: str = "") -> None:
-        self.title, self._fingerprint = context.name, context.fingerprint
-        self.path = context.run_dir / f"{context.name}{name and '_'}{name}_parts.safetensors"
-        checkpoint = resume_checkpoint(self.path, "parts", context.fingerprint)
-        self._parts: dict[str, Any] = {} if checkpoint is None else checkpoint[1]["parts"]
+    def __init__(self, path: str | Path | None, *depends_on: object) -> None:
+        self.parts: dict[str, Any] = {}
+        self._path = None if path is None else Path(path)
+        if self._path is not None:
+            self._fingerprint = _Hasher("md5").hash(depends_on)
+            checkpoint = resume_checkpoint(self._path, "parts", self._fingerprint)
+            self.parts = {} if checkpoint is None else checkpoint[1]["parts"]
 
     def once(self, key: str, work: Callable[[], Any]) -> Any:
         """Returns the result of a part, which is worked on unless it was finished before."""
-        if key not in self._parts:
-            self._parts = {**self._parts, key: work()}
-            write_checkpoint(self.path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self._parts})
-        return self._parts[key]
+        if key not in self.parts:
+            self.parts[key] = work()
+            if self._path is not None:
+                write_checkpoint(self._path, "parts", {}, {"fingerprint": self._fingerprint, "parts": self.parts})
+        return self.parts[key]
 
-    def remove(self) -> None:
-        """Deletes the file."""
-        self.path.unlink(missing_ok=True)
+
+class _Hasher(NumpyHasher):
+    """Hashes objects by their content: tensors as arrays, and without what `cached_property` has kept."""
+
+    def save(self, obj: Any) -> None:
+        super().save(obj.numpy(force=True) if isinstance(obj, torch.Tensor) else obj)
+
+    def reducer_override(self, obj: Any) -> Any:
+        kept = [x for x in getattr(obj, "__dict__", ()) if isinstance(getattr(type(obj), x, None), cached_property)]
+        if not kept:
+            return NotImplemented
+        return object.__new__, (type(obj),), {name: x for name, x in obj.__getstate__().items() if name not in kept}
 
 
 def padded(arrays: Sequence[NDArray[Any]], frames: int = 0) -> NDArray[Any]:

@@ -14,7 +14,7 @@ import torch
 from ..data.trials import GIVEN, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray
-from ..io.errors import ConvergenceError
+from ..io.errors import ConvergenceError, InputError, checks_types
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..stepping.rollout import states
 from ..stepping.state import State
@@ -26,6 +26,7 @@ from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor,
 POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
 
 
+@checks_types
 def evaluate(
     simulator: Simulator,
     motions: ObservedMotions,
@@ -55,7 +56,7 @@ def evaluate(
         ConvergenceError: no initial equilibrium.
     """
     dataset, parts = motions.trials, parts or Parts("evaluate")
-    names = dataset.names if names is None else names
+    names = dataset.chosen(names)
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
     order = [name for part in cut_up for name in part.names]
@@ -183,7 +184,9 @@ class TrialRollout:
             self.steps = POSE_STEPS if data_driven else 0
 
     def predictor(self, learned: Learned) -> LearnedPredictor:
-        """Returns the predictor of a network in these trials."""
+        """Returns the predictor of a network in these trials, or raises InputError for one of another body."""
+        if (given := len(learned.network.rest)) != (wanted := len(self._simulator.rest_positions)):
+            raise InputError(f"a force on {given} vertices was learned, but the body has {wanted}: learn one for it.")
         frames = None if self._data_driven else force_frames(self._simulator, learned.force_frame)
         base = self._motions.base(self.replay.trials.names, self._simulator)
         conditions = self._motions.conditions(self.replay, self._values, self._data_driven)

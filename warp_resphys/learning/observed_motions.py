@@ -6,7 +6,7 @@
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Self, SupportsFloat
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
 from ..dynamics.frames import BaseFrame, base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError, InputError, in_short
 from ..settings.learning import ActuationSettings, ReleaseSettings
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
@@ -48,8 +48,13 @@ class Identified:
 
     @classmethod
     def of(cls, parameters: "Identified | Mapping[str, float] | None") -> "Identified":
-        """Returns parameters given as a mapping, or none."""
-        return parameters if isinstance(parameters, Identified) else cls(parameters or {})
+        """Returns parameters given as a mapping, or none; raises InputError for a value that is no number."""
+        if isinstance(parameters, Identified):
+            return parameters
+        for name, value in (parameters or {}).items():
+            if not isinstance(value, SupportsFloat) or getattr(value, "shape", ()) != ():
+                raise InputError(f"the parameter {name} is {in_short(value)}: it must be a number.")
+        return cls(parameters or {})
 
     def values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Returns (1,) values of all parameters, on the device of a simulator."""
@@ -213,7 +218,12 @@ class ObservedMotions:
             smoothed = simulator.tensor(self.trials.smoothed[self.trials.rows(trials.names)])
             targets = later(smoothed, start.delay, simulator.time_step)
         elif self.trials.begin_of(trials.names[0]) in (GIVEN, STATIC) or not self.trials.labels:
-            targets = trials.observed
+            targets, frame = trials.observed, float(trials.times[0, :2].sum())
+            if frame and abs(frame - simulator.time_step) > 1e-6 * frame:
+                raise InputError(
+                    f"{trials.names[0]!r} was observed every {1e3 * frame:g} ms, but the step of the simulator is "
+                    f"{1e3 * simulator.time_step:g} ms: reconstruct it with time_step={frame:g}."
+                )
         else:
             targets = start.bound(simulator.tensor(at_steps(trials, simulator.time_step, start.delay)))
         return targets[:, : self.learned_steps(targets.shape[1] - 1) + 1]

@@ -18,10 +18,11 @@ import torch
 from ...data.camera import CORRECTIONS, PlacedCamera
 from ...energies.catalogue import law_content
 from ...io.errors import InputError
+from ...io.parts import Checkpoint
 from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
-from ...learning.identification.search import Identification, first_points, search_parameters, shown
+from ...learning.identification.search import Identification, first_points, refined_searches, search_parameters
 from ...learning.parameters import TILTS, configured_parameters, own_name, split_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
@@ -264,6 +265,8 @@ class _Plan:
 def identify_pictures(context: StageContext) -> None:
     """Writes identification.json: the parameters, their uncertainty, and the camera of each pose.
 
+    An interrupted run keeps its finished search.
+
     Raises:
         ConvergenceError: the simulation fails at every start.
     """
@@ -273,10 +276,10 @@ def identify_pictures(context: StageContext) -> None:
     poses = [plan.pose(name, {}) for name in settings.data.train]
     bounds = plan.bounds(poses, lambda name, per: True)
     misfit = PictureMisfit(poses, bounds, plan.clamp_turns(poses))
-    guess, most = plan.guess(bounds, poses), wanted.max_evaluations
-    with shown(context.name, wanted.starts * most) as report:
-        starts = first_points(misfit, guess, wanted.starts, wanted.candidates, settings.seed)
-        found = search_parameters(misfit, starts, most, wanted.tolerance, report)
+    guess, kept = plan.guess(bounds, poses), context.run_dir / f"{context.name}_parts.safetensors"
+    first = (guess, wanted.starts, wanted.candidates, settings.seed)
+    options = (wanted.max_evaluations, wanted.tolerance, Checkpoint(kept, context.fingerprint), context.name)
+    (found,) = refined_searches(lambda before: (misfit, first_points(misfit, *first)), *options, starts=wanted.starts)
     result = replace(found, first_guess=guess).plain()
     cameras = {
         pose.name: {photo.lens: photo.camera.pose.tolist() for photo in pose.photos if photo.camera.lens is not None}
@@ -289,6 +292,7 @@ def identify_pictures(context: StageContext) -> None:
         fitted = values_of(pose, found.parameters)
         parameters = {key: fitted.get(key, value) for key, value in plan.poses.material(pose.name).values.items()}
         write_json(context.run_dir / law_file(material), law_content(settings.simulation.model, parameters))
+    kept.unlink(missing_ok=True)
 
 
 def compare_pictures(context: StageContext) -> None:

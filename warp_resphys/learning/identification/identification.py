@@ -8,14 +8,15 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...data.rigid_bodies import independent
-from ...data.trials import RESTING, Trials
+from ...data.trials import RELEASED, RESTING, Trials
 from ...dynamics.simulator import Simulator
-from ...io.errors import ConvergenceError
+from ...io.errors import ConvergenceError, checks_types
 from ...io.parts import Checkpoint
 from ...settings.learning import Bounds
 from ..observed_motions import ObservedMotions
@@ -36,6 +37,7 @@ from .search import Identification, first_points, refined_searches, search_param
 log = logging.getLogger(__name__)
 
 
+@checks_types
 def identify(
     simulator: Simulator,
     motions: ObservedMotions,
@@ -51,7 +53,7 @@ def identify(
     max_evaluations: int = 30,
     tolerance: float = 1e-6,
     seed: int = 0,
-    kept: Checkpoint | None = None,
+    kept: str | Path | None = None,
 ) -> Identification:
     """Finds the parameters with which a simulator comes closest to observed motions.
 
@@ -73,27 +75,36 @@ def identify(
         max_evaluations: of the loss and its gradient, for each start.
         tolerance: relative decrease of the loss below which a search ends.
         seed: of the random candidates.
-        kept: finished searches, which an interrupted identification goes on from; None: nothing is kept.
+        kept: file of the finished searches, from which an interrupted identification goes on; it is not used if
+            anything that they depend on has changed. None: nothing is kept.
 
     Raises:
         InputError: an unknown parameter, an empty range, or a motion in which nothing moves.
         ConvergenceError: the simulation fails at every start.
     """
-    trials = motions.trials.names if names is None else tuple(names)
+    trials = motions.trials.chosen(names)
+    motions.trials.rows(held_out)
     ranges = {name: bounds_of(limits) for name, limits in parameters.items()}
     check_ranges(simulator, ranges, identifiable_parameters(simulator), bool(motions.trials.sessions))
     bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
     known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds]), **(first_guess or {})}
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}
     seconds, many = _learned(motions, replays, seconds), 4 * starts if candidates is None else candidates
+    first_search = (guess, starts, many, seed)
+    searched = (simulator, motions, bounds, trials, accuracy, seconds, first_search, max_evaluations, tolerance)
 
     def begin(before: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
         again = replays if before is None else [(replay, motions.start(replay, before)) for replay, _ in replays]
         misfit = _misfit(motions, again, bounds, seconds, accuracy)
-        first = (guess, starts, many, seed) if before is None else (before.parameters,)
+        first = first_search if before is None else (before.parameters,)
         return misfit, first_points(misfit, *first)
 
-    rounds = refined_searches(begin, motions, trials, max_evaluations, tolerance, kept, starts=starts)
+    rounds = refined_searches(
+        *(begin, max_evaluations, tolerance, Checkpoint(kept, *searched), "identify"),
+        starts=starts,
+        labels=motions.labels,
+        released=RELEASED in map(motions.trials.begin_of, trials),
+    )
     found = _separated(_joined(rounds, guess, accuracy), ranges)
     return _with_first_frames(found, simulator, motions, held_out, ranges, max_evaluations)
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -18,13 +19,14 @@ import torch
 from pydantic import TypeAdapter
 
 from ...data.rigid_bodies import independent
-from ...data.trials import evenly
+from ...data.trials import RELEASED, evenly
 from ...dynamics.simulator import Simulator
 from ...energies.catalogue import LawContent, LawTest, TriedClass, make_material
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
-from ...io.errors import InputError
+from ...io.errors import InputError, checks_types
 from ...io.parts import Checkpoint
+from ...mesh.volume_mesh import Mesh
 from ...settings.learning import Bounds, LawSettings, Prior
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import Limits, bounds_of
@@ -43,7 +45,7 @@ from .law import (
 )
 from .law_scores import RefinedLaw, Score, scores_of, stretches_in
 from .misfit import Misfit
-from .search import Identification, first_points, once, refined_searches
+from .search import Identification, first_points, refined_searches
 from .weak_form import KnownMotion, WeakForm
 
 _OF_MASS: Final = ("density", MASS_DAMPING)
@@ -59,6 +61,7 @@ _BESIDE: Final = "beside"  # key of the search of parameters beside a known law
 _BALANCED: Final = 0.7  # ratio of the force residuals below which a larger class is refined as well
 
 
+@checks_types
 def identify_law(
     simulator: Simulator,
     motions: ObservedMotions,
@@ -70,7 +73,7 @@ def identify_law(
     settings: LawSettings | None = None,
     seconds: float | None = None,
     known: LawContent | None = None,
-    kept: Checkpoint | None = None,
+    kept: str | Path | None = None,
 ) -> IdentifiedLaw:
     """Identifies the law of a material from observed motions, and tests it on others.
 
@@ -96,12 +99,13 @@ def identify_law(
     if "" not in simulator.materials:
         raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
     ranges = {name: bounds_of(limits) for name, limits in (parameters or {}).items()}
-    names = motions.trials.names if train is None else tuple(train)
+    names = motions.trials.chosen(train)
     if motions.train_fraction < 1.0:
         learned = motions.train_fraction * float(motions.trials.times.max())
         seconds = min(learned, seconds or math.inf)
-    options = (settings or LawSettings(), seconds, kept)
-    search = _LawSearch(simulator, motions, ranges, identified or Identified(), names, tuple(validation), *options)
+    given = (simulator, motions, ranges, identified or Identified(), names, tuple(validation))
+    options = (settings or LawSettings(), seconds)
+    search = _LawSearch(*given, *options, Checkpoint(kept, *given, *options, known))
     return search.run() if known is None else search.beside(known)
 
 
@@ -117,7 +121,7 @@ class _LawSearch:
     validation: tuple[str, ...]
     settings: LawSettings
     seconds: float | None
-    kept: Checkpoint | None
+    kept: Checkpoint
 
     @cached_property
     def checked(self) -> tuple[str, ...]:
@@ -172,13 +176,13 @@ class _LawSearch:
     def run(self) -> IdentifiedLaw:
         """Identifies a law."""
         if self.motions.sees_states:
-            fitted = once(self.kept, "classes", lambda: [asdict(law) for law in self._from_states()])
+            fitted = self.kept.once("classes", lambda: [asdict(law) for law in self._from_states()])
             classes = TypeAdapter(list[LawClass]).validate_python(fitted)
             scores = [score.error for score in self.scores([law.parameters for law in classes])]
             smallest = next(k for k, score in enumerate(scores) if score <= _CLOSE * min(scores))
             best = self._enlarged(self._refine(classes[smallest]), classes)
         else:
-            refined = self._from_markers()
+            refined = tried_without_states(self._refine, self.guess, self.settings, self.base.body.mesh)
             classes, scores = [tried.law for tried in refined], [tried.score.error for tried in refined]
             best = refined[-1]
         if not self.validation:
@@ -284,43 +288,6 @@ class _LawSearch:
                     best, residual = larger, law.residual
         return best
 
-    def _from_markers(self) -> list[RefinedLaw]:
-        """Returns the classes that were tried through the simulator, the best last.
-
-        The search begins with all groups of terms, and takes away those without which validation trials are as close:
-        a class that lacks a group makes up for it with others, from where the group no longer helps.
-        """
-        guess, wanted = dict(self.guess), self.settings
-        creep = {name: value for name, value in guess.items() if name.startswith("prony")}
-        known = [value for name, value in creep.items() if name.startswith("prony_time")]
-        shortest, longest = wanted.relaxation_times
-        middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
-        times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
-        groups = {
-            "elastic": dict.fromkeys(wanted.terms, 0.0),
-            "branches": branches_of([0.1 * self.shear] * len(times), times, len(known) + 1),
-            "fibres": family(0.3 * self.shear, longest_side(self.base.body.mesh)) if wanted.families else {},
-        }
-        groups = {name: added for name, added in groups.items() if added}
-        guess["bulk_1"] = max(guess["bulk_1"], _RUBBERY * self.shear)
-        whole = {name: value for added in groups.values() for name, value in added.items()}
-        best = self._refine(LawClass(tuple(groups), guess | whole, math.nan))
-        tried = [best]
-        for name in groups:
-            left = {n: x for n, x in best.law.parameters.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
-            if name == "branches":
-                left |= creep
-            if name == "elastic":  # They may have been all that resists shear.
-                left["c10"] = max(left["c10"], guess["c10"])
-            smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
-            if left == best.law.parameters:  # The search has left nothing of the group.
-                best = replace(best, law=smaller)
-                continue
-            tried.append(self._refine(smaller))
-            if not best.score.beats(tried[-1].score):
-                best = tried[-1]
-        return [one for one in tried if one.law.parameters != best.law.parameters] + [best]
-
     def _refine(self, law: LawClass, whole: bool = False) -> RefinedLaw:
         """Returns a law that is refined through the simulator, with the other identified parameters.
 
@@ -375,8 +342,9 @@ class _LawSearch:
             known = {**self.identified.parameters, **guess}
             return misfit, first_points(misfit, {name: known[name] for name in bounds})
 
-        options = (wanted.max_evaluations, wanted.tolerance, self.kept, key)
-        return refined_searches(prepared, self.motions, () if key == _BESIDE else self.train, *options)[-1]
+        released = key != _BESIDE and RELEASED in map(self.motions.trials.begin_of, self.train)
+        options = (wanted.max_evaluations, wanted.tolerance, self.kept, "identify_law", key)
+        return refined_searches(prepared, *options, labels=self.motions.labels, released=released)[-1]
 
     @cached_property
     def _bounds_of_others(self) -> dict[str, Bounds]:
@@ -390,3 +358,49 @@ class _LawSearch:
             share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
             prior = Prior(mean=share * modulus.prior.mean, deviation=share * modulus.prior.deviation)
         return bounds_of_parameter(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)
+
+
+def tried_without_states(
+    refine: Callable[[LawClass], RefinedLaw], guess: Mapping[str, float], wanted: LawSettings, mesh: Mesh
+) -> list[RefinedLaw]:
+    """Returns the classes that were tried through the simulator, the best last.
+
+    The search begins with all groups of terms, and takes away those without which validation trials are as close:
+    a class that lacks a group makes up for it with others, from where the group no longer helps.
+
+    Args:
+        refine: refines a law through the simulator.
+        guess: a neo-Hookean law like the identified material.
+        wanted: terms, branches and families of the largest class.
+        mesh: of the body.
+    """
+    shear = 2.0 * guess["c10"]
+    start = {**guess, "bulk_1": max(guess["bulk_1"], _RUBBERY * shear)}
+    creep = {name: value for name, value in guess.items() if name.startswith("prony")}
+    known = [value for name, value in creep.items() if name.startswith("prony_time")]
+    shortest, longest = wanted.relaxation_times
+    middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
+    times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
+    groups = {
+        "elastic": dict.fromkeys(wanted.terms, 0.0),
+        "branches": branches_of([0.1 * shear] * len(times), times, len(known) + 1),
+        "fibres": family(0.3 * shear, longest_side(mesh)) if wanted.families else {},
+    }
+    groups = {name: added for name, added in groups.items() if added}
+    whole = {name: value for added in groups.values() for name, value in added.items()}
+    best = refine(LawClass(tuple(groups), start | whole, math.nan))
+    tried = [best]
+    for name in groups:
+        left = {n: x for n, x in best.law.parameters.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
+        if name == "branches":
+            left |= creep
+        if name == "elastic":  # They may have been all that resists shear.
+            left["c10"] = max(left["c10"], guess["c10"])
+        smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
+        if left == best.law.parameters:  # The search has left nothing of the group.
+            best = replace(best, law=smaller)
+            continue
+        tried.append(refine(smaller))
+        if not best.score.beats(tried[-1].score):
+            best = tried[-1]
+    return [one for one in tried if one.law.parameters != best.law.parameters] + [best]

@@ -9,8 +9,7 @@ search continues, until the loss changes by less than 2 %.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,15 +19,14 @@ import numpy as np
 import torch
 from pydantic import TypeAdapter
 
-from ...data.trials import RELEASED
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress
 from ...io.safe_files import read_json
 from ...linalg.least_squares import Point, UnitBox, minimise
-from ..observed_motions import Identified, ObservedMotions
-from .misfit import BoundedMisfit, Misfit
+from ..observed_motions import Identified
+from .misfit import BoundedMisfit
 from .uncertainty import Uncertainty
 
 Report = Callable[[int, float, Mapping[str, float]], None]
@@ -85,27 +83,16 @@ class Identification(Identified):
 _PLAIN = TypeAdapter(Identification)
 
 
-@contextmanager
-def shown(title: str, most: int) -> Iterator[Report]:
-    """Shows the progress of searches with at most so many evaluations, which the yielded function reports."""
-    with Progress(title, most, "evaluations at most") as progress:
-
-        def report(start: int, loss: float, values: Mapping[str, float]) -> None:
-            name, value = next(iter(values.items()))
-            progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
-
-        yield report
-
-
 def refined_searches(
-    begin: Callable[[Identification | None], tuple[Misfit, Sequence[Mapping[str, float]]]],
-    motions: ObservedMotions,
-    names: Sequence[str],
+    begin: Callable[[Identification | None], tuple[BoundedMisfit, Sequence[Mapping[str, float]]]],
     max_evaluations: int,
     tolerance: float,
-    kept: Checkpoint | None = None,
+    kept: Checkpoint,
+    title: str,
     key: str = "",
     starts: int = 1,
+    labels: Sequence[str] = (),
+    released: bool = False,
 ) -> list[Identification]:
     """Returns the results of a search, and of those with releases that are estimated again with the last result.
 
@@ -113,33 +100,36 @@ def refined_searches(
 
     Args:
         begin: returns the misfit and the starts of the search that follows a result; None at first.
-        motions: the trials.
-        names: of those that are searched, which may be released.
         max_evaluations: see `search_parameters`.
         tolerance: see `search_parameters`.
-        kept: see `identify`.
+        kept: finished searches.
+        title: of the progress bar.
         key: of the searches in `kept`.
         starts: number of starts of the first search.
+        labels: see `search_parameters`.
+        released: whether the trials begin by a release.
     """
-    results, again = list[Identification](), _MOST_AGAIN if RELEASED in map(motions.trials.begin_of, names) else 0
-    with shown("identify" if kept is None else kept.title, (starts + again) * max_evaluations) as report:
+    results, again = list[Identification](), _MOST_AGAIN if released else 0
+    before = [kept.parts[name]["history"] for number in range(1 + again) if (name := f"{key} {number}") in kept.parts]
+    done = sum(len(records) for history in before for records in history)
+    with Progress(title, (starts + again) * max_evaluations, "evaluations at most", done) as progress:
+
+        def report(start: int, loss: float, values: Mapping[str, float]) -> None:
+            name, value = next(iter(values.items()))
+            progress.advance(1, start=start, loss=f"{loss:.3g}", **{name: f"{value:.4g}"})
+
         for number in range(1 + again):
             ends = partial(_ends, number == again, results[-1].loss if results else None)
 
             def work(ends: IsLast = ends) -> dict[str, Any]:
                 misfit, points = begin(results[-1] if results else None)
-                options = (max_evaluations, tolerance, report, ends, motions.labels)
+                options = (max_evaluations, tolerance, report, ends, labels)
                 return asdict(search_parameters(misfit, points, *options))
 
-            results.append(Identification.from_plain(once(kept, f"{key} {number}", work)))
+            results.append(Identification.from_plain(kept.once(f"{key} {number}", work)))
             if ends(results[-1].loss):
                 break
     return results
-
-
-def once(kept: Checkpoint | None, key: str, work: Callable[[], Any]) -> Any:
-    """Returns the JSON data of some work, unless it is kept already."""
-    return work() if kept is None else kept.once(key, work)
 
 
 def _ends(last: bool, before: float | None, after: float) -> bool:

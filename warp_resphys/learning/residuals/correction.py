@@ -12,7 +12,7 @@ import torch
 
 from ...dynamics.frames import BaseFrame, VertexFrames
 from ...dynamics.simulator import Constants, Simulator
-from ...io.errors import ConvergenceError
+from ...io.errors import ConvergenceError, InputError, in_short
 from ...io.safe_files import read_checkpoint, write_checkpoint
 from ...stepping.inputs import Inputs
 from ...stepping.state import State
@@ -77,6 +77,9 @@ class CorrectedSimulator:
             predicted = self._predict(state, number)
             if isinstance(predicted, State):
                 return predicted, lost
+            if not isinstance(predicted, torch.Tensor) or predicted.shape[-2:] != state.q.shape[1:]:
+                wanted = f"a tensor of shape {tuple(state.q.shape)} in N"
+                raise InputError(f"the force of step {number} is {in_short(predicted)}: it must be {wanted}.")
             failed = lost | ~torch.isfinite(predicted).flatten(1).all(1)
             force = torch.where(failed[:, None, None], 0.0, predicted)
         if bool(failed.any()):  # Lost environments stand at rest, without inputs.

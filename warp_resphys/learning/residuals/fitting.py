@@ -15,7 +15,7 @@ import torch
 from ...data.trials import STATIC
 from ...dynamics.modes import RestStiffness
 from ...dynamics.simulator import Simulator
-from ...io.errors import InputError
+from ...io.errors import InputError, checks_types
 from ...io.progress import Progress
 from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
@@ -35,6 +35,7 @@ Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
 
 
+@checks_types
 def fit_force(
     simulator: Simulator,
     motions: ObservedMotions,
@@ -72,11 +73,9 @@ def fit_force(
     Raises:
         InputError: sizes that do not fit the motions.
     """
-    names = motions.trials.names
-    train = [name for name in names if name not in validation] if train is None else train
-    fitting = Fitting(
-        simulator, motions, reconstructed, tuple(train), tuple(validation), Identified.of(parameters), **more
-    )
+    others = [name for name in motions.trials.names if name not in validation]
+    train = motions.trials.chosen(others if train is None else train)
+    fitting = Fitting(simulator, motions, reconstructed, train, tuple(validation), Identified.of(parameters), **more)
     groups = {"network": network or NetworkSettings(), "trainer": trainer or TrainerSettings()}
     settings = parse(TrainingSettings, {**groups, "in_the_loop": in_the_loop, "seed": seed})
     with torch.random.fork_rng():
@@ -167,6 +166,8 @@ class Fitting:
         if self.reconstructed is None:
             raise InputError("the trials have no velocities of all vertices to learn from: reconstruct them first.")
         arrays = self.reconstructed.of(names, "q", "v", "force", "error")
+        if (given := arrays[0].shape[2]) != (wanted := len(self.simulator.rest_positions)):
+            raise InputError(f"forces on {given} vertices were reconstructed, but the body has {wanted}: do so for it.")
         q, v, force, error = (torch.as_tensor(array, device=self.device) for array in arrays)
         return q, v, force, error[:, 1:].isfinite()
 

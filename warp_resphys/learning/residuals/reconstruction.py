@@ -28,7 +28,7 @@ from typing_extensions import override
 from ...data.markers import WHOLE_STATE, Markers, Observation, WholeState
 from ...dynamics.modes import vibration_modes
 from ...dynamics.simulator import Constants, Simulator
-from ...io.errors import ConvergenceError, InputError
+from ...io.errors import ConvergenceError, InputError, checks_types
 from ...io.parts import Arrays, Parts, Report, TrialPart, cut
 from ...linalg.least_squares import minimise
 from ...linalg.threads import threads_for
@@ -294,6 +294,7 @@ class ReconstructedTrials:
         return [self.read(name)[index] for name in arrays]
 
 
+@checks_types
 def reconstruct(
     simulator: Simulator,
     motions: ObservedMotions,
@@ -320,7 +321,7 @@ def reconstruct(
     parts, known = parts or Parts("reconstruct"), Identified.of(parameters)
     used, wanted = without_ringing(simulator, motions.observe), settings or ReconstructionSettings()
     cut_up = list[TrialPart]()
-    for number, whole in enumerate(motions.trials.batches(motions.trials.names if names is None else names)):
+    for number, whole in enumerate(motions.trials.batches(motions.trials.chosen(names))):
         frames = motions.learned_steps(int(motions.trials.seconds(whole) / used.time_step + 1e-6)) + 1
         for first, batch in cut(whole, parts.batch):
             work = partial(_reconstructed, used, motions, batch, known, wanted)
@@ -363,5 +364,5 @@ def _reconstructed(
     series = {"q": [state.q for state in reached], "v": [state.v for state in reached], "force": forces}
     arrays = {name: torch.stack(values, 1).cpu().numpy() for name, values in series.items()}
     arrays["error"] = mean_distance(points, observed.cpu().numpy())
-    dtype = "float64" if motions.trials.bound is None else "float32"
+    dtype = "float64" if motions.sees_states else "float32"
     return {name: (values.astype(dtype), UNITS[name]) for name, values in arrays.items()}

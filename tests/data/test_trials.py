@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+import h5py
 import numpy as np
+import pytest
 
 from warp_resphys.data.driving import driving, first_change, phases_of, since_change
 from warp_resphys.data.trials import Trials
+from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.safe_files import read_hdf5
 
 TIMES = 0.1 * np.arange(6)
@@ -57,6 +60,16 @@ def test_constant_inputs_and_loads_before_the_trials_alone_are_kept_in_a_file(tm
     for one, other in ((again.inputs, trials.inputs), (again.resting, trials.resting)):
         assert one.keys() == other.keys()
         assert all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("name", ["names", "inputs", "gravity", "time_step", "held", "payload", "observed"])
+def test_a_file_that_lacks_something_is_named(tmp_path, name):
+    path = tmp_path / "dataset.h5"
+    dataset(("rest",)).write(path)
+    with h5py.File(path, "a") as file:
+        del (file.attrs if name in file.attrs else file)[name]
+    with pytest.raises(DataFileError, match=f"dataset.h5 has no (attribute|dataset) '{name}': .*check the path"):
+        Trials.read(path)
 
 
 def test_a_pose_is_under_its_last_inputs_or_under_constant_ones():

@@ -13,7 +13,7 @@ from ..energies.strings import PAYLOAD, Strings
 from ..fem.bodies import Body
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import InputError
-from ..io.safe_files import atomic_hdf5, create, read_array, read_hdf5
+from ..io.safe_files import atomic_hdf5, create, read_array, read_attribute, read_hdf5
 from ..mesh.selection import vertices_at
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
@@ -154,7 +154,8 @@ class Trials:
             DataFileError: the file is missing, damaged or of another kind.
         """
         with read_hdf5(path, _KIND) as file:
-            words = {key: tuple(map(str, file.attrs[key])) for key in ("names", "labels", "begins", "inputs")}
+            required = ("names", "labels", "begins", "inputs")
+            words = {key: tuple(map(str, read_attribute(file, key))) for key in required}
             more = {key: tuple(map(str, file.attrs.get(key, ()))) for key in ("sessions", "obstacles")}
             inputs, r = words.pop("inputs"), len(words["names"])
             times = read_array(file, "times", (r, None))
@@ -164,15 +165,16 @@ class Trials:
                 **{"smoothed": observed.shape, "velocity": observed.shape},
                 **{"initial": (r, 2, None, 3), "base": (r, None, 6)},
             }
-            arrays = {name: read_array(file, name, x) for name, x in shapes.items() if name in file}
+            there = {*file, "held", "payload"}
+            arrays = {name: read_array(file, name, x) for name, x in shapes.items() if name in there}
             known: dict[str, Any] = {**words, **arrays}
             resting = [key.removesuffix(_RESTING) for key in file if key.endswith(_RESTING)]
             return cls(
                 **known,
                 times=times,
                 observed=observed,
-                gravity=np.asarray(file.attrs["gravity"], dtype=np.float64),
-                time_step=float(file.attrs["time_step"]),
+                gravity=np.asarray(read_attribute(file, "gravity"), dtype=np.float64),
+                time_step=float(read_attribute(file, "time_step")),
                 inputs={name: _of_trials(file, name, r) for name in inputs},
                 resting={name: _of_trials(file, f"{name}{_RESTING}", r) for name in resting},
                 channels={

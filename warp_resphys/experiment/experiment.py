@@ -14,7 +14,7 @@ from ..data.markers import WHOLE_STATE, Observation
 from ..data.trials import Trials
 from ..dynamics.simulator import Simulator
 from ..fem.bodies import Body
-from ..io.safe_files import read_array, read_hdf5, read_json
+from ..io.safe_files import read_array, read_attribute, read_hdf5, read_json
 from ..learning.comparison import Model
 from ..learning.identification.search import Identification
 from ..learning.observed_motions import ObservedMotions
@@ -197,7 +197,7 @@ class Experiment:
         if not path.is_file():
             return None
         with read_hdf5(path, "reconstruction") as file:
-            names = tuple(map(str, file.attrs["names"]))
+            names = tuple(map(str, read_attribute(file, "names")))
 
         def read(name: str) -> NDArray[Any]:
             with read_hdf5(path, "reconstruction") as file:

@@ -24,7 +24,7 @@ from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
 from ..io.resuming import StageContext, package_versions, resources_used
-from ..io.safe_files import read_array, read_hdf5, read_json
+from ..io.safe_files import read_array, read_attribute, read_hdf5, read_json
 from ..learning.error_tables import ErrorTables
 from ..learning.identification.search import Identification
 from ..learning.intervals import half_widths_of
@@ -238,7 +238,7 @@ class RunReader:
         bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
         errors: ErrorTables = read_json(self.folder / ERRORS)
         with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
-            rolled = tuple(map(str, file.attrs["names"]))
+            rolled = tuple(map(str, read_attribute(file, "names")))
             test = [name for name in rolled if self.scaled is None or name not in self.scaled.names]
             models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
             unknown = sorted(set(test) - set(dataset.names))
@@ -287,7 +287,7 @@ class RunReader:
             models = [model for model in MODELS if f"{model}_film" in file]
             shape = (len(steps), None, 3)
             bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
-            trial, times = str(file.attrs["film_trial"]), float(file.attrs["time_step"]) * steps
+            trial, times = str(read_attribute(file, "film_trial")), float(read_attribute(file, "time_step")) * steps
         if dataset.bound is not None and run.markers is not None:
             view = marker_view_of(run.markers, dataset.labels, dataset.sets)
             if view.own:
@@ -362,8 +362,8 @@ class RunReader:
             return []
         followed = []
         with read_hdf5(self.folder / DRIVEN, "driven") as file:
-            controllers = [*map(str, file.attrs["controllers"])]
-            for name in map(str, file.attrs["names"]):
+            controllers = [*map(str, read_attribute(file, "controllers"))]
+            for name in map(str, read_attribute(file, "names")):
                 shape, seconds = name.removesuffix("s").rsplit("_", 1)
                 path = read_array(file, f"{name}/path", (None, 3)).astype(np.float64)
                 points = read_array(file, f"{name}/points", (len(controllers), len(path), 3)).astype(np.float64)

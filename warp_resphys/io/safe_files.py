@@ -232,6 +232,13 @@ def read_array(
         raise hdf5_error(Path(path), error) from error
 
 
+def read_attribute(file: h5py.File, name: str) -> Any:
+    """Reads an attribute of a file, or raises DataFileError where it is missing."""
+    if name not in file.attrs:
+        raise DataFileError(f"{file.filename} has no attribute '{name}': write the file again, or check the path")
+    return file.attrs[name]
+
+
 def write_checkpoint(
     path: str | Path, kind: str, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]
 ) -> None:

@@ -13,8 +13,8 @@ from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.identification.law import LawClass, branches_of, strong_names
-from warp_resphys.learning.identification.law_scores import Score
-from warp_resphys.learning.identification.law_search import identify_law, tried_without_states
+from warp_resphys.learning.identification.law_scores import Score, tried_without_states
+from warp_resphys.learning.identification.law_search import identify_law
 from warp_resphys.settings.learning import LawSettings
 
 SHEAR = 100e3  # Pa

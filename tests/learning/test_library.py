@@ -207,6 +207,22 @@ def test_forces_from_markers_bring_the_markers_there(robot):
     assert float(replayed[1:].max()) < 0.02 * float(evaluate(wrong, seen).mean())
 
 
+def test_representations_have_shapes_in_place_of_arrays(robot):
+    motion = let_go(robot, 0.1, markers=MARKERS)
+    assert repr(motion).startswith(
+        "ObservedMotions(trials=Trials(names=('motion 0',), labels=('a', 'b', 'c'), begins=('driven',), "
+        "times=array (1, 26), observed=array (1, 26, 3, 3), held=array (1, 3, 3), "
+    )
+    assert "observe=SurfaceMarkers(vertices=array (3, 3), labels=('a', 'b', 'c'), weights=array" in repr(motion)
+    found = reconstruct(robot, motion)
+    assert repr(found) == "ReconstructedTrials(names=('motion 0',), read=partial)"
+    network = NetworkSettings(position_modes=1, velocity_modes=0, force_modes=1, width=2)
+    force = fit_force(robot, motion, found, network=network, trainer=TrainerSettings(epochs=1))
+    assert repr(force).startswith(
+        "Learned(network=ResidualForce, force_frame='world', training={'epochs': [{'epoch': 1"
+    )
+
+
 def test_invalid_motions_are_refused(robot):
     start = robot.rest_state()
     with pytest.raises(wr.InputError, match="observed has shape"):

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..io.arrays import BoolArray, FloatArray, IntArray
+from ..io.arrays import BoolArray, Brief, FloatArray, IntArray
 from ..io.errors import InputError
 from ..mesh.surface import closest_points
 from ..mesh.volume_mesh import Mesh
@@ -37,7 +37,7 @@ _LEAST_PATCH = 4  # number of vertices that determine the rotation of a patch
 KINDS = ("normal", "frame", "rigid", "patch")
 
 
-class Observation(ABC):
+class Observation(Brief, ABC):
     """Map from positions to the measurement of a sensor; subclasses are frozen dataclasses.
 
     Attributes:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ..io.arrays import BoolArray, FloatArray, IntArray
+from ..io.arrays import BoolArray, Brief, FloatArray, IntArray
 from ..io.errors import DataFileError, InputError, listed
 
 _MILLI = 1e3
@@ -31,7 +31,7 @@ class RegistrationSummary(TypedDict, total=False):
 
 
 @dataclass(frozen=True)
-class RigidTransform:
+class RigidTransform(Brief):
     """The map p -> R p + t."""
 
     rotation: FloatArray  # (..., 3, 3), determinant +1
@@ -91,7 +91,7 @@ def root_mean_square(residual: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
-class Registration:
+class Registration(Brief):
     """Measured markers in the frame of the body."""
 
     names: tuple[str, ...]

@@ -11,7 +11,7 @@ import torch
 
 from ..energies.strings import PAYLOAD, Strings
 from ..fem.bodies import Body
-from ..io.arrays import BoolArray, FloatArray
+from ..io.arrays import BoolArray, Brief, FloatArray
 from ..io.errors import InputError
 from ..io.safe_files import atomic_hdf5, create, read_array, read_attribute, read_hdf5
 from ..mesh.selection import vertices_at
@@ -36,7 +36,7 @@ _UNITS = {
 
 
 @dataclass(frozen=True)
-class Trials:
+class Trials(Brief):
     """R trials of one body, in the frame of the body, as stored in `DATASET`.
 
     Attributes:

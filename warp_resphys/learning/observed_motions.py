@@ -18,6 +18,7 @@ from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
 from ..dynamics.frames import BaseFrame, base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.strings import PAYLOAD
+from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError, in_short
 from ..settings.learning import ActuationSettings, ReleaseSettings
 from ..settings.mesh import Place
@@ -33,7 +34,7 @@ _STANDS_STILL = 1e-9  # m/s, rad/s
 
 
 @dataclass(frozen=True)
-class Identified:
+class Identified(Brief):
     """Identified parameters of a simulator, and marker places.
 
     Attributes:
@@ -62,7 +63,7 @@ class Identified:
 
 
 @dataclass(frozen=True)
-class ObservedMotions:
+class ObservedMotions(Brief):
     """Trials of one body with an observation, as simulators replay them.
 
     Attributes:

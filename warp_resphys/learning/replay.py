@@ -17,6 +17,7 @@ from ..data.input_response import InputResponse, response_of
 from ..data.markers import Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
+from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
@@ -43,7 +44,7 @@ def exact(simulator: Simulator) -> Simulator:
 
 
 @dataclass(frozen=True)
-class Start:
+class Start(Brief):
     """Initial conditions of R trials."""
 
     state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
@@ -79,7 +80,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Windows:
+class Windows(Brief):
     """Known states of R trials, from which a simulation begins anew every few steps.
 
     Where a state is unknown (NaN), the trial goes on from the simulated one. So does the memory of the energies, whose

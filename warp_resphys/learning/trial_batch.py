@@ -8,13 +8,14 @@ import torch
 
 from ..data.trials import STATIC, Trials
 from ..fem.bodies import Body
+from ..io.arrays import Brief
 from ..io.errors import InputError
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
 
 
 @dataclass(frozen=True)
-class TrialBatch:
+class TrialBatch(Brief):
     """R trials of one body with the same observed points, in the frame of the body.
 
     The observation is a map of the positions, such as markers or all vertices. A static pose is a trial of one frame.

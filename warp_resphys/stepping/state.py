@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
-from ..io.arrays import BoolArray
+from ..io.arrays import BoolArray, Brief
 from ..io.errors import InputError
 from .inputs import check_tensor, shapes
 
@@ -15,7 +15,7 @@ _MEMORY = "memory."  # prefix of memory variables among the tensors of a state
 
 
 @dataclass(frozen=True)
-class SolveReport:
+class SolveReport(Brief):
     """Outcome of the solve of a time step, by environment."""
 
     iterations: torch.Tensor  # (B,) number of global steps

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from ...io.arrays import BoolArray, FloatArray
+from ...io.arrays import BoolArray, Brief, FloatArray
 from ...io.errors import DataFileError, InputError, listed, number_of
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ RATES = (1e-3, 1e6)  # [Hz]
 
 
 @dataclasses.dataclass(frozen=True)
-class Recording:
+class Recording(Brief):
     """Positions of markers over time.
 
     The reader of a file returns lengths in the unit of the file, and what the file does not say as no labels, a rate of

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ...fem.bodies import Body
-from ...io.arrays import FloatArray, IntArray
+from ...io.arrays import Brief, FloatArray, IntArray
 from .contact_points import GROWTH, MOTION, SHIFT, TURN
 from .obstacle_contact import Contact
 from .obstacle_poses import Pose
@@ -19,7 +19,7 @@ _NEAR: Final = 0.2  # Width of the space around a body in which its obstacles ar
 
 
 @dataclass(frozen=True, eq=False)
-class ObstacleSurface:
+class ObstacleSurface(Brief):
     """Triangles of all O obstacles of a body, at rest or at T times."""
 
     names: tuple[str, ...] = ()  # Of the obstacles, with those of their bodies if there are several.

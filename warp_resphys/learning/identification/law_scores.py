@@ -1,7 +1,7 @@
-"""Errors of simulators with laws on observed motions, their comparison, and the stretches of a body in them."""
+"""Laws that are refined through the simulator: their errors, their comparison, a search by it, and stretches."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Final
@@ -13,14 +13,18 @@ from ...data.markers import WHOLE_STATE
 from ...dynamics.simulator import Simulator
 from ...fem.integration_points import principal_stretches
 from ...io.arrays import FloatArray
+from ...mesh.volume_mesh import Mesh
+from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay, Start
-from .law import LawClass
+from .law import LawClass, branches_of, family, longest_side
 from .search import Identification
 from .uncertainty import redundancy
 
 _CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
 _SIGNIFICANT: Final = 2.0  # standard errors
+_RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
+_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of parameters of a group begin with these
 
 
 @dataclass(frozen=True)
@@ -124,3 +128,49 @@ def stretches_in(
             ]
     parts = [principal_stretches(mesh, body.reshape(-1, *mesh.vertices.shape)) for body in bodies]
     return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
+
+
+def tried_without_states(
+    refine: Callable[[LawClass], RefinedLaw], guess: Mapping[str, float], wanted: LawSettings, mesh: Mesh
+) -> list[RefinedLaw]:
+    """Returns the classes that were tried through the simulator, the best last.
+
+    The search begins with all groups of terms, and takes away those without which validation trials are as close:
+    a class that lacks a group makes up for it with others, from where the group no longer helps.
+
+    Args:
+        refine: refines a law through the simulator.
+        guess: a neo-Hookean law like the identified material.
+        wanted: terms, branches and families of the largest class.
+        mesh: of the body.
+    """
+    shear = 2.0 * guess["c10"]
+    start = {**guess, "bulk_1": max(guess["bulk_1"], _RUBBERY * shear)}
+    creep = {name: value for name, value in guess.items() if name.startswith("prony")}
+    known = [value for name, value in creep.items() if name.startswith("prony_time")]
+    shortest, longest = wanted.relaxation_times
+    middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
+    times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
+    groups = {
+        "elastic": dict.fromkeys(wanted.terms, 0.0),
+        "branches": branches_of([0.1 * shear] * len(times), times, len(known) + 1),
+        "fibres": family(0.3 * shear, longest_side(mesh)) if wanted.families else {},
+    }
+    groups = {name: added for name, added in groups.items() if added}
+    whole = {name: value for added in groups.values() for name, value in added.items()}
+    best = refine(LawClass(tuple(groups), start | whole, math.nan))
+    tried = [best]
+    for name in groups:
+        left = {n: x for n, x in best.law.parameters.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
+        if name == "branches":
+            left |= creep
+        if name == "elastic":  # They may have been all that resists shear.
+            left["c10"] = max(left["c10"], guess["c10"])
+        smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
+        if left == best.law.parameters:  # The search has left nothing of the group.
+            best = replace(best, law=smaller)
+            continue
+        tried.append(refine(smaller))
+        if not best.score.beats(tried[-1].score):
+            best = tried[-1]
+    return [one for one in tried if one.law.parameters != best.law.parameters] + [best]

@@ -26,7 +26,6 @@ from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
 from ...io.errors import InputError, checks_types
 from ...io.parts import Checkpoint
-from ...mesh.volume_mesh import Mesh
 from ...settings.learning import Bounds, LawSettings, Prior
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import Limits, bounds_of
@@ -40,10 +39,9 @@ from .law import (
     first_guess,
     fit_classes,
     is_shape,
-    longest_side,
     strong_names,
 )
-from .law_scores import RefinedLaw, Score, scores_of, stretches_in
+from .law_scores import RefinedLaw, Score, scores_of, stretches_in, tried_without_states
 from .misfit import Misfit
 from .search import Identification, first_points, refined_searches
 from .weak_form import KnownMotion, WeakForm
@@ -53,8 +51,6 @@ _FURTHER: Final = 0.2  # standard deviation of the priors of further terms from 
 _HELD_OUT: Final = 4  # every fourth training trial
 _EARLY: Final = 0.6  # of the training trials that a law is tested on as well: share from which it is identified
 _CLOSE: Final = 1.25  # ratio of the validation error to the best one that a smaller class may have
-_RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
-_MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of parameters of a group begin with these
 _STRIDE: Final = 10  # steps from one balance of forces to the next, where all vertices are observed
 _FIXED: Final = ("fibre_stiffening", "fibre_compression")  # parameters that are not refined
 _BESIDE: Final = "beside"  # key of the search of parameters beside a known law
@@ -358,49 +354,3 @@ class _LawSearch:
             share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
             prior = Prior(mean=share * modulus.prior.mean, deviation=share * modulus.prior.deviation)
         return bounds_of_parameter(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)
-
-
-def tried_without_states(
-    refine: Callable[[LawClass], RefinedLaw], guess: Mapping[str, float], wanted: LawSettings, mesh: Mesh
-) -> list[RefinedLaw]:
-    """Returns the classes that were tried through the simulator, the best last.
-
-    The search begins with all groups of terms, and takes away those without which validation trials are as close:
-    a class that lacks a group makes up for it with others, from where the group no longer helps.
-
-    Args:
-        refine: refines a law through the simulator.
-        guess: a neo-Hookean law like the identified material.
-        wanted: terms, branches and families of the largest class.
-        mesh: of the body.
-    """
-    shear = 2.0 * guess["c10"]
-    start = {**guess, "bulk_1": max(guess["bulk_1"], _RUBBERY * shear)}
-    creep = {name: value for name, value in guess.items() if name.startswith("prony")}
-    known = [value for name, value in creep.items() if name.startswith("prony_time")]
-    shortest, longest = wanted.relaxation_times
-    middles = [shortest ** (1.0 - x) * longest**x for x in (0.25, 0.75)][: wanted.branches]
-    times = [time for time in middles if all(not time / 4.0 < one < 4.0 * time for one in known)]
-    groups = {
-        "elastic": dict.fromkeys(wanted.terms, 0.0),
-        "branches": branches_of([0.1 * shear] * len(times), times, len(known) + 1),
-        "fibres": family(0.3 * shear, longest_side(mesh)) if wanted.families else {},
-    }
-    groups = {name: added for name, added in groups.items() if added}
-    whole = {name: value for added in groups.values() for name, value in added.items()}
-    best = refine(LawClass(tuple(groups), start | whole, math.nan))
-    tried = [best]
-    for name in groups:
-        left = {n: x for n, x in best.law.parameters.items() if not n.startswith(_MEMBERS.get(name, wanted.terms))}
-        if name == "branches":
-            left |= creep
-        if name == "elastic":  # They may have been all that resists shear.
-            left["c10"] = max(left["c10"], guess["c10"])
-        smaller = LawClass(tuple(group for group in best.law.groups if group != name), left, math.nan)
-        if left == best.law.parameters:  # The search has left nothing of the group.
-            best = replace(best, law=smaller)
-            continue
-        tried.append(refine(smaller))
-        if not best.score.beats(tried[-1].score):
-            best = tried[-1]
-    return [one for one in tried if one.law.parameters != best.law.parameters] + [best]

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...io.arrays import FloatArray
+from ...io.arrays import Brief, FloatArray
 from ...settings.learning import Bounds
 from .nuisances import Nuisances
 
@@ -118,7 +118,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Uncertainty:
+class Uncertainty(Brief):
     """Uncertainty of the parameters near the minimum (Gauss-Newton approximation)."""
 
     deviation: dict[str, float]  # standard deviation of each parameter, in its unit

@@ -12,6 +12,7 @@ import torch
 
 from ...dynamics.frames import BaseFrame, VertexFrames
 from ...dynamics.simulator import Constants, Simulator
+from ...io.arrays import Brief
 from ...io.errors import ConvergenceError, InputError, in_short
 from ...io.safe_files import read_checkpoint, write_checkpoint
 from ...stepping.inputs import Inputs
@@ -108,7 +109,7 @@ def known_positions(state: State) -> torch.Tensor:
 
 
 @dataclass(frozen=True)
-class Range:
+class Range(Brief):
     """Bounding box of a model's standardised inputs in training, widened by a quarter of its width on every side.
 
     A network extrapolates badly, and a wrong force may drive the body ever further away. So the inputs of the model are
@@ -242,7 +243,7 @@ class LearnedPredictor:
 
 
 @dataclass(frozen=True)
-class Learned:
+class Learned(Brief):
     """A trained network with the settings of its roll-outs.
 
     Attributes:

@@ -28,6 +28,7 @@ from typing_extensions import override
 from ...data.markers import WHOLE_STATE, Markers, Observation, WholeState
 from ...dynamics.modes import vibration_modes
 from ...dynamics.simulator import Constants, Simulator
+from ...io.arrays import Brief
 from ...io.errors import ConvergenceError, InputError, checks_types
 from ...io.parts import Arrays, Parts, Report, TrialPart, cut
 from ...linalg.least_squares import minimise
@@ -47,7 +48,7 @@ _STATIC_STEP = 1e6  # s, time step for static poses, in which inertia is negligi
 
 
 @dataclass(frozen=True)
-class ReconstructedStep:
+class ReconstructedStep(Brief):
     """One reconstructed step."""
 
     state: State  # after the step with the force
@@ -268,7 +269,7 @@ def make_reconstructor(
 
 
 @dataclass(frozen=True)
-class ReconstructedTrials:
+class ReconstructedTrials(Brief):
     """Reconstructed states and forces of R trials.
 
     Attributes:

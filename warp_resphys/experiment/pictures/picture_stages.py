@@ -263,9 +263,7 @@ class _Plan:
 
 
 def identify_pictures(context: StageContext) -> None:
-    """Writes identification.json: the parameters, their uncertainty, and the camera of each pose.
-
-    An interrupted run keeps its finished search.
+    """Writes identification.json: parameters, uncertainty and cameras. An interrupted run keeps its finished search.
 
     Raises:
         ConvergenceError: the simulation fails at every start.

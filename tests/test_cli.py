@@ -145,19 +145,15 @@ class TestOwnOptions:
             path.write_text(text)
         return tmp_path / "configs"
 
-    def test_they_lie_in_the_working_directory(self, command, own):
+    def test_they_lie_in_the_working_directory_or_another_folder_and_help_names_them(self, command, own):
         assert command("experiment=my_robot", "seed=1") == (0, "")
         assert command.outputs == ["runs/my_robot/seed=1"]
         code, errors = command("experiment=my_robt")
         assert (code, errors.partition(";")[0]) == (2, "error: unknown experiment 'my_robt', did you mean 'my_robot'?")
         assert command("experiment=zzz")[1].endswith("known are beam, beam_twist, my_robot\n")
-
-    def test_help_names_them(self, command, own):
         _, out, err = outcome("--help")
         assert re.search("^experiment: beam_.*, my_robot, .*, tentacle_wrap$", out, flags=re.MULTILINE)
         assert err == ""
-
-    def test_another_folder_takes_their_place(self, command, own):
         assert command("--config-dir", "elsewhere", "experiment=other_robot") == (0, "")
         assert command("--config-dir", "elsewhere", "experiment=my_robot")[0] == 2
 
@@ -248,7 +244,10 @@ def disk_is_full() -> None:
 
 
 class TestOtherEnds:
-    def test_faults_of_the_program_keep_their_traceback(self, command, monkeypatch):
+    def test_faults_of_the_program_keep_their_traceback_and_nothing_global_is_left_changed(self, command, monkeypatch):
+        command("seed=[1")
+        assert "HYDRA_FULL_ERROR" not in os.environ
+        assert logging.raiseExceptions is True
         command.job = lambda config: 1 / 0
         with pytest.raises(ZeroDivisionError):
             command()
@@ -260,11 +259,6 @@ class TestOtherEnds:
         with pytest.raises(InputError):
             command()
         assert os.environ["HYDRA_FULL_ERROR"] == "1"
-
-    def test_nothing_global_is_left_changed(self, command):
-        command("seed=[1")
-        assert "HYDRA_FULL_ERROR" not in os.environ
-        assert logging.raiseExceptions is True
 
     @pytest.mark.parametrize("mode", ["--run", "--multirun"])
     def test_interruption(self, command, mode):

@@ -12,6 +12,7 @@ import torch
 import warp_resphys
 from support.command_line import sentence
 from support.main_job import DRIVEN, IN_RUN, ROD, run, run_without_report
+from support.refusals import refuses
 from warp_resphys import Contact, HalfSpace, InputError, Twin, pipeline
 from warp_resphys.control import sampling
 from warp_resphys.control.control_files import PLANNED, plans_file, read_motion, read_reduced, reduced_file
@@ -47,7 +48,7 @@ CONTROL = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """One run for all tests of it, which are slow therefore; `test_reduced` and `test_pieces` take its parts."""
+    """One run for all tests of it, which are slow therefore; `test_pieces` takes its parts."""
     place = tmp_path_factory.mktemp("control")
     return run_without_report(place, *CONTROL)
 
@@ -152,8 +153,7 @@ class TestReducedModel:
         check_plannable(robot)
         robot = robot.with_parameters()
         robot.parameters[f"tendon_tension_{word}"] = robot.parameters["tendon_tension_rise"]
-        with pytest.raises(InputError, match=f"tendon_tension_{word} is identified"):
-            check_plannable(robot)
+        refuses(InputError, f"tendon_tension_{word} is identified", check_plannable, robot)
 
     def test_it_comes_to_rest_where_the_corrected_robot_does(self, robot, model):
         inputs = np.array([0.6, 0.0, 0.3])
@@ -175,29 +175,22 @@ class TestReducedModel:
         np.testing.assert_allclose(estimator.state.z, state.z, atol=2e-6)
         np.testing.assert_allclose(estimator.bias, elsewhere, atol=2e-5)
 
-    def test_friction_a_medium_and_obstacles_are_refused(self, robot, monkeypatch):
+    def test_friction_a_medium_obstacles_and_data_driven_robots_are_refused(self, robot, monkeypatch, folder):
         sampling.check_reducible(robot)
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ("density",))
-        with pytest.raises(InputError, match="density is no stiffness"):
-            sampling.check_reducible(robot)
+        refuses(InputError, "density is no stiffness", sampling.check_reducible, robot)
         monkeypatch.setattr(sampling, "_OF_MEDIUM", ())
         body, energies = robot.simulator.body, robot.simulator.body.energies
         monkeypatch.setitem(vars(body), "energies", [*energies, Contact({"floor": HalfSpace(position=(0, 0, -9))})])
-        with pytest.raises(InputError, match="in contact cannot be reduced"):
-            sampling.check_reducible(robot)
+        refuses(InputError, "in contact cannot be reduced", sampling.check_reducible, robot)
         monkeypatch.setitem(vars(body), "energies", [*energies, SimpleNamespace(memory=("slide",))])
-        with pytest.raises(InputError, match="with memory"):
-            sampling.check_reducible(robot)
-
-    def test_a_data_driven_robot_is_refused(self, folder):
-        with pytest.raises(InputError, match="no stiffness"):
-            reduce(warp_resphys.load(folder, "simfree"), ReductionSettings())
+        refuses(InputError, "with memory", sampling.check_reducible, robot)
+        refuses(InputError, "no stiffness", reduce, warp_resphys.load(folder, "simfree"), ReductionSettings())
 
     def test_a_path_out_of_reach_is_named_with_the_nearest_point(self, folder, model, robot):
         far = control_of(folder).changed(centre=[0.0, 0.0, -0.35])
         task = Task(far, robot)
-        with pytest.raises(InputError, match=r"path circle: .*-350.0\) mm is .* mm away"):
-            task.check_reach(model, 1e-3)
+        refuses(InputError, r"path circle: .*-350.0\) mm is .* mm away", task.check_reach, model, 1e-3)
 
 
 class TestReducedTwin:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from support.refusals import refuses
 from warp_resphys.data.input_response import check_inputs, draw_inputs
 from warp_resphys.energies.pressure import PRESSURE
 from warp_resphys.energies.tendons import TENSION
@@ -18,7 +19,7 @@ def drawn(count=40, steps=150, chambers=2, limit=20e3, **settings):
     return np.stack([draw_inputs(sequences, limit, steps, STEP, chambers, own) for own in random])
 
 
-def test_sequences_start_and_end_at_rest_and_stay_within_the_limit():
+def test_sequences_rest_at_their_ends_within_the_limit_and_have_the_moments_asked_for():
     p = drawn(rest=0.1)
     assert p.min() == 0.0
     assert p.max() == 20e3
@@ -27,10 +28,7 @@ def test_sequences_start_and_end_at_rest_and_stay_within_the_limit():
     # Zero slope too: the first steps under pressure are small beside the typical change of a step.
     typical = np.abs(np.diff(p, axis=1)).max()
     assert np.abs(np.diff(p, axis=1))[:, 10:13].max() < 0.25 * typical
-
-
-def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
-    """Far from the ends and the limits the process is stationary."""
+    # Far from the ends and the limits the process is stationary.
     settings = {"mean": 5e4, "deviation": 1e3, "correlation_time": 0.1, "limit": 1e5, "correlation": 0.6}
     p = drawn(200, **settings)[:, 60:90] - 5e4
     assert abs(p.mean()) < 150.0
@@ -50,20 +48,15 @@ def test_sequences_have_the_mean_deviation_and_correlations_asked_for():
     ],
 )
 def test_bad_sequences(settings, message):
-    with pytest.raises(InputError, match=message):
-        drawn(1, 300, 3, **settings)
+    refuses(InputError, message, drawn, 1, 300, 3, **settings)
 
 
-def test_recorded_pressures_are_checked():
+def test_recorded_inputs_are_checked_but_for_a_small_zero_error_of_a_gauge():
     good = np.full((4, 2), 1e4)
     np.testing.assert_array_equal(check_inputs(good, PRESSURE, 2e4, "a.h5"), good)
     high = good.copy()
     high[3, 1] = 2.5e4
-    with pytest.raises(DataFileError, match=r"data\.input_limit"):
-        check_inputs(high, PRESSURE, 2e4, "a.h5")
-
-
-def test_a_small_zero_error_of_a_gauge_is_accepted_and_a_large_one_refused():
+    refuses(DataFileError, r"data\.input_limit", check_inputs, high, PRESSURE, 2e4, "a.h5")
     tension = np.array([[-0.01, 1.0], [0.2, 0.5]])
     np.testing.assert_array_equal(check_inputs(tension, TENSION, 2.0, "a.h5"), [[0.0, 1.0], [0.2, 0.5]])
     with pytest.raises(DataFileError, match=r"a\.h5: the tension of tendon 1 is -0.5 N in frame 1: it must be zero or"):

@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import warp_resphys as wr
+from support.refusals import refuses
 from support.slopes import differences
 from warp_resphys.data.camera import CameraMarkers, Lens, PlacedCamera, axes_from_below, motion_axes, path_axes
 from warp_resphys.stepping.rotations import rotations
@@ -74,8 +75,7 @@ def test_a_marker_behind_the_camera_is_not_seen_and_spoils_no_gradient():
 
 def test_bad_input_is_named():
     lens, pose = Lens(torch.eye(3)), torch.eye(4)
-    with pytest.raises(wr.InputError, match=r"shape \(3, 4\)"):
-        PlacedCamera(lens, pose[:3])
+    refuses(wr.InputError, r"shape \(3, 4\)", PlacedCamera, lens, pose[:3])
     with pytest.raises(wr.InputError, match="no rotation with a shift"):
         PlacedCamera(lens, pose * torch.tensor([[-1.0], [1.0], [1.0], [1.0]]))
     with pytest.raises(wr.InputError, match=r"\(time, motion, point, 2\) in px"):
@@ -142,10 +142,8 @@ def test_rays_are_the_inverse_of_pixels():
 )
 def test_files_without_a_calibration_are_said(text, error, words, tmp_path):
     (tmp_path / "camera.yaml").write_text(text)
-    with pytest.raises(error, match=words):
-        Lens.read(tmp_path / "camera.yaml")
-    with pytest.raises(wr.DataFileError, match="Cannot read"):
-        Lens.read(tmp_path / "none.yaml")
+    refuses(error, words, Lens.read, tmp_path / "camera.yaml")
+    refuses(wr.DataFileError, "Cannot read", Lens.read, tmp_path / "none.yaml")
 
 
 MATRIX = torch.tensor([[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from support.command_line import outcome, refusal
+from support.refusals import refuses
 from warp_resphys import DataFileError, read_recording
 from warp_resphys.io import decoding
 from warp_resphys.settings.data_kinds import TableSettings
@@ -124,8 +125,7 @@ def test_c3d_files_with_more_than_255_markers_and_without_model_outputs(tmp_path
 @pytest.mark.parametrize("content", ["this is no recording", ""])
 def test_foreign_files(tmp_path, content):
     (tmp_path / "notes.c3d").write_text(content)
-    with pytest.raises(DataFileError, match="not a C3D file"):
-        read_recording(tmp_path / "notes.c3d")
+    refuses(DataFileError, "not a C3D file", read_recording, tmp_path / "notes.c3d")
 
 
 def test_an_unknown_unit_and_the_byte_order_of_sgi_are_refused(tmp_path, trajectory):
@@ -143,8 +143,7 @@ def test_truncated_file(tmp_path, trajectory, part):
     content = write_c3d(tmp_path / "whole.c3d", np.tile(trajectory, (10, 1, 1)), "abc").read_bytes()
     cut = tmp_path / "cut.c3d"
     cut.write_bytes(content[: int(part * len(content))])
-    with pytest.raises(DataFileError, match="truncated"):
-        read_recording(cut)
+    refuses(DataFileError, "truncated", read_recording, cut)
 
 
 @pytest.mark.parametrize(
@@ -164,5 +163,4 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
     path.write_bytes(content)
     for limit, given in limits.items():
         monkeypatch.setattr(decoding, limit, given)
-    with pytest.raises(DataFileError, match=rf"whole\.c3d cannot be decoded \(.*{message}\): copy"):
-        read_recording(path)
+    refuses(DataFileError, rf"whole\.c3d cannot be decoded \(.*{message}\): copy", read_recording, path)

@@ -9,7 +9,7 @@ from warp_resphys.data.input_response import InputResponse, with_means
 STEP = 0.01
 
 
-def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
+def test_a_lag_follows_a_step_exponentially_and_a_delay_shifts_commands():
     command = torch.full((50, 1, 1), 2e4, dtype=torch.float64)
     rise = torch.tensor([0.07], dtype=torch.float64, requires_grad=True)
     result, _ = InputResponse(STEP, rise=rise).from_rest(command)
@@ -18,9 +18,6 @@ def test_a_lag_follows_a_step_exponentially_and_has_a_derivative():
     result.sum().backward()
     expected = -(2e4 * torch.exp(-times / 0.07) * times / 0.07**2).sum()
     torch.testing.assert_close(rise.grad[0], expected)
-
-
-def test_a_delay_shifts_commands_and_averages_over_a_step():
     command = torch.arange(1.0, 6.0, dtype=torch.float64)[:, None, None].expand(-1, 3, 2)
     late = torch.tensor([0.0, 2.0, 1.25], dtype=torch.float64) * STEP
     result = InputResponse(STEP, delay=late).from_rest(command)[0][..., 0]
@@ -92,7 +89,7 @@ def test_a_characteristic_curve_has_its_slope_in_each_octave_of_the_typical_comm
     assert response.scaled(np.zeros(1)) == 0.0
 
 
-def test_commands_within_the_dead_band_have_no_effect():
+def test_what_acts_counts_from_the_zero_beyond_the_dead_band_and_not_below_the_least_input():
     commands = np.array([-3.0, -1.0, 0.0, 0.5, 1.0, 1.5, 4.0])[:, None, None]
     acting, _ = InputResponse(STEP, 2.0, dead_band=1.0).from_rest(commands)
     np.testing.assert_allclose(acting[:, 0, 0], 2.0 * np.array([-2.0, 0.0, 0.0, 0.0, 0.0, 0.5, 3.0]))
@@ -103,9 +100,6 @@ def test_commands_within_the_dead_band_have_no_effect():
     np.testing.assert_allclose(result[-1, :, 0].detach(), [4.0, 3.0, 0.0])
     (slope,) = torch.autograd.grad(result[-1].sum(), bands)
     np.testing.assert_allclose(slope, [-1.0, -1.0, 0.0])
-
-
-def test_what_acts_counts_from_the_zero_and_not_below_the_least_input():
     commands = np.array([0.0, 0.5, 1.0, 3.0])[:, None]
     acting = InputResponse(STEP, 2.0, zero=0.5, lower=0.0).scaled(commands)
     np.testing.assert_array_equal(acting[:, 0], [0.0, 0.0, 1.0, 5.0])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from support.refusals import refuses
 from warp_resphys.data.recordings.recording_files import read_recording, write_recording
 from warp_resphys.data.registration import register_markers
 from warp_resphys.io.errors import DataFileError, InputError
@@ -113,8 +114,7 @@ class TestALogThatBeganBeforeItsWinch:
         path = self.write(tmp_path / "swing.csv", positions, np.ones(40), np.ones(40))
         rows = path.read_text().split("\n")
         path.write_text("\n".join([*rows[:21], rows[21] + "9", *rows[22:]]))
-        with pytest.raises(DataFileError, match="line 22"):
-            self.read(path)
+        refuses(DataFileError, "line 22", self.read, path)
 
 
 @pytest.mark.parametrize(
@@ -180,8 +180,7 @@ def test_errors_of_tables_name_line_and_column(tmp_path, positions, line, change
     if message is None:
         assert read_recording(path).rate == 100.0
         return
-    with pytest.raises(DataFileError, match=rf"swing\.csv.*{message}"):
-        read_recording(path)
+    refuses(DataFileError, rf"swing\.csv.*{message}", read_recording, path)
 
 
 @pytest.mark.parametrize(
@@ -191,8 +190,7 @@ def test_times_that_are_too_close_are_refused(tmp_path, positions, stamps):
     path = write_table(tmp_path / "swing.csv", positions)
     for line, stamp in enumerate(stamps, start=2):
         edit(path, line, lambda text, stamp=float(stamp): f"{stamp!r}{text[6:]}")
-    with pytest.raises(DataFileError, match=r"a frame rate of inf|do not belong to one recording|does not rise"):
-        read_recording(path)
+    refuses(DataFileError, r"a frame rate of inf|do not belong to one recording|does not rise", read_recording, path)
 
 
 def archive(path, positions, **changes):
@@ -253,8 +251,7 @@ def test_arrays_larger_than_any_recording_are_not_read(tmp_path, positions, monk
     zeros = np.zeros((200_000, 3, 3))  # 14 MB, of which little is left in the file
     np.savez_compressed(tmp_path / "swing.npz", positions=zeros, rate_hz=100.0)
     assert (tmp_path / "swing.npz").stat().st_size < 1 << 20
-    with pytest.raises(DataFileError, match=r"swing\.npz .* \(its arrays are larger than"):
-        read_recording(tmp_path / "swing.npz")
+    refuses(DataFileError, r"swing\.npz .* \(its arrays are larger than", read_recording, tmp_path / "swing.npz")
     with h5py.File(tmp_path / "swing.h5", "w") as file:
         file.create_dataset("positions", (1 << 40, 3, 3), "f8", chunks=(64, 3, 3))  # nothing of it in the file
     with pytest.raises(DataFileError, match=r"swing\.h5 is damaged \(it takes more than 2048 MiB of memory\)"):
@@ -273,31 +270,24 @@ class Payload:
 
 def test_objects_in_an_archive_are_refused_and_not_run(tmp_path, positions):
     path = archive(tmp_path / "swing.npz", positions, labels=np.array([Payload(tmp_path / "ran")], dtype=object))
-    with pytest.raises(DataFileError, match="Python objects"):
-        read_recording(path)
+    refuses(DataFileError, "Python objects", read_recording, path)
     (tmp_path / "bare.npz").write_bytes(pickle.dumps(Payload(tmp_path / "ran")))
-    with pytest.raises(DataFileError, match="Python objects"):
-        read_recording(tmp_path / "bare.npz")
+    refuses(DataFileError, "Python objects", read_recording, tmp_path / "bare.npz")
     assert not (tmp_path / "ran").exists()
 
 
 def test_damaged_and_foreign_files(tmp_path, positions):
     whole = archive(tmp_path / "swing.npz", positions).read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataFileError, match=r"cut\.npz is not a NumPy file of plain arrays"):
-        read_recording(tmp_path / "cut.npz")
+    refuses(DataFileError, r"cut\.npz is not a NumPy file of plain arrays", read_recording, tmp_path / "cut.npz")
     np.save(tmp_path / "single.npy", positions)
     (tmp_path / "single.npy").rename(tmp_path / "single.npz")
-    with pytest.raises(DataFileError, match="is a single array"):
-        read_recording(tmp_path / "single.npz")
+    refuses(DataFileError, "is a single array", read_recording, tmp_path / "single.npz")
     for name in ("absent.npz", "absent.csv", "absent.c3d", "absent.h5"):
-        with pytest.raises(DataFileError, match=r"No such file|does not exist"):
-            read_recording(tmp_path / name)
+        refuses(DataFileError, r"No such file|does not exist", read_recording, tmp_path / name)
     (tmp_path / "empty.csv").touch()
-    with pytest.raises(DataFileError, match="has no header that is known"):
-        read_recording(tmp_path / "empty.csv")
-    with pytest.raises(DataFileError, match="is no recording that can be read"):
-        read_recording(tmp_path / "swing.mat")
+    refuses(DataFileError, "has no header that is known", read_recording, tmp_path / "empty.csv")
+    refuses(DataFileError, "is no recording that can be read", read_recording, tmp_path / "swing.mat")
 
 
 def test_arguments_are_checked(tmp_path, positions):
@@ -307,8 +297,7 @@ def test_arguments_are_checked(tmp_path, positions):
         ({"rate": 0.0}, r"rate is 0\.0"),
         ({"labels": ["a"]}, "labels has 1 names; .* has 3 markers"),
     ):
-        with pytest.raises(InputError, match=message):
-            read_recording(path, **given)
+        refuses(InputError, message, read_recording, path, **given)
 
 
 def test_hdf5_gives_back_what_was_written(tmp_path, positions):

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.command_line import outcome, refusal
+from support.refusals import refuses
 from warp_resphys import DataFileError, read_recording
 
 FRAMES, TIME = np.arange(1, 31), np.arange(30) / 100.0
@@ -211,8 +212,7 @@ def test_a_wrong_export_is_named(tmp_path, name, old, new, message):
     text, encoding, *_ = FILES[name]
     assert old in text
     (tmp_path / "a.csv").write_bytes(text.replace(old, new).encode(encoding))
-    with pytest.raises(DataFileError, match=rf"a\.csv.*{message}"):
-        read_recording(tmp_path / "a.csv")
+    refuses(DataFileError, rf"a\.csv.*{message}", read_recording, tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize("names", ["", NAMES_3D])
@@ -285,5 +285,4 @@ def test_files_that_are_no_text_are_refused(tmp_path):
     path = tmp_path / "a.csv"
     for content in (bytes(range(256)), b"PK\3\4\0\0" * 9, b"\xff\xfea", bytes(100)):
         path.write_bytes(content)
-        with pytest.raises(DataFileError, match=r"a\.csv is not a text file: export it"):
-            read_recording(path)
+        refuses(DataFileError, r"a\.csv is not a text file: export it", read_recording, path)

@@ -72,22 +72,19 @@ def test_a_file_that_lacks_something_is_named(tmp_path, name):
         Trials.read(path)
 
 
-def test_a_pose_is_under_its_last_inputs_or_under_constant_ones():
+def test_a_pose_is_under_its_last_or_constant_inputs_and_a_frame_under_those_of_its_step():
     steps = np.arange(8.0).reshape(2, 4, 1)
     for pressure in (steps, steps[:, 3]):
         acting, resting = dataset(("static", "static"), pressure=pressure).acting(["a", "b"], None, None, 0.05)
         assert resting.fields["pressure"].tolist() == [[3.0], [7.0]]
         assert acting.at(3).fields["pressure"].tolist() == [[3.0], [7.0]]
-
-
-def test_inputs_are_those_of_the_step_that_begins_with_a_frame():
     steps = np.arange(12.0)[None, :, None] * np.array([1.0, 2.0])[:, None, None]
     acting = driving(dataset(("rest", "static"), pressure=steps), ["b", "a"])["pressure"]
     np.testing.assert_array_equal(acting[1, :, 0], [0.0, 2.0, 4.0, 6.0, 8.0, 10.0])
     np.testing.assert_array_equal(acting[0, :, 0], 22.0)  # A pose has the last input.
 
 
-def test_the_time_since_a_change_counts_all_inputs_of_a_trial():
+def test_changes_are_those_of_all_inputs_beyond_noise_and_a_slow_fall_of_one_is_a_release():
     valve = np.zeros((3, 12, 1))
     valve[0, 4:] = 1.0
     other = np.zeros((3, 12, 2))
@@ -96,17 +93,11 @@ def test_the_time_since_a_change_counts_all_inputs_of_a_trial():
     np.testing.assert_allclose(since[0], [0.0, 0.1, 0.0, 0.1, 0.0, 0.1], atol=1e-12)
     np.testing.assert_allclose(since[1], TIMES)  # Since its release.
     assert np.isinf(since[2]).all()
-
-
-def test_inputs_begin_to_change_after_noise():
     valve = 1e-3 * (np.arange(24.0).reshape(2, 12, 1) % 4)
     valve[0, 6:] += 1.0
     own = dataset(("rest", "rest"), pressure=valve + 0.5)
     assert first_change(own, "a") == TIMES[3]
     assert first_change(own, "b") == 0.0
-
-
-def test_a_slow_fall_of_one_of_two_inputs_is_a_release():
     right = np.repeat(np.linspace(0.3, 0.0, 6), 2)
     own = dataset(("rest",), pressure=np.stack([np.ones(12), right], axis=1)[None])
     assert phases_of(own, ["a"])[0].tolist() == ["rise", "rise", "release", "release", "release", "release"]

@@ -50,7 +50,7 @@ def poses_of_two(steps=20):
 
 
 class TestBaseFrame:
-    def test_a_body_that_goes_with_its_base_is_at_rest_in_its_frame(self):
+    def test_a_body_that_goes_with_its_base_is_at_rest_in_its_frame_from_which_states_come_back(self):
         poses = poses_of_two()
         points = Body(box_hexahedra(divisions=(2, 1, 1))).mesh.vertices
         world = torch.from_numpy(
@@ -61,8 +61,6 @@ class TestBaseFrame:
             q, v = base.enter(world[k], (world[k] - world[k - 1]) / STEP, k)
             np.testing.assert_allclose(q, np.stack([points, points]), atol=1e-14)
             np.testing.assert_allclose(v, np.zeros_like(q), atol=1e-12)
-
-    def test_states_and_forces_come_back_from_it(self):
         base, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(2)
         q, v, force = (torch.randn(2, 7, 3, dtype=torch.float64, generator=random) for _ in range(3))
         for k in (0, 1, 7, 20, 25):

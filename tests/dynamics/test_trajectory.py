@@ -1,4 +1,4 @@
-"""Trajectories as files and pictures, and batches of one without their axis."""
+"""Trajectories as files and pictures, inputs as numbers and lists, batches of one, and what Python prints."""
 
 import h5py
 import matplotlib.pyplot as plt
@@ -8,11 +8,14 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Contact, InputError, Inputs, Simulator, Tendons, box_hexahedra, select_vertices
+from support.refusals import refuses
+from warp_resphys import Body, Corotated, InputError, Inputs, Scene, Simulator, Tendons, box_hexahedra, select_vertices
 from warp_resphys.energies import Box, Sphere
+from warp_resphys.energies.contact.obstacle_contact import Contact
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
+from warp_resphys.energies.contact.surface_contact import SurfaceContact
 
-MESH = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1))
+MESH = box_hexahedra((0.1, 0.02, 0.02), (4, 1, 1))
 TIP = select_vertices(MESH, x=0.1)
 SIMULATOR = Simulator(clamped(MESH, energies=[Tendons([[[0.0, 0.01, 0.02], [0.1, 0.01, 0.02]]])]))
 
@@ -84,8 +87,7 @@ def test_a_plot_without_choices_shows_the_vertex_that_moves_furthest_along_its_w
     ],
 )
 def test_what_is_not_there_is_refused(trajectory, call, message):
-    with pytest.raises(InputError, match=message):
-        call(trajectory)
+    refuses(InputError, message, call, trajectory)
 
 
 def test_a_batch_of_one_needs_no_axis():
@@ -102,7 +104,71 @@ def test_a_batch_of_one_needs_no_axis():
     clamp = rest[SIMULATOR.fixed]
     assert Inputs(fixed_positions=clamp).fixed_positions.shape == (1, *clamp.shape)
     assert Inputs(attached_mass=torch.zeros(20)).attached_mass.shape == (1, 20)
-    with pytest.raises(InputError, match="q has shape"):
-        SIMULATOR.state(rest[:5])
-    with pytest.raises(InputError, match="external_force has shape"):
-        SIMULATOR.step(SIMULATOR.rest_state(batch=2), Inputs(force))
+    refuses(InputError, "q has shape", SIMULATOR.state, rest[:5])
+    refuses(InputError, "external_force has shape", SIMULATOR.step, SIMULATOR.rest_state(batch=2), Inputs(force))
+
+
+ROUTES = [[[x, 0.01, z] for x in (0.0, 0.05, 0.1)] for z in (0.002, 0.018)]
+
+
+def pulled(dtype=torch.float64):
+    return Simulator(clamped(MESH, energies=[Tendons(ROUTES)]), Corotated(2e5, 0.45), dtype=dtype)
+
+
+@pytest.mark.parametrize(("dtype", "batch"), [(torch.float64, 1), (torch.float32, 3)])
+def test_numbers_and_lists_are_for_every_environment(dtype, batch):
+    simulator = pulled(dtype)
+    start = simulator.rest_state(batch)
+    series = np.linspace(0.1, 0.2, 3)[:, None, None] * np.ones((1, batch, 2))
+    cases = [
+        (0.2, [[0.2, 0.2]] * batch),
+        ([0.1, 0.3], [[0.1, 0.3]] * batch),
+        (np.array([[0.1, 0.3]]), [[0.1, 0.3]] * batch),
+        (series, series),
+        (series[:, :1], series),
+    ]
+    for given, expected in cases:
+        path = simulator.rollout(start, 3, Inputs(tendon_tension=given))
+        other = simulator.rollout(start, 3, Inputs(tendon_tension=simulator.tensor(expected)))
+        assert torch.equal(path.q, other.q)
+    rest = simulator.static_equilibrium(Inputs(tendon_tension=0.2), batch=batch).q
+    assert rest.shape[0] == batch
+    assert torch.equal(rest, simulator.static_equilibrium(Inputs(tendon_tension=simulator.tensor(cases[0][1]))).q)
+    force = np.zeros((len(MESH.vertices), 3))
+    force[-1, 2] = 0.01
+    moved = simulator.step(start, Inputs(external_force=force)).q
+    assert float((moved - simulator.step(start).q)[:, -1, 2].min()) > 0.0
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tendon_tension": "much"}, "tendon_tension is 'much'"),
+        ({"external_force": [0.0, 0.0, -1.0]}, r"external_force has shape \(3,\): it must be \(N, 3\)"),
+        ({"fixed_positions": 1.0}, r"fixed_positions has shape \(\)"),
+        ({"attached_mass": 0.1}, r"attached_mass has shape \(\): .* a mass for every vertex"),
+        ({"tendon_tension": [torch.ones(2), torch.ones(2)]}, "list with tensors"),
+    ],
+)
+def test_what_is_no_input_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        Inputs(**given)
+
+
+def test_wrong_numbers_of_values_are_refused():
+    simulator = pulled()
+    with pytest.raises(InputError, match=r"tendon_tension has shape \(1, 3\)"):
+        simulator.step(simulator.rest_state(), Inputs(tendon_tension=[0.1, 0.2, 0.3]))
+
+
+def test_simulations_are_printed_in_a_line():
+    simulator = pulled()
+    inputs = Inputs(tendon_tension=[0.1, 0.2])
+    path = simulator.rollout(simulator.rest_state(), 2, inputs)
+    scene = Scene({"a": simulator.body, "b": Body.rigid_body(MESH)}, SurfaceContact(distance=1e-4))
+    body = "Body(Mesh(20 vertices, 4 cells: hexahedron), 4 fixed vertices, Tendons)"
+    assert repr(simulator) == f"Simulator({body}, Corotated, 10 ms, implicit_euler, torch.float64, cpu)"
+    assert repr(path.final).startswith("State(q (1, 20, 3), v (1, 20, 3)")
+    assert repr(path) == "Motion: 2 steps of 10 ms, 1 environment, q (3, 1, 20, 3)"
+    assert repr(inputs) == "Inputs(tendon_tension (1, 2))"
+    assert repr(scene).startswith(f"Scene(a: {body}, b: Body(Mesh(20 vertices, 4 cells: hexahedron, regions body)")

@@ -10,6 +10,7 @@ import torch
 from support.clamped import noise
 from support.contact import BLOCK, KAPPA, SIDE, SOFT, WEIGHT, D, G, distances, resting_floor
 from support.contact import on_obstacles as simulator
+from support.refusals import refuses
 from support.slopes import check_slopes
 from warp_resphys import Body, Corotated, Inputs, Simulator, State, SymmetryPlane, box_hexahedra, box_tetrahedra
 from warp_resphys.energies.contact.contact_points import vertex_areas, vertex_factors
@@ -305,11 +306,10 @@ def test_a_free_block_rests_on_a_floor_by_friction():
 def test_a_free_block_that_no_friction_holds_is_refused(mu, gap):
     s = simulator({"floor": HalfSpace(position=(0.0, 0.0, -gap))}, mu)
     assert not s.is_held(s.rest_state())
-    with pytest.raises(InputError, match="lay it on an obstacle with friction, within the distance of contact"):
-        s.static_equilibrium()
+    refuses(InputError, "lay it on an obstacle with friction, within the distance of contact", s.static_equilibrium)
 
 
-def test_refusals():
+def test_bodies_states_and_inputs_that_contact_refuses():
     with pytest.raises(InputError, match=r"within the obstacle 'floor' at rest: vertex 0 by 2 mm"):
         simulator(
             {"ball": Sphere(radius=0.01, position=(0.1, 0.0, 0.0)), "floor": HalfSpace(position=(0.0, 0.0, 2e-3))}
@@ -321,6 +321,12 @@ def test_refusals():
     held = simulator(s.body.energies[0].obstacles["obstacle"], fixed=select_vertices(BLOCK, z=0.0))
     with pytest.raises(InputError, match=r"after an obstacle has moved: vertex \d+ by 0.5 mm; .* move obstacles less"):
         held.rollout(start, 2, Inputs(obstacle_move_z=vector(0.0, 1.5e-3)[:, None, None]))
+    floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
+    half = Body(BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})])
+    refuses(InputError, "symmetry planes has no contact", Simulator, half)
+    lying = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
+    with pytest.raises(InputError, match="without moves=True"):
+        lying.step(lying.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))
 
 
 TWO = {"a": HalfSpace(position=(0.0, 0.0, -0.1)), "b": HalfSpace(position=(0.0, 0.0, -0.2))}
@@ -353,11 +359,10 @@ def test_values_by_the_name_of_an_obstacle():
     ],
 )
 def test_values_out_of_range(make, message):
-    with pytest.raises(InputError, match=message):
-        make()
+    refuses(InputError, message, make)
 
 
-def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused():
+def test_an_obstacle_and_a_clamp_that_pass_through_one_another_in_a_step_are_refused():
     thickness = 0.002
     plate = Box(position=(0.01, 0.01, SIDE + 0.01), edges=(0.05, 0.05, thickness), moves=True)
     simulator = Simulator(Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
@@ -369,27 +374,12 @@ def test_an_obstacle_that_passes_through_a_body_in_a_step_is_refused():
     simulator.step(state, Inputs(obstacle_move_z=still - 0.0105 + 0.5 * thickness))
     with pytest.raises(InputError, match="more than 90 degrees"):
         simulator.step(state, Inputs(obstacle_move_z=still, obstacle_rotate_z=still + 2.0))
-
-
-def test_a_clamp_that_moves_through_an_obstacle_is_refused():
     plate = Box(position=(0.01, 0.01, -0.003), edges=(0.05, 0.05, 0.002))
     body = Body(BLOCK, fixed=select_vertices(BLOCK, z=0.0), energies=[Contact({"plate": plate})])
     simulator = Simulator(body, gravity=(0.0, 0.0, 0.0), time_step=0.01)
     clamp = simulator.rest_positions[simulator.fixed]
     for way in (0.004, 0.008, 0.05):
         inputs = Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, way]))
-        with pytest.raises(InputError, match="'plate'"):
-            simulator.step(simulator.rest_state(), inputs)
-        with pytest.raises(InputError, match="'plate'"):
-            simulator.static_equilibrium(inputs)
+        refuses(InputError, "'plate'", simulator.step, simulator.rest_state(), inputs)
+        refuses(InputError, "'plate'", simulator.static_equilibrium, inputs)
     simulator.step(simulator.rest_state(), Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, 0.0015])))
-
-
-def test_bodies_and_inputs_that_contact_refuses():
-    floor, other = HalfSpace(position=(0.0, 0.0, -0.01), moves=True), HalfSpace(position=(0.0, 0.0, -0.02))
-    half = Body(BLOCK, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[Contact({"floor": other})])
-    with pytest.raises(InputError, match="symmetry planes has no contact"):
-        Simulator(half)
-    simulator = Simulator(Body(BLOCK, energies=[Contact({"floor": floor, "other": other})]))
-    with pytest.raises(InputError, match="without moves=True"):
-        simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=torch.tensor([[0.0, 1e-3]], dtype=torch.float64)))

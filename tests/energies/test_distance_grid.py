@@ -8,6 +8,7 @@ import torch
 import trimesh
 
 from support.clamped import noise
+from support.refusals import refuses
 from support.slopes import check_slopes
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Mesh, Simulator, State, box_hexahedra
 from warp_resphys.energies import DistanceGrid
@@ -87,13 +88,11 @@ def test_a_surface_gives_the_distances_of_its_shape(tmp_path):
     np.testing.assert_allclose(d[0], [1e-3, 0.7e-3, -1e-2], atol=2e-5)
     np.testing.assert_allclose(n[0, :2], [[0, 0, 1], [0, 1, 0]], atol=3e-3)
     (tmp_path / "open.stl").write_bytes(trimesh.Trimesh(box.vertices, box.faces[1:]).export(file_type="stl"))
-    with pytest.raises(MeshError, match="close the surface"):
-        DistanceGrid.from_file(tmp_path / "open.stl", spacing=1e-3)
+    refuses(MeshError, "close the surface", DistanceGrid.from_file, tmp_path / "open.stl", spacing=1e-3)
     with pytest.raises(MeshError, match="one of m, cm, mm, not inch"):
         DistanceGrid.from_file(tmp_path / "box.stl", spacing=1e-3, units="inch")
     for faces in (box.faces[:, ::-1], np.concatenate([box.faces[:1, ::-1], box.faces[1:]])):
-        with pytest.raises(InputError, match="counter-clockwise"):
-            DistanceGrid.of_surface(1e-3 * box.vertices, faces, 1e-3)
+        refuses(InputError, "counter-clockwise", DistanceGrid.of_surface, 1e-3 * box.vertices, faces, 1e-3)
 
 
 @pytest.mark.slow

@@ -43,13 +43,15 @@ def test_the_surface_is_where_the_distance_is_zero(name):
     assert np.linalg.det(corners).sum() / 6.0 == pytest.approx(volume, rel=6e-3)
 
 
-def test_a_half_space_is_a_plate_below_the_body():
+def test_a_half_space_is_a_plate_below_the_body_and_no_obstacle_draws_none():
     floor = HalfSpace(position=(5.0, 5.0, -0.01))
     surface = ObstacleSurface.of(Body(MESH, energies=[Contact({"floor": floor})]), {"obstacle_growth": 2e-3})
     low, high = surface.points.min(axis=0), surface.points.max(axis=0)
     assert high[2] == pytest.approx(-0.008)
     np.testing.assert_allclose(0.5 * (low + high)[:2], MESH.vertices.mean(axis=0)[:2], atol=1e-12)
     assert (high - low)[:2] == pytest.approx([0.15, 0.15])
+    surface = ObstacleSurface.of(Body(MESH))
+    assert obstacle_layers(surface.points, surface.triangles) == []
 
 
 def test_parameters_move_the_obstacle_that_they_name():
@@ -70,8 +72,3 @@ def test_obstacles_of_a_scene_have_the_names_and_parameters_of_their_bodies():
     np.testing.assert_allclose(moved["left_ball"][0], one + [0.0, 0.01, 0.0], atol=1e-15)
     assert np.ptp(moved["right_ball"][0], axis=0) == pytest.approx(np.ptp(one, axis=0) * 0.04 / 0.03)
     assert all(np.array_equal(faces, triangles) for _, faces in moved.values())
-
-
-def test_a_body_without_obstacles_draws_none():
-    surface = ObstacleSurface.of(Body(MESH))
-    assert obstacle_layers(surface.points, surface.triangles) == []

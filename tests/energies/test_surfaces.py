@@ -9,6 +9,7 @@ import torch
 import warp as wp
 
 from support.clamped import clamped
+from support.refusals import refuses
 from support.slopes import check_slopes
 from warp_resphys import Corotated, Inputs, Scene, Simulator, SolverSettings, State, SurfaceContact, SymmetryPlane
 from warp_resphys.energies import FrictionPair
@@ -255,16 +256,14 @@ def test_regions_have_their_own_friction():
     with torch.no_grad():
         held, slides = (s.rollout(s.rest_state(), 10).v[-1, 0, b, 0].mean() for s in (both, other))
     assert float(held) < 1e-3 < 0.1 < float(slides)  # the first pair that fits counts
-    with pytest.raises(InputError, match="the pair 'pad' of a contact"):
-        Simulator(Scene({"a": bodies["a"]}, contact))
+    refuses(InputError, "the pair 'pad' of a contact", Simulator, Scene({"a": bodies["a"]}, contact))
     with pytest.raises(InputError, match=r"FrictionPair\.friction is -1\.0: it must be a number, zero or more"):
         SurfaceContact(pairs={"pad": FrictionPair(first="a", second="b", friction=-1.0)})
     for wrong in (
         [FrictionPair(first="a", second="b", friction=1.0)],
         {"other": FrictionPair(first="a", second="b", friction=1.0)},
     ):
-        with pytest.raises(InputError, match="by name, other than 'other'"):
-            SurfaceContact(pairs=wrong)
+        refuses(InputError, "by name, other than 'other'", SurfaceContact, pairs=wrong)
     with pytest.raises(InputError, match=r"3 values for 2 coefficients \(other, pad\)"):
         simulator.prepare({"surface_friction": torch.full((1, 3), 0.1, dtype=torch.float64)})
 
@@ -386,36 +385,27 @@ def test_driven_vertices_push_in_one_step(rise, device):
 
 def test_refusals():
     cube = replace(CUBE, vertices=CUBE.vertices + [0.0102, 0.0103, 0.01 + 1e-12])
-    with pytest.raises(InputError, match="touch at rest"):
-        Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
+    refuses(InputError, "touch at rest", Simulator, Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     cube = replace(CUBE, vertices=CUBE.vertices + [0.01, 0.01, 0.005])
     words = r"cross at rest: an edge .* 'plate'.*; deepest is vertex \d+ in '(cube|plate)', by 5 mm"
-    with pytest.raises(InputError, match=words):
-        Simulator(Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
+    refuses(InputError, words, Simulator, Scene({"plate": Body(PLATE), "cube": Body(cube)}, SurfaceContact()))
     within = Body(replace(CUBE, vertices=0.2 * CUBE.vertices + [0.01, 0.01, 0.003]))
     words = r"a body with vertex \d+ in 'cube' is within that with vertex \d+ in 'plate' at rest: move"
-    with pytest.raises(InputError, match=words):
-        Simulator(Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
-    with pytest.raises(InputError, match="mm from itself"):
-        Simulator(Body(clip(), energies=[SurfaceContact(distance=0.02)]))
-    with pytest.raises(InputError, match="distance of a contact between surfaces"):
-        SurfaceContact(distance=0.0)
-    with pytest.raises(InputError, match="surface_friction"):
-        SurfaceContact(friction=-0.1)
+    refuses(InputError, words, Simulator, Scene({"plate": Body(PLATE), "cube": within}, SurfaceContact(distance=1e-4)))
+    refuses(InputError, "mm from itself", Simulator, Body(clip(), energies=[SurfaceContact(distance=0.02)]))
+    refuses(InputError, "distance of a contact between surfaces", SurfaceContact, distance=0.0)
+    refuses(InputError, "surface_friction", SurfaceContact, friction=-0.1)
     with pytest.raises(InputError, match="symmetry planes"):
         Simulator(Body(CUBE, symmetry=[SymmetryPlane((1.0, 0.0, 0.0))], energies=[SurfaceContact()]))
-    with pytest.raises(InputError, match="midpoint"):
-        Simulator(Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
+    refuses(InputError, "midpoint", Simulator, Body(CUBE, energies=[SurfaceContact()]), integrator="midpoint")
     simulator = landing()
     smaller, cube = simulator.rest_positions.clone(), simulator.body.vertex_slice("cube")
     smaller[cube] = 0.2 * (smaller[cube] - smaller[cube].mean(0)) + smaller.new_tensor([0.02, 0.02, 0.005])
     words = r"vertex \d+ in 'cube' is within that with .* in 'plate' at the start .* environment 0"
-    with pytest.raises(InputError, match=words):
-        simulator.step(simulator.state(smaller))
+    refuses(InputError, words, simulator.step, simulator.state(smaller))
     crossing = simulator.rest_positions.clone()
     crossing[cube, 2] -= 0.008
-    with pytest.raises(InputError, match="cross at the start of a step"):
-        simulator.step(simulator.state(crossing))
+    refuses(InputError, "cross at the start of a step", simulator.step, simulator.state(crossing))
 
 
 def test_a_ball_in_a_hollow_is_not_within_the_body_around_it():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.refusals import refuses
 from support.slopes import check_rows, check_slopes
 from warp_resphys import Body, Corotated, Inputs, Simulator, State, Tendons, box_hexahedra, select_vertices
 from warp_resphys.dynamics import statics
@@ -146,8 +147,7 @@ def test_gradients_from_a_straight_rest_are_finite_and_right():
     ],
 )
 def test_bad_friction_is_refused(route, more, words):
-    with pytest.raises(InputError, match=words):
-        simulator(route, **more)
+    refuses(InputError, words, simulator, route, **more)
 
 
 @pytest.mark.parametrize(
@@ -159,23 +159,17 @@ def test_bad_friction_is_refused(route, more, words):
     ],
 )
 def test_bad_routes_are_refused(guides, keys, words):
-    with pytest.raises(InputError, match=words):
-        Route(guides=guides, **keys)
+    refuses(InputError, words, Route, guides=guides, **keys)
 
 
-def test_friction_that_no_pose_holds_is_said(monkeypatch):
+def test_friction_that_no_pose_holds_and_memory_of_another_body_are_refused(monkeypatch):
     monkeypatch.setattr(statics, "_MOST_SETTLINGS", 2)
     s = simulator(STRAIGHT)
-    with pytest.raises(ConvergenceError, match="lower the friction or the tension"):
-        s.static_equilibrium(tension(6.0))
-
-
-def test_memory_of_another_body_is_refused():
+    refuses(ConvergenceError, "lower the friction or the tension", s.static_equilibrium, tension(6.0))
     s = simulator(STRAIGHT)
     state = s.rest_state()
     state = State(state.q, state.v, memory={"tendon_segment_tension": torch.zeros(1, 3).double()})
-    with pytest.raises(InputError, match="tendon_segment_tension"):
-        s.step(state)
+    refuses(InputError, "tendon_segment_tension", s.step, state)
 
 
 def test_guides_in_the_world_pull_as_a_cable_to_a_post():

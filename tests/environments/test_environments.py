@@ -1,4 +1,4 @@
-"""Gymnasium environments on a small run, seeds, resets in all modes and refusals, and its robot as time goes on."""
+"""Gymnasium environments on small runs: seeds, resets in all modes, refusals, and two fingers as a gripper."""
 
 from dataclasses import replace
 
@@ -10,11 +10,14 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import warp_resphys
+from support.main_job import DRIVEN, run_without_report
+from support.refusals import refuses
 from warp_resphys import InputError, Robot, State
 from warp_resphys.control.worlds import World
 from warp_resphys.data.registration import kabsch
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
-from warp_resphys.environments.making import TASKS, make_vector
+from warp_resphys.environments.making import TASKS, make_vector, register
+from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv
 from warp_resphys.studies.live import LiveRobot
@@ -103,8 +106,7 @@ class TestResets:
         action = np.zeros((2, 3), dtype=np.float32)
         for _ in range(4):
             moved = environment.step(action)[0]
-        with pytest.raises(InputError, match="reset_mask"):
-            environment.step(action)
+        refuses(InputError, "reset_mask", environment.step, action)
         seen, _ = environment.reset(options={"reset_mask": np.array([True, False])})
         np.testing.assert_array_equal(seen[1], moved[1])
         assert np.abs(seen[0] - moved[0]).max() > 0.05
@@ -225,18 +227,15 @@ class TestPictures:
     ],
 )
 def test_invalid_arguments_are_refused(folder, change, said):
-    with pytest.raises(InputError, match=said):
-        make_vector(**{"task": "reach", "run": folder, "num_envs": 1, **QUICK, **change})
+    refuses(InputError, said, make_vector, **{"task": "reach", "run": folder, "num_envs": 1, **QUICK, **change})
 
 
 @pytest.mark.slow
 def test_steps_need_a_reset_and_actions_their_shape(folder):
     environment = make_vector("reach", folder, 2, **QUICK)
-    with pytest.raises(InputError, match="not reset"):
-        environment.step(np.zeros((2, 3), dtype=np.float32))
+    refuses(InputError, "not reset", environment.step, np.zeros((2, 3), dtype=np.float32))
     environment.reset(seed=0)
-    with pytest.raises(InputError, match=r"actions have shape \(3,\)"):
-        environment.step(np.zeros(3, dtype=np.float32))
+    refuses(InputError, r"actions have shape \(3,\)", environment.step, np.zeros(3, dtype=np.float32))
 
 
 @pytest.fixture(scope="module")
@@ -287,3 +286,58 @@ def test_markers_observed_in_their_own_frame_are_shown_on_the_body(robot):
     assert np.abs(observed - plain.markers).max() > 1e-4
     np.testing.assert_allclose(turned.markers, plain.markers, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(kabsch(observed, plain.markers).apply(observed), plain.markers, atol=1e-8)
+
+
+BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
+MESHES = ["mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"]
+RUN = ["experiment=finger", *MESHES, *DRIVEN, "data.steps=30"]
+
+
+@pytest.fixture(scope="module")
+def fingers(tmp_path_factory):
+    register()
+    return run_without_report(tmp_path_factory.mktemp("grasps"), *RUN)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("can_draw")
+def test_gymnasiums_checker_passes(fingers):
+    environment = gym.make(
+        "warp_resphys/Grasp-v0", run=fingers, model="sysid", seconds=0.2, action_time=0.05, render_mode="rgb_array"
+    )
+    check_env(environment.unwrapped)
+    environment.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["simulator", "laboratory"])
+def test_a_firm_grasp_lifts_the_ball_and_a_loose_one_does_not(fingers, world):
+    grippers = make_vector("grasp", fingers, 2, "sysid", world, seconds=1.0)
+    policies = ScriptedGrasp(1.0), ScriptedGrasp(0.05)
+
+    def firm_and_loose(seen):
+        return np.stack([policy(seen)[row] for row, policy in enumerate(policies)])
+
+    errors = errors_mm(grippers, firm_and_loose, 0)
+    firm, loose = errors[-1]
+    assert firm < 8.0  # of 20 mm
+    assert loose > 18.0
+
+
+@pytest.mark.slow
+def test_grippers_are_what_they_are_alone_and_begin_anew(fingers):
+    together, alone = (make_vector("grasp", fingers, n, "resphys", seconds=0.3, noise=0.0) for n in (3, 1))
+    actions = np.array([[[-0.5, -1.0], [0.4, 0.0], [1.0, 1.0]]] * 4, dtype=np.float32)
+    first = together.reset(seed=0)[0]
+    alone.reset(seed=1)
+    for action in actions:
+        seen, own = together.step(action)[0], alone.step(action[1:2])[0]
+    np.testing.assert_allclose(seen[1], own[0], atol=1e-5)
+    assert np.abs(seen - first).max() > 0.1
+    np.testing.assert_array_equal(together.reset(seed=0)[0], first)
+
+
+@pytest.mark.slow
+def test_what_cannot_grasp_is_refused(fingers, folder):
+    refuses(InputError, "contact, which reduced models lack", make_vector, "grasp", fingers, 1, world="reduced")
+    refuses(InputError, "this robot has front, left, right", make_vector, "grasp", folder, 1)

@@ -14,24 +14,9 @@ import pytest
 import trimesh
 from omegaconf import OmegaConf
 
+from support import main_job
 from support.configured import settings
-from support.main_job import (
-    CORRECTED,
-    IN_RUN,
-    LEARNED,
-    MODELS,
-    REPOSITORY,
-    SHORT,
-    STAGES,
-    TINY,
-    errors,
-    files,
-    finish,
-    metrics,
-    ran,
-    run,
-    same_errors,
-)
+from support.main_job import IN_RUN, TINY, errors, files, finish, metrics, ran, run, same_errors
 from warp_resphys import box_hexahedra, pipeline
 from warp_resphys.experiment.build import build_mesh, build_simulator
 from warp_resphys.experiment.checks import check_run
@@ -46,8 +31,8 @@ LEARNED_FILES = (("", "safetensors"), ("training_", "json"))
 
 
 class TestCompleteRun:
-    def test_files_and_metrics(self, finished):
-        names = set(finished[1]) - {f"stages/{name}.json" for name in STAGES}
+    def test_files_metrics_and_a_correction_that_corrects(self, finished):
+        names = set(finished[1]) - {f"stages/{name}.json" for name in main_job.STAGES}
         names = {name for name in names if not name.startswith("figures/")}
         learned = {f"{kind}{model}.{end}" for model in ("resphys", "simfree") for kind, end in LEARNED_FILES}
         data = {"dataset.h5", "reconstruction_resphys.h5", "reconstruction.json", "rollouts.h5", "times.json"}
@@ -60,18 +45,16 @@ class TestCompleteRun:
         assert set(results["errors_mm"]) == {*BASELINES, "simulation", "reconstruction", "resphys", "simfree"}
         assert set(results["errors_vs_reconstruction_mm"]) == set(results["errors_mm"]) - {"reconstruction"}
         assert results["baselines"].keys() == {*BASELINES}
-        assert list(results["seconds"]) == STAGES
+        assert list(results["seconds"]) == main_job.STAGES
         assert 0.1 < results["peak_memory_gib"] < 4.0
         assert results["versions"] == package_versions()
         assert {"python", "warp-resphys", "warp-lang", "torch"} <= set(results["versions"])
         assert [trial["name"] for trial in results["per_trajectory"]] == ["70 g", "150 g"]
-
-    def test_the_correction_corrects(self, finished):
         results = metrics(finished[0])["errors_mm"]
         assert results["simulation"]["mean"] > 0.5
         assert results["resphys"]["mean"] < 0.02 * results["simulation"]["mean"]
         assert results["reconstruction"]["mean"] < 1e-3
-        assert all(results[model]["diverged"] == 0 for model in MODELS)
+        assert all(results[model]["diverged"] == 0 for model in main_job.MODELS)
 
     def test_errors_are_those_of_the_stored_positions(self, finished):
         with read_hdf5(finished[0] / "dataset.h5", "dataset") as file:
@@ -126,19 +109,19 @@ def fingerprints(*overrides):
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("trainer.epochs=30", LEARNED),
-        ("seed=3", LEARNED),
-        ("reconstruction.regularisation=1e-9", CORRECTED),
-        ("simulation.youngs_modulus=220e3", CORRECTED),
-        ("target.youngs_modulus=270e3", STAGES),
-        ("data.weights_g.test=[60]", STAGES),
+        ("trainer.epochs=30", main_job.LEARNED),
+        ("seed=3", main_job.LEARNED),
+        ("reconstruction.regularisation=1e-9", main_job.CORRECTED),
+        ("simulation.youngs_modulus=220e3", main_job.CORRECTED),
+        ("target.youngs_modulus=270e3", main_job.STAGES),
+        ("data.weights_g.test=[60]", main_job.STAGES),
         ("title=Another", ["report"]),
         ("parallel.processes=2", ["report"]),
     ],
 )
 def test_a_stage_depends_on_its_own_settings_and_those_before_it(override, expected):
     before, after = fingerprints(*TINY), fingerprints(*TINY, override)
-    assert [name for name in STAGES if after[name] != before[name]] == expected
+    assert [name for name in main_job.STAGES if after[name] != before[name]] == expected
 
 
 PLANNED = {"plan_resphys", "plan_sysid", "plan_simulation"}
@@ -170,7 +153,7 @@ class TestOtherRuns:
     @pytest.mark.parametrize(
         "options",
         [
-            ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]", *SHORT],
+            ["mesh=beam_tetrahedra", "mesh.divisions=[2,1,1]", *main_job.SHORT],
             ["physics=published", *TINY, "trainer=published", "trainer.learning_rate=1e-2"],
             ["solver=projective_dynamics", *TINY, "data.steps=4"],
             ["reconstruction=lbfgsb", *TINY, "data.steps=4"],
@@ -204,18 +187,18 @@ class TestOtherRuns:
         box = box_hexahedra((0.1, 0.03, 0.03), (4, 2, 2))
         meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
         tolerance = ["+fixed.tolerance=1e-6", "+data.load.tolerance=1e-6"]
-        arguments = [*SHORT, "mesh=file", "mesh.path=box.vtu", "mesh.units=cm", *tolerance]
+        arguments = [*main_job.SHORT, "mesh=file", "mesh.path=box.vtu", "mesh.units=cm", *tolerance]
         finish(*arguments)
         np.testing.assert_allclose(errors()[:2], errors(finished[0])[:2], rtol=0.05)
         before = files()
         box = box_hexahedra((0.1, 0.03, 0.03), (3, 2, 2))
         meshio.write("box.vtu", meshio.Mesh(100.0 * box.vertices, [("hexahedron", box.cells)]))
         finish(*arguments)
-        assert ran(before) == STAGES
+        assert ran(before) == main_job.STAGES
 
 
 def options(group):
-    return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml"))
+    return sorted(path.stem for path in (main_job.REPOSITORY / "conf" / group).glob("*.yaml"))
 
 
 FROM_MARKERS = ("levenberg_marquardt", "pressure_steps")  # reconstructions
@@ -280,7 +263,7 @@ class TestInterruption:
         """The last time by SIGTERM, with which clusters end a process."""
         arguments, (done, cut) = [*TINY, "integrator=bdf2"], interruption
         assert run(*arguments, "hydra.run.dir=whole")[0] == 0
-        whole = {stage: done[stage] for stage in STAGES[:5]}
+        whole = {stage: done[stage] for stage in main_job.STAGES[:5]}
         assert [*whole.values()] == [14, 14, 40, 40, 42]  # frames and their file, epochs, and frames of three models
         done.clear()
         for stage, at in {"simulate": 1, "reconstruct_resphys": 7, "train_resphys": 25, "evaluate": 18}.items():
@@ -319,12 +302,14 @@ class TestInterruption:
     ("overrides", "said"),
     [
         (["solver.max_iterations=1", *TINY], "the newton solver stopped after 1 iterations"),
-        ([*SHORT, "mesh=file", "mesh.path=box.vtu"], "box.vtu: "),
+        ([*main_job.SHORT, "mesh=file", "mesh.path=box.vtu"], "box.vtu: "),
     ],
 )
 def test_what_fails_costs_one_sentence_and_leaves_nothing_half_made(folder, overrides, said):
     code, err = run(*overrides, IN_RUN)
-    (line,) = [line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in STAGES))]
+    (line,) = [
+        line for line in err.splitlines() if not line.startswith(tuple(f"{stage}: " for stage in main_job.STAGES))
+    ]
     assert code == 2
     assert line.startswith("error: ")
     assert said in line

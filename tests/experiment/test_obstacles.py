@@ -44,7 +44,7 @@ def simulator_of(*overrides):
     return build_simulator(run, run.simulation)
 
 
-def test_regions_of_the_body_have_factors_of_friction():
+def test_regions_have_factors_of_friction_and_parameters_a_name_for_each_obstacle():
     run = settings(
         *("mesh.divisions=[10,3,3]", f"obstacles={FLOOR}", "+regions={foot: {x: [0.09, 0.1]}}"),
         "contact={friction: 0.2, friction_factors: {foot: 3.0}}",
@@ -56,6 +56,12 @@ def test_regions_of_the_body_have_factors_of_friction():
     assert points.factors == pytest.approx(np.where(x > 0.095, 3.0, np.where(x > 0.085, 2.0, 1.0))[vertices])
     with pytest.raises(InputError, match="no region 'hand'"):
         build_simulator(run.changed(contact=run.contact.changed(friction_factors={"hand": 1.0})), run.simulation)
+    simulator = simulator_of(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
+    assert {"contact_friction", "contact_friction_floor", "obstacle_x_ball", "obstacle_turn_y_floor"} <= {
+        *identifiable_parameters(simulator)
+    }
+    constants = constants_of(simulator, {"contact_friction_ball": torch.tensor([0.7, 0.8], dtype=torch.float64)})
+    assert constants["contact_friction"].tolist() == [[0.1, 0.7], [0.1, 0.8]]
 
 
 def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
@@ -67,15 +73,6 @@ def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
     truth = true_contact(settings("experiment=beam_obstacle"))
     assert truth["contact_friction"] == 0.5
     assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
-
-
-def test_parameters_have_a_name_for_each_obstacle():
-    simulator = simulator_of(BEAM, f"obstacles={TWO}", "contact={friction: {floor: 0.1, ball: 0.2}}")
-    assert {"contact_friction", "contact_friction_floor", "obstacle_x_ball", "obstacle_turn_y_floor"} <= {
-        *identifiable_parameters(simulator)
-    }
-    constants = constants_of(simulator, {"contact_friction_ball": torch.tensor([0.7, 0.8], dtype=torch.float64)})
-    assert constants["contact_friction"].tolist() == [[0.1, 0.7], [0.1, 0.8]]
 
 
 def robot_of(run, parameters):
@@ -119,15 +116,13 @@ def test_the_live_view_shows_obstacles_where_its_parameters_put_them(robot):
 
 
 class TestSurfaces:
-    def test_contact_is_an_energy_of_the_body_whose_parameters_can_be_identified(self):
+    def test_contact_and_friction_of_pairs_of_regions_are_configured_and_identified(self):
         assert build_body(settings(*ABOVE)).energies == (SurfaceContact(2e4, 0.3, 5e-4, 1e-3),)
         assert build_body(settings(BEAM)).energies == ()
         simulator = simulator_of(*ABOVE)
         assert {"surface_friction", "surface_stiffness"} <= {*identifiable_parameters(simulator)}
         given = {"surface_friction": torch.tensor([0.1, 0.7], dtype=torch.float64)}
         assert constants_of(simulator, given)["surface_friction"].tolist() == [[0.1], [0.7]]
-
-    def test_friction_of_pairs_of_regions_is_configured_and_identified(self):
         pairs = "self_contact.pairs={pad: {first: lower, second: body, friction: 0.8}}"
         simulator = simulator_of(*ABOVE, pairs)
         (contact,) = simulator.body.energies
@@ -138,7 +133,7 @@ class TestSurfaces:
         with pytest.raises(InputError, match=r"the pair 'pad' of a contact between surfaces: .*shell"):
             build_body(settings(*ABOVE, pairs.replace("body", "shell")))
 
-    def test_a_beam_lies_on_another_one(self):
+    def test_a_beam_lies_on_another_one_which_a_twin_refuses(self):
         """The upper beam bends more than the thicker one below: in equilibrium its end lies on it."""
         upper, gaps = torch.arange(20 + 20) < 20, []
         for given in (ABOVE, ABOVE[:2]):
@@ -147,8 +142,6 @@ class TestSurfaces:
             gaps.append(float(q[upper & end, 2].min() - q[~upper & end, 2].max()))
         touching, free = gaps
         assert free < -1e-3 < 0.0 < touching < 1e-3
-
-    def test_a_twin_refuses_it(self):
         with pytest.raises(InputError, match="contact between surfaces"):
             Twin(robot_of(settings(BEAM, "self_contact={friction: 0.3}", "integrator=bdf2"), {}))
 
@@ -180,7 +173,7 @@ class TestMotions:
         assert np.ptp(expected, axis=0).max() > 0.02
         np.testing.assert_array_equal(moved.at(3).points, moved.points[3])
 
-    def test_a_marker_shows_a_translation_and_a_rigid_body_a_turn(self):
+    def test_a_marker_shows_a_translation_and_a_rigid_body_a_turn_or_they_are_refused(self):
         poses = prescribed(swing(start=0.1, ramp=0.1), np.arange(100) / 100.0)
         places = np.array([0.3, 0.1, -0.2]) + ARM * np.eye(4, 3, -1)
         whole = obstacle_motion(shown(poses, places, labels=("ball", "ball +x", "ball +y", "ball +z")), "ball", 0.05)
@@ -188,8 +181,6 @@ class TestMotions:
         alone = obstacle_motion(shown(poses, places[:1]), "ball", 0.05)
         np.testing.assert_allclose(alone[:, :3] + places[0], shown(poses, places[:1]).positions[:, 0], atol=2e-6)
         assert not alone[:, 3:].any()
-
-    def test_a_marker_that_does_not_show_its_obstacle_is_refused(self):
         recording = shown(np.zeros((50, 6)), np.zeros((1, 3)))
         with pytest.raises(DataFileError, match="no marker or rigid body 'bar', which shows the motion of this"):
             obstacle_motion(recording, "bar", 0.05)

@@ -52,7 +52,7 @@ def test_a_region_of_another_mesh_has_its_own_material_and_may_be_rigid():
     assert np.abs(moved[tip]).max() > 1e-3
 
 
-def test_tendons_run_straight_between_their_guides():
+def test_tendons_run_straight_between_their_guides_and_muscles_are_in_the_cells_of_their_boxes():
     routes = {
         "left": {"guides": [[0, 0, 0], [0.3, 0, 0], [0.3, 0.4, 0]], "pieces": 5},
         "right": {"guides": [[0, 0, 1], [0, 1, 1]]},
@@ -63,9 +63,6 @@ def test_tendons_run_straight_between_their_guides():
     assert (len(left), len(right)) == (11, 2)
     np.testing.assert_allclose(np.linalg.norm(np.diff(left, axis=0), axis=1), [0.06] * 5 + [0.08] * 5)
     np.testing.assert_allclose(left[[0, 5, 10]], routes["left"]["guides"])
-
-
-def test_muscles_are_in_the_cells_whose_centres_are_in_their_boxes():
     bundles = {"root": {"direction": [1, 0, 0], "within": {"x": [0.0, 0.02]}}, "all": {"direction": [0, 1, 0]}}
     settings = parse(MuscleSettings, {"bundles": bundles, "commanded": "stress", "stiffness": 0.0})
     root, everywhere = build_muscles(settings, box_hexahedra((0.04, 0.01, 0.01), (4, 1, 1))).muscles

@@ -194,17 +194,14 @@ def rested(recording, frames=150):
     return dataclasses.replace(recording, positions=positions, actuation=pressures)
 
 
-def test_whole_recordings_are_read_without_a_number_of_steps(recordings, caplog):
+def test_recordings_are_read_whole_without_a_number_of_steps_or_from_where_something_happens(recordings, caplog):
     recordings.write(rested, "t000")
     whole = recordings.imported("data.steps=null")
     seen = np.isfinite(whole.observed).all(axis=(2, 3))
     assert seen.sum(axis=1).tolist() == [163, 13, 13, 13]
     np.testing.assert_array_equal(whole.inputs["pressure"][0, :149], 0.0)
     assert "shorter" not in caplog.text
-
-
-def test_recordings_are_read_from_where_something_happens(recordings):
-    """More frames at rest at their start change nothing; without the lead, nothing happens in the first steps."""
+    # More frames at rest at their start change nothing; without the lead, nothing happens in the first steps.
     expected = recordings.imported("data.lead=0.02")
     recordings.write(rested, "t000", "t003")
     read = recordings.imported("data.lead=0.02")

@@ -3,6 +3,7 @@
 import pytest
 
 from support.configured import check, composed, settings
+from support.refusals import refuses
 from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.splits import folds_of, split_of, trials_of
 from warp_resphys.io.errors import InputError, ResphysError
@@ -65,8 +66,7 @@ PLAYED = [
     ("base", "key", "value", "said"), [(REAL, *case) for case in RECORDED] + [(REAL[:1], *case) for case in PLAYED]
 )
 def test_a_configuration_is_checked(base, key, value, said):
-    with pytest.raises(ResphysError, match=said):
-        check(changed(composed(*base), key, value))
+    refuses(ResphysError, said, check, changed(composed(*base), key, value))
 
 
 def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
@@ -110,11 +110,9 @@ def test_folds_and_splits(tmp_path):
     config["data"] |= {"train": "others", "test": ["bare"]}
     assert split_of(parse(RunSettings, config)) == Split(train=["load52", "load101"], validation=[], test=["bare"])
     config["data"]["validation"] = "others"
-    with pytest.raises(InputError, match=r"data\.train is others, .* give these as lists"):
-        check(config)
+    refuses(InputError, r"data\.train is others, .* give these as lists", check, config)
     config["data"] |= {"train": [], "validation": []}
-    with pytest.raises(InputError, match=r"data\.train is empty: .* or set data\.folds to leave_one_out"):
-        check(config)
+    refuses(InputError, r"data\.train is empty: .* or set data\.folds to leave_one_out", check, config)
 
 
 def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():
@@ -125,14 +123,11 @@ def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():
         split_of(settings("experiment=fish_tail", "data.folder=recordings", "data.train_fraction=1"))
 
 
-def test_a_budget_takes_fewer_folds():
+def test_the_quick_budget_takes_fewer_folds_and_wins_but_over_the_command_line():
     folds = folds_of(settings(*REAL, "budget=quick"))
     assert {name: fold.train for name, fold in folds.items()} == {"bare": ("load52", "load101")}
     folds = folds_of(settings(*REAL, "budget=quick", "data.limit.test=2", "data.limit.train=1"))
     assert {name: fold.train for name, fold in folds.items()} == {"bare": ("load52",), "load101": ("bare",)}
-
-
-def test_the_quick_budget_wins_over_the_experiment_and_the_command_line_over_both():
     repeated = ("experiment=beam_real_repeated", "data.folder=recordings")
     run = settings(*repeated, "budget=quick")
     check_run(run)
@@ -164,8 +159,7 @@ def test_a_material_may_leave_out_its_model_and_its_parameters_and_is_believed_o
         ({"youngs_modulus": 264.0}, "its own weight would strain it by .* or that of youngs_modulus not Pa"),
         ({"model": "mooney_rivlin", "c10": 36.0, "c01": 8.0}, "with E = 0.264 kPa its own weight .* of c10 not Pa"),
     ):
-        with pytest.raises(InputError, match=said):
-            check(config | {"simulation": soft})
+        refuses(InputError, said, check, config | {"simulation": soft})
 
 
 def test_an_experiment_may_choose_its_network(tmp_path):

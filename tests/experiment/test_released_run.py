@@ -69,7 +69,7 @@ def finished(tmp_path_factory):
 
 
 class TestCompleteRun:
-    def test_files(self, finished):
+    def test_files_are_complete_and_films_have_whole_steps(self, finished):
         names = {path.name for path in finished.iterdir()}
         trained = {name for model in TRAINED for name in (f"{model}.safetensors", f"training_{model}.json")}
         assert names >= {"truth.json", "quality.json", "registration.json", "reconstruction_resphys.h5", *trained}
@@ -78,6 +78,14 @@ class TestCompleteRun:
         for model, kind, name in (("simfree", NextState, "next state"), ("resphys", ResidualForce, "residual force")):
             restored = restore(kind, *read_checkpoint(finished / f"{model}.safetensors", name))
             assert (restored.actuation is None) == (model != "simfree")  # in_the_loop.sees_payload is false
+        with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
+            assert list(file.attrs["names"]) == ["m50"]
+            films = {file[f"{model}_film"].shape for model in MODELS}
+            assert (str(file.attrs["film_trial"]), file.attrs["time_step"]) == ("m50", 0.01)
+            np.testing.assert_array_equal(file["film_steps"], np.arange(len(file["film_steps"])))
+            fall = file["sysid_film"][2, -1, 2] - file["sysid_film"][0, -1, 2]
+        assert fall == pytest.approx(-0.5 * 9.80709 * 0.02**2, rel=0.15)  # freely at first; by half steps
+        assert films == {(12, 20, 3)}  # the whole steps of 0.01 s up to the last frame, which comes before 0.12 s
 
     def test_identification(self, finished):
         results = read_json(finished / "identification.json")
@@ -103,17 +111,7 @@ class TestCompleteRun:
         for model, markers in results["per_marker"].items():
             assert np.mean(list(markers.values())) == pytest.approx(errors[model])
 
-    def test_films_have_whole_steps(self, finished):
-        with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
-            assert list(file.attrs["names"]) == ["m50"]
-            films = {file[f"{model}_film"].shape for model in MODELS}
-            assert (str(file.attrs["film_trial"]), file.attrs["time_step"]) == ("m50", 0.01)
-            np.testing.assert_array_equal(file["film_steps"], np.arange(len(file["film_steps"])))
-            fall = file["sysid_film"][2, -1, 2] - file["sysid_film"][0, -1, 2]
-        assert fall == pytest.approx(-0.5 * 9.80709 * 0.02**2, rel=0.15)  # freely at first; by half steps
-        assert films == {(12, 20, 3)}  # the whole steps of 0.01 s up to the last frame, which comes before 0.12 s
-
-    def test_training_begins_without_a_force_and_descends(self, finished):
+    def test_training_begins_without_a_force_and_the_reconstruction_says_how_close_it_came(self, finished):
         training = read_json(finished / "training_resphys.json")
         first, *others = training["epochs"]
         assert [record["epoch"] for record in training["epochs"]] == [0, 1, 2]
@@ -123,8 +121,6 @@ class TestCompleteRun:
         assert training["kept"]["validation_rollout_error_mm"] <= first["rollout_error_mm"]
         sysid = read_json(finished / "identification.json")["sysid"]["loss"]
         assert first["train_loss"] == pytest.approx(sysid, rel=1e-3)
-
-    def test_the_reconstruction_says_how_close_it_came(self, finished):
         results = read_json(finished / "reconstruction.json")
         assert results == read_json(finished / "metrics.json")["reconstruction"]
         assert set(results) == {"resphys"}

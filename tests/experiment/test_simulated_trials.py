@@ -34,7 +34,7 @@ OWN = (
 COARSE = ("mesh={kind:box_hexahedra,size:[0.1,0.03,0.03],divisions:[4,2,2]}", "data.steps=3")
 
 
-def test_keys_that_are_left_out_are_those_of_the_simulator():
+def test_keys_that_are_left_out_are_those_of_the_simulator_and_a_law_is_a_model_as_any_other():
     run = settings("experiment=beam_oscillation", "integrator=bdf2", "time_step=0.02")
     target = run.target
     parameters = target.material.values  # directly in the group, as beam_oscillation has them
@@ -47,9 +47,6 @@ def test_keys_that_are_left_out_are_those_of_the_simulator():
     fibres = settings("experiment=sopra_fibres", "~laboratory.fibres")
     assert fibres.laboratory.fibres == fibres.fibres != None  # noqa: E711
     assert settings("experiment=sopra_fibres", "laboratory.fibres=null").laboratory.fibres is None
-
-
-def test_a_law_of_the_material_is_a_model_as_any_other():
     out = ["~law", *(f"~simulation.{name}" for name in ("youngs_modulus", "poissons_ratio", "stiffness_damping"))]
     law = "simulation={model:law,c10:40e3,bulk_1:2e6,ogden_m3:5e3,shear_viscosity:20.0}"
     run = settings(*COARSE, *out, law)

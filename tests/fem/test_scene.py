@@ -1,16 +1,21 @@
-"""Several bodies in one simulator."""
+"""Several bodies in one simulator, and bodies in another place, which move as the first ones do there."""
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from support.chambered import hollow_box
 from support.clamped import clamped
-from warp_resphys import Body, Corotated, Inputs, Mesh, Rigid, Scene, Simulator, StableNeoHookean, box_hexahedra
-from warp_resphys.energies import Strings
+from warp_resphys import Body, Fibres, Inputs, Mesh, Muscles, Pressure, Rigid, Scene, Simulator, SymmetryPlane, Tendons
+from warp_resphys.energies import Muscle, Strings
+from warp_resphys.energies.materials import Corotated, StableNeoHookean
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.mesh.boxes import box_tetrahedra
+from warp_resphys.mesh import find_chambers
+from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.mesh.volume_mesh import join
+from warp_resphys.settings.body import Route
 
 SOFT = Corotated(2e5, 0.45)
 
@@ -39,7 +44,7 @@ def test_bodies_of_a_scene_move_as_each_alone():
             torch.testing.assert_close(motion.final.memory[f"{name}_{key}"], value, rtol=0.0, atol=1e-9)
 
 
-def test_forces_and_clamps_go_to_the_body_that_is_named():
+def test_forces_clamps_materials_and_regions_go_to_the_body_that_is_named():
     two = Body(box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1)), fixed=[0, 1])
     scene = Scene({"a": two, "b": finger()})
     force = torch.ones(1, two.n_vertices, 3, dtype=torch.float64)
@@ -51,6 +56,20 @@ def test_forces_and_clamps_go_to_the_body_that_is_named():
         scene.inputs({"a": Inputs(fixed_positions=clamp)})
     with pytest.raises(InputError, match="Unknown body 'c'"):
         scene.inputs({"c": Inputs()})
+    scene = Scene({"a": finger(), "b": finger()})
+    assert scene.mesh.region("b").tolist() == [4, 5, 6, 7]
+    simulator = Simulator(scene, {"a": SOFT, "b": StableNeoHookean()})
+    assert list(simulator.materials) == ["a", "b"]
+    with pytest.raises(InputError, match="'b' has no material"):
+        Simulator(scene, {"a": SOFT})
+    with pytest.raises(MeshError, match="cannot be joined"):
+        Scene({"a": finger(), "ball": ball()}).mesh  # noqa: B018
+    with pytest.raises(InputError, match="one or more bodies"):
+        Scene({})
+    mesh = box_hexahedra()
+    named = Mesh(mesh.vertices, mesh.cells, {"b": np.arange(1)})
+    with pytest.raises(MeshError, match="two regions have the name 'a_b'"):
+        join({"a_b": mesh, "a": named})
 
 
 def test_a_body_may_be_driven_as_a_whole_but_not_all_of_them():
@@ -69,21 +88,47 @@ def test_a_body_may_be_driven_as_a_whole_but_not_all_of_them():
         Simulator(Scene({"tool": driven, "other": driven}), SOFT)
 
 
-def test_materials_and_the_joined_mesh_of_a_scene():
-    scene = Scene({"a": finger(), "b": finger()})
-    assert scene.mesh.region("b").tolist() == [4, 5, 6, 7]
-    simulator = Simulator(scene, {"a": SOFT, "b": StableNeoHookean()})
-    assert list(simulator.materials) == ["a", "b"]
-    with pytest.raises(InputError, match="'b' has no material"):
-        Simulator(scene, {"a": SOFT})
-    with pytest.raises(MeshError, match="cannot be joined"):
-        Scene({"a": finger(), "ball": ball()}).mesh  # noqa: B018
-    with pytest.raises(InputError, match="one or more bodies"):
-        Scene({})
+ROTATION = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
+SHIFT = np.array([0.1, -0.2, 0.05])  # m
+BOX = box_hexahedra((0.1, 0.02, 0.02), (5, 1, 1))
+HOLLOW = hollow_box("hexahedron")
+CHAMBER = [max(find_chambers(HOLLOW), key=lambda own: len(own.faces))]  # longer than it is wide
+ROUTE = [[0.0, 0.015, 0.01], [0.05, 0.015, 0.012], [0.1, 0.015, 0.01]]
+BODIES = {
+    "tendon": (
+        clamped(BOX, energies=[Tendons([Route(guides=ROUTE, offsets=[[0.0, 0.0, 1.0]])])]),
+        {"tendon_tension": 0.4},
+        {"tendon_offset_1": 2e-3},
+    ),
+    "muscle": (clamped(BOX, energies=[Muscles([Muscle([2, 3], (1.0, 0.5, 0.0))])]), {"muscle_stress": 2e4}, {}),
+    "chamber": (
+        clamped(HOLLOW, energies=[Pressure(CHAMBER), Fibres(CHAMBER, [20.0], axis=(1.0, 0.2, 0.1), stiffness=1e3)]),
+        {"pressure": 3e4},
+        {},
+    ),
+}
 
 
-def test_regions_of_one_name_are_refused():
-    mesh = box_hexahedra()
-    named = Mesh(mesh.vertices, mesh.cells, {"b": np.arange(1)})
-    with pytest.raises(MeshError, match="two regions have the name 'a_b'"):
-        join({"a_b": mesh, "a": named})
+@pytest.mark.parametrize("name", BODIES)
+def test_the_motion_moves_with_the_body(name):
+    body, given, parameters = BODIES[name]
+    gravity = np.array([0.0, 3.0, -9.0])
+    material, ends = Corotated(2e5, 0.4), []
+    for own, pull in ((body, gravity), (body.moved(ROTATION, SHIFT), ROTATION @ gravity)):
+        simulator = Simulator(own, material, 0.01, tuple(pull), relative_tolerance=1e-11)
+        ends.append(simulator.rollout(simulator.rest_state(), 5, Inputs(**given), parameters).q[-1, 0].numpy())
+    without = Simulator(body, material, 0.01, tuple(gravity))
+    free = without.rollout(without.rest_state(), 5).q[-1, 0].numpy()
+    assert np.abs(ends[0] - free).max() > 1e-4  # The actuator does something.
+    np.testing.assert_allclose(ends[1], ends[0] @ ROTATION.T + SHIFT, rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("rotation", [np.diag([1.0, 1.0, -1.0]), [0.0, 0.0, 1.0]])
+def test_a_matrix_that_is_no_rotation_is_refused(rotation):
+    with pytest.raises(InputError, match="the rotation is"):
+        BODIES["tendon"][0].moved(rotation, SHIFT)
+
+
+def test_a_symmetric_body_stays():
+    with pytest.raises(InputError, match="symmetry plane"):
+        clamped(BOX, symmetry=[SymmetryPlane((0.0, 1.0, 0.0))]).moved(ROTATION, SHIFT)

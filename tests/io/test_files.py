@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.refusals import refuses
 from warp_resphys.io import atomic, safe_files
 from warp_resphys.io.errors import DataFileError
 
@@ -79,8 +80,7 @@ class TestAtomicFiles:
         }
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, limits[1]))  # Python ignores the signal.
         try:
-            with pytest.raises(DataFileError, match=f"disk is full while writing {path}"):
-                work[name]()
+            refuses(DataFileError, f"disk is full while writing {path}", work[name])
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert os.listdir(tmp_path) == []
@@ -95,8 +95,7 @@ class TestJson:
         assert parsed == {"x": 1.5, "n": [[1, 2]], "p": "b", "bad": [None, None], "3": True}
 
     def test_objects_are_refused(self, tmp_path):
-        with pytest.raises(TypeError, match="object cannot be written"):
-            safe_files.write_json(tmp_path / "a.json", {"a": object()})
+        refuses(TypeError, "object cannot be written", safe_files.write_json, tmp_path / "a.json", {"a": object()})
         assert os.listdir(tmp_path) == []
 
     @pytest.mark.parametrize(
@@ -106,8 +105,7 @@ class TestJson:
         path = tmp_path / "a.json"
         if content is not None:
             path.write_bytes(content)
-        with pytest.raises(DataFileError, match=f"{path}.*{message}"):
-            safe_files.read_json(path)
+        refuses(DataFileError, f"{path}.*{message}", safe_files.read_json, path)
 
 
 class TestHdf5:
@@ -121,14 +119,12 @@ class TestHdf5:
             assert np.array_equal(safe_files.read_array(file, "positions", index=(slice(3, 5), 2)), POSITIONS[3:5, 2])
         assert np.array_equal(read_positions(trajectory), POSITIONS)
 
-    def test_cut_anywhere_it_is_refused(self, trajectory):
+    def test_cut_anywhere_it_is_refused_and_a_flipped_bit_never_gives_other_numbers(self, trajectory):
         content = trajectory.read_bytes()
         for length in [*range(0, 2048, 97), len(content) // 2, len(content) - 1]:
             trajectory.write_bytes(content[:length])
             with pytest.raises(DataFileError, match=r"trajectory\.h5 (is truncated|is not an HDF5 file|is damaged)"):
                 read_positions(trajectory)
-
-    def test_a_flipped_bit_never_gives_other_numbers(self, trajectory):
         content = trajectory.read_bytes()
         refused = 0
         for place in range(0, len(content), 211):
@@ -149,8 +145,7 @@ class TestHdf5:
         assert safe_files.is_final(path, "forces", "f")
         assert not safe_files.is_final(path, "forces", "g")
         path.write_bytes(path.read_bytes()[:-9])
-        with pytest.raises(DataFileError, match=r"forces\.h5 is truncated"):
-            safe_files.is_final(path, "forces", "f")
+        refuses(DataFileError, r"forces\.h5 is truncated", safe_files.is_final, path, "forces", "f")
 
     @pytest.mark.parametrize(
         ("attributes", "message"),
@@ -168,7 +163,7 @@ class TestHdf5:
         with pytest.raises(DataFileError, match=message), safe_files.read_hdf5(path, "trajectories"):
             pass
 
-    def test_no_hdf5_at_all(self, tmp_path):
+    def test_no_hdf5_at_all_and_missing_and_misshapen_datasets(self, tmp_path, trajectory):
         np.savez(tmp_path / "a.npz", x=POSITIONS)
         (tmp_path / "empty.h5").touch()
         for name, message in [
@@ -179,12 +174,9 @@ class TestHdf5:
         ]:
             with pytest.raises(DataFileError, match=message), safe_files.read_hdf5(tmp_path / name, "trajectories"):
                 pass
-
-    def test_missing_and_misshapen_datasets(self, trajectory):
         with safe_files.read_hdf5(trajectory, "trajectories") as file:
             for name in ("velocities", "weights"):
-                with pytest.raises(DataFileError, match=f"no dataset '{name}'"):
-                    safe_files.read_array(file, name)
+                refuses(DataFileError, f"no dataset '{name}'", safe_files.read_array, file, name)
             for shape in [(None, 4), (None, 5, 3)]:
                 with pytest.raises(DataFileError, match=r"shape \(130, 4, 3\) where any x"):
                     safe_files.read_array(file, "positions", shape=shape)
@@ -245,20 +237,17 @@ class TestCheckpoints:
     def test_unusable(self, tmp_path):
         path = tmp_path / "a.safetensors"
         safe_files.write_checkpoint(path, "network", self.tensors, {"fingerprint": "f"})
-        with pytest.raises(DataFileError, match="'network'"):
-            safe_files.read_checkpoint(path, "other")
+        refuses(DataFileError, "'network'", safe_files.read_checkpoint, path, "other")
         content = path.read_bytes()
         for length in (0, 5, 40, len(content) - 1):
             path.write_bytes(content[:length])
             with pytest.raises(DataFileError, match=r"not a complete safetensors file|is damaged"):
                 safe_files.read_checkpoint(path, "network")
-        with pytest.raises(DataFileError, match="does not exist"):
-            safe_files.read_checkpoint(tmp_path / "none", "network")
+        refuses(DataFileError, "does not exist", safe_files.read_checkpoint, tmp_path / "none", "network")
         from safetensors.torch import save_file
 
         save_file({"x": torch.zeros(2)}, path)
-        with pytest.raises(DataFileError, match="was not written by warp_resphys"):
-            safe_files.read_checkpoint(path, "network")
+        refuses(DataFileError, "was not written by warp_resphys", safe_files.read_checkpoint, path, "network")
 
     def test_those_of_other_settings_or_cut_short_are_not_used(self, tmp_path, caplog):
         path = tmp_path / "a.safetensors"

@@ -3,6 +3,7 @@ from typing import Annotated, Literal, Self
 import pytest
 from pydantic import Field, model_validator
 
+from support.refusals import refuses
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import (
@@ -86,8 +87,7 @@ def test_what_is_wrong_is_said_with_its_unit_and_what_to_do(values, sentence):
 
 
 def test_a_group_that_lies_in_another_is_named():
-    with pytest.raises(InputError, match=r"^bodies\.ball\.share is 2"):
-        parse(World, {**BALL, "share": 2}, "bodies.ball")
+    refuses(InputError, r"^bodies\.ball\.share is 2", parse, World, {**BALL, "share": 2}, "bodies.ball")
 
 
 def test_a_whole_number_stands_for_a_number_and_a_list_becomes_a_tuple():
@@ -117,8 +117,7 @@ class TestContent:
         assert Part.of(parse(World, BALL)) == Part(count=3, share=1.0)
 
     def test_changes_are_checked(self):
-        with pytest.raises(InputError, match="count"):
-            parse(World, BALL).changed(count=-1)
+        refuses(InputError, "count", parse(World, BALL).changed, count=-1)
 
     def test_all_keys_are_listed(self):
         assert {"shape.radius", "shape.size", "spans.NAME.high", "share"} <= {*keys(World.model_json_schema())}

@@ -8,18 +8,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from support.refusals import refuses
+from warp_resphys.io import resuming
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.machine import peak_memory_gib
 from warp_resphys.io.progress import Progress, one_line
-from warp_resphys.io.resuming import (
-    Stage,
-    StageContext,
-    StageInterrupted,
-    fingerprint,
-    resources_used,
-    run_lock,
-    run_stages,
-)
 from warp_resphys.io.safe_files import write_json
 
 REPOSITORY = Path(__file__).parents[2]
@@ -32,22 +25,23 @@ class Experiment:
         self.run_dir = run_dir
         self.ran: list[str] = []
         self.settings: dict[str, dict[str, Any]] = {"generate": {"seed": 0}, "train": {"epochs": 5}, "report": {}}
-        self.behaviour: dict[str, Callable[[StageContext], None]] = {}
+        self.behaviour: dict[str, Callable[[resuming.StageContext], None]] = {}
 
-    def work(self, context: StageContext) -> None:
+    def work(self, context: resuming.StageContext) -> None:
         self.ran.append(context.name)
         self.behaviour.get(context.name, lambda context: None)(context)
         write_json(context.run_dir / f"{context.name}.json", context.settings)
 
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[resuming.Stage]:
         upstream = {"generate": (), "train": ("generate",), "report": ("generate", "train")}
         return [
-            Stage(name, self.work, (f"{name}.json",), self.settings[name], upstream[name]) for name in self.settings
+            resuming.Stage(name, self.work, (f"{name}.json",), self.settings[name], upstream[name])
+            for name in self.settings
         ]
 
     def run(self) -> list[str]:
         self.ran.clear()
-        self.seconds = run_stages(self.stages(), self.run_dir)
+        self.seconds = resuming.run_stages(self.stages(), self.run_dir)
         return list(self.ran)
 
 
@@ -66,13 +60,13 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 class TestResources:
     def test_the_peak_is_the_largest_of_all_stages(self, experiment):
         experiment.run()
-        used = resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
+        used = resuming.resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
         assert used["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
         assert used["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
         path = experiment.run_dir / "stages" / "generate.json"
         write_json(path, json.loads(path.read_text()) | {"peak_memory_gib": 3.0})
-        assert resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
-        assert resources_used(experiment.run_dir, ["none"])["peak_memory_gib"] is None
+        assert resuming.resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
+        assert resuming.resources_used(experiment.run_dir, ["none"])["peak_memory_gib"] is None
         assert experiment.run() == []
 
 
@@ -123,7 +117,7 @@ class TestSkipping:
     def test_outputs_of_two_settings_are_never_mixed(self, experiment):
         """Old outputs stay valid until new ones replace them; half replaced, they are valid for neither."""
 
-        def two_outputs(context: StageContext) -> None:
+        def two_outputs(context: resuming.StageContext) -> None:
             write_json(context.run_dir / "a.json", context.settings)
             if stop:
                 raise KeyboardInterrupt
@@ -132,13 +126,13 @@ class TestSkipping:
 
         def run(x: int) -> list[str]:
             experiment.ran.clear()
-            run_stages([Stage("s", two_outputs, ("a.json", "b.json"), {"x": x})], experiment.run_dir)
+            resuming.run_stages([resuming.Stage("s", two_outputs, ("a.json", "b.json"), {"x": x})], experiment.run_dir)
             return experiment.ran
 
         stop = False
         assert run(1) == ["1"]
         stop = True
-        with pytest.raises(StageInterrupted):
+        with pytest.raises(resuming.StageInterrupted):
             run(2)
         stop = False
         assert run(1) == ["1"]
@@ -147,7 +141,9 @@ class TestSkipping:
     def test_the_fingerprint_does_not_depend_on_the_order_of_keys(self):
         def of(upstream: str = "u", **changes: Any) -> str:
             fields = {"name": "s", "function": print, "outputs": (), "settings": {"a": 1, "b": {"c": 2.0}}}
-            return fingerprint(Stage(**{**fields, "upstream": ("before",), **changes}), {"before": upstream})
+            return resuming.fingerprint(
+                resuming.Stage(**{**fields, "upstream": ("before",), **changes}), {"before": upstream}
+            )
 
         assert of() == of(settings={"b": {"c": 2.0}, "a": 1})
         others = [of("v"), of(name="t"), of(settings={"a": 1, "b": {"c": 3.0}})]
@@ -156,17 +152,16 @@ class TestSkipping:
 
 class TestInterruption:
     def test_the_message_names_finished_stages_and_seconds_add_up(self, experiment, clock):
-        def interrupt_after_a_while(context: StageContext) -> None:
+        def interrupt_after_a_while(context: resuming.StageContext) -> None:
             clock[0] += 30.0
             raise KeyboardInterrupt
 
-        def finish(context: StageContext) -> None:
+        def finish(context: resuming.StageContext) -> None:
             clock[0] += 5.0
 
         experiment.behaviour["train"] = interrupt_after_a_while
         for _ in range(2):
-            with pytest.raises(StageInterrupted, match=r"in stage 'train' \(finished and kept: generate; "):
-                experiment.run()
+            refuses(resuming.StageInterrupted, r"in stage 'train' \(finished and kept: generate; ", experiment.run)
         experiment.behaviour["train"] = finish
         assert experiment.run() == ["train", "report"]
         assert experiment.seconds == {"generate": 0.0, "train": 65.0, "report": 0.0}
@@ -175,7 +170,7 @@ class TestInterruption:
 
         experiment.settings["train"] = {"epochs": 6}
         experiment.behaviour["train"] = interrupt_after_a_while
-        with pytest.raises(StageInterrupted):
+        with pytest.raises(resuming.StageInterrupted):
             experiment.run()
         experiment.settings["train"] = {"epochs": 7}
         experiment.behaviour["train"] = finish
@@ -183,26 +178,29 @@ class TestInterruption:
         assert experiment.seconds["train"] == 5.0
 
     def test_errors_pass_through_and_the_stage_runs_again(self, experiment):
-        def fail(context: StageContext) -> None:
+        def fail(context: resuming.StageContext) -> None:
             raise InputError("no")
 
         experiment.behaviour["train"] = fail
-        with pytest.raises(InputError, match="no"):
-            experiment.run()
+        refuses(InputError, "no", experiment.run)
         experiment.behaviour.clear()
         assert experiment.run() == ["train", "report"]
 
 
 class TestLock:
-    def test_one_process_at_a_time(self, experiment):
-        with run_lock(experiment.run_dir), pytest.raises(InputError, match="another process is writing the run folder"):
+    def test_one_process_at_a_time_in_a_folder_that_can_be_made(self, experiment, tmp_path):
+        with (
+            resuming.run_lock(experiment.run_dir),
+            pytest.raises(InputError, match="another process is writing the run folder"),
+        ):
             experiment.run()
         assert experiment.ran == []
         assert experiment.run() == ["generate", "train", "report"]
-
-    def test_a_folder_that_cannot_be_made(self, tmp_path):
         (tmp_path / "file").touch()
-        with pytest.raises(DataFileError, match="cannot write the run folder"), run_lock(tmp_path / "file" / "run"):
+        with (
+            pytest.raises(DataFileError, match="cannot write the run folder"),
+            resuming.run_lock(tmp_path / "file" / "run"),
+        ):
             pass
 
 

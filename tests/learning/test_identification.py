@@ -1,4 +1,4 @@
-"""Identification: parameters come back from sparse, noisy markers, with the deviation that was predicted."""
+"""Identification from sparse, noisy markers, and its uncertainty against least squares and correlated errors."""
 
 from dataclasses import replace
 
@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from support.refusals import refuses
 from support.slopes import differences
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
 from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.search import first_points, search_parameters
+from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, redundancy, uncertainty_of
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.settings.learning import Bounds, Prior
@@ -83,8 +85,7 @@ def test_a_start_where_the_simulation_fails_is_passed_over():
     assert result.at_bounds == ()
     assert result.history[0] == []
     assert len(result.history[1]) < 25
-    with pytest.raises(ConvergenceError, match=r"every start.*: too soft"):
-        search_parameters(misfit, [soft], 20)
+    refuses(ConvergenceError, r"every start.*: too soft", search_parameters, misfit, [soft], 20)
 
 
 def test_starts_are_the_first_guess_and_the_best_candidates():
@@ -99,8 +100,7 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
 
 def test_no_parameters_and_a_motion_that_stands_still_are_refused():
     replay, release = replay_of(simulator(gravity=(0.0, 0.0, 0.0)), TRUTH, frames=3)
-    with pytest.raises(InputError, match="nothing to identify"):
-        Misfit([(replay, release)], {})
+    refuses(InputError, "nothing to identify", Misfit, [(replay, release)], {})
     still = replay.trials.held[:, None].repeat(1, 3, 1, 1)
     motions = replace(replay.trials, observed=still)
     with pytest.raises(InputError, match="'m0' stay where they were held"):
@@ -121,8 +121,7 @@ def test_no_parameters_and_a_motion_that_stands_still_are_refused():
     ],
 )
 def test_bounds_leave_a_range_and_values_of_trials_have_a_prior(limits, sentence):
-    with pytest.raises(InputError, match=sentence):
-        Bounds(**limits)
+    refuses(InputError, sentence, Bounds, **limits)
 
 
 @pytest.mark.parametrize("bounds", [Bounds(lower=1e5, upper=1e6, logarithmic=True), Bounds(lower=-1.0, upper=3.0)])
@@ -199,3 +198,56 @@ def test_derivatives_are_those_of_the_loss_with_the_best_delays_and_priors(accur
     step, matrix = np.array([1.0, -1.0, 0.5]), linear.gauss_newton
     np.testing.assert_allclose(matrix, matrix.T)
     assert step @ matrix @ step > 0.0
+
+
+BOUNDS = {"stiffness": Bounds(lower=1.0, upper=3.0), "damping": Bounds(lower=0.1, upper=10.0, logarithmic=True)}
+UNIT = np.array([0.5, 0.25])
+
+
+def series(correlation, shape, seed=0):
+    """Errors of unit variance, correlated along the first axis."""
+    errors = np.random.default_rng(seed).normal(size=shape)
+    for k in range(1, len(errors)):
+        errors[k] = correlation * errors[k - 1] + np.sqrt(1.0 - correlation**2) * errors[k]
+    return errors
+
+
+def linear(rows, slopes):
+    """One trial without priors."""
+    return LinearMisfit([LinearTrial(rows, slopes, rows.size)], np.zeros(0), np.zeros((0, slopes.shape[1])), 1.0)
+
+
+def test_independent_errors_have_the_covariance_of_least_squares():
+    frames, coordinates = 400, 6
+    rows = 0.1 * series(0.0, (frames, coordinates))
+    jacobian = np.random.default_rng(1).normal(size=(frames * coordinates, 2)) @ [[1.0, 0.6], [0.0, 0.5]]
+    result = uncertainty_of(linear(rows, jacobian), BOUNDS, UNIT)
+    covariance = 0.1**2 * np.linalg.inv(jacobian.T @ jacobian)
+    deviation = np.sqrt(np.diag(covariance))
+    slopes = [2.0, 0.1 * 100**0.25 * np.log(100.0)]
+    np.testing.assert_allclose(list(result.deviation.values()), deviation * slopes, rtol=0.1)
+    assert result.correlation[0][1] == pytest.approx(covariance[0, 1] / deviation.prod(), abs=0.05)
+    values, vectors = np.linalg.eigh(covariance)
+    assert abs(np.dot(list(result.poorest.values()), vectors[:, 1])) == pytest.approx(1.0, abs=1e-6)
+    assert result.poorest_deviation == pytest.approx(np.sqrt(values[1]), rel=0.1)
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.8])
+def test_correlated_frames_are_worth_fewer(correlation):
+    """The mean of an autoregressive series varies (1 + r) / (1 - r) times as much as that of independent values."""
+    rows = series(correlation, (4000, 5))
+    expected = (1.0 + correlation) / (1.0 - correlation)
+    assert redundancy(rows) == pytest.approx(expected, rel=0.15)
+    same = linear(rows, np.ones((rows.size, 1)))
+    deviation = uncertainty_of(same, {"a": BOUNDS["stiffness"]}, UNIT[:1]).deviation["a"]
+    assert deviation == pytest.approx(2.0 * np.sqrt(expected / rows.size), rel=0.1)
+
+
+def test_what_the_data_do_not_change_is_uncertain_by_its_range():
+    """A uniform variable in [0, 1] has the standard deviation 1 / sqrt(12)."""
+    rows = series(0.0, (100, 3))
+    jacobian = np.stack([np.ones(rows.size), np.zeros(rows.size)], axis=1)
+    result = uncertainty_of(linear(rows, jacobian), BOUNDS, UNIT)
+    assert result.poorest == {"stiffness": 0.0, "damping": 1.0}
+    assert result.poorest_deviation == pytest.approx(12.0**-0.5)
+    assert result.deviation["damping"] == pytest.approx(12.0**-0.5 * 0.1 * 100**0.25 * np.log(100.0))

@@ -60,22 +60,18 @@ class TestAtSteps:
             markers[0, frames, marker] = torch.nan
         return motions_of(self.TIMES[None], markers)
 
-    def test_it_starts_where_the_markers_were_held_and_ends_with_the_last_frame(self):
+    def test_it_lasts_from_where_the_markers_were_held_to_the_last_frame_and_bridges_short_gaps(self):
         result = at_steps(self.seen(), STEP)
         assert result.shape == (1, 20, 2, 3)  # 0 to 0.19 s, the last frame at 0.193 s
         np.testing.assert_allclose(result[0], self.path(STEP * np.arange(20)), rtol=0, atol=1e-12)
         finer = at_steps(self.seen(), 0.5 * STEP)[0]
         np.testing.assert_allclose(finer, self.path(0.5 * STEP * np.arange(39)), rtol=0, atol=1e-12)
-
-    def test_short_gaps_are_bridged_and_long_ones_are_not_seen(self):
         result = at_steps(self.seen((0, slice(5, 6)), (0, slice(10, 15)), (1, slice(2, None))), STEP)[0]
         # Frames 9 and 15, at 0.093 and 0.153 s, are the last and first sight; 0.015 s around them count.
         lost = np.isnan(result[:, 0]).all(1)
         np.testing.assert_array_equal(np.flatnonzero(lost), [11, 12, 13])
         np.testing.assert_allclose(result[~lost, 0], self.path(STEP * np.flatnonzero(~lost))[:, 0], rtol=0, atol=1e-12)
         assert np.isnan(result[:, 1]).all()  # three sights with that at the release: too few for a cubic
-
-    def test_a_late_release_is_time_zero(self):
         result = at_steps(self.seen(), STEP, delay=double([0.002]))[0]
         np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
 

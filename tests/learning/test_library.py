@@ -7,17 +7,15 @@ import pytest
 import torch
 
 import warp_resphys as wr
+from support.refusals import refuses
+from warp_resphys import ObservedMotions, evaluate, identify, reconstruct
 from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Parts
 from warp_resphys.learning.comparison import Comparison, Model
-from warp_resphys.learning.evaluation import evaluate
-from warp_resphys.learning.identification.identification import identify
 from warp_resphys.learning.identification.misfit import Misfit
-from warp_resphys.learning.observed_motions import ObservedMotions
 from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.residuals.fitting import Fitting, fit_force
-from warp_resphys.learning.residuals.reconstruction import reconstruct
 from warp_resphys.settings.learning import Bounds, InTheLoopSettings, NetworkSettings, Prior, TrainerSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -225,8 +223,7 @@ def test_representations_have_shapes_in_place_of_arrays(robot):
 
 def test_invalid_motions_are_refused(robot):
     start = robot.rest_state()
-    with pytest.raises(wr.InputError, match="observed has shape"):
-        ObservedMotions.of(robot, torch.zeros(3), start)
+    refuses(wr.InputError, "observed has shape", ObservedMotions.of, robot, torch.zeros(3), start)
     with pytest.raises(wr.InputError, match="5 points were observed, but there are 24 vertices"):
         evaluate(robot, ObservedMotions.of(robot, torch.zeros(3, 5, 3), start))
     q = robot.rollout(start, 3).q
@@ -234,15 +231,13 @@ def test_invalid_motions_are_refused(robot):
         ObservedMotions.of(robot, q[:, :, :5], start, observation=MARKERS)
     with pytest.raises(wr.InputError, match="start has 1 states, but 2 motions were observed"):
         ObservedMotions.of(robot, q.expand(-1, 2, -1, -1), start)
-    with pytest.raises(wr.InputError, match="Unknown input pressure"):
-        ObservedMotions.of(robot, q, start, wr.Inputs(pressure=1.0))
+    refuses(wr.InputError, "Unknown input pressure", ObservedMotions.of, robot, q, start, wr.Inputs(pressure=1.0))
     with pytest.raises(wr.InputError, match="external_force has 2 time steps, but 3 are"):
         ObservedMotions.of(robot, q, start, wr.Inputs(external_force=torch.zeros(2, *q.shape[1:]).to(q)))
     motion = ObservedMotions.of(robot, q.numpy(), start)
     with pytest.raises(wr.InputError, match="reconstruct them first"):
         Fitting(robot, motion, None, motion.trials.names).samples(motion.trials.names)
-    with pytest.raises(wr.InputError, match="there is no parameter 'mass'"):
-        identify(robot, motion, {"mass": (1.0, 2.0)})
+    refuses(wr.InputError, "there is no parameter 'mass'", identify, robot, motion, {"mass": (1.0, 2.0)})
     with pytest.raises(wr.InputError, match=r"a range is 200000\.0: give the smallest and the largest value"):
         identify(robot, motion, {"youngs_modulus": 2e5})
     with pytest.raises(wr.InputError, match="there is no trial 'motion 1': there are motion 0"):

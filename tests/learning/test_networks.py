@@ -1,4 +1,7 @@
+"""Networks, recurrent ones with their hidden states in the roll-out, and a force that fades out beyond its training."""
+
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -10,9 +13,10 @@ from warp_resphys.dynamics import modes
 from warp_resphys.dynamics.modes import RestStiffness, vibration_modes
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
-from warp_resphys.learning.residuals.correction import LearnedPredictor, Range
+from warp_resphys.learning.residuals.correction import Learned, LearnedPredictor, Range
 from warp_resphys.learning.residuals.networks import NextState, ResidualForce, SkipMLP, build_model, restore
-from warp_resphys.settings.learning import NetworkSettings
+from warp_resphys.learning.residuals.training import Samples, SequenceTrainer
+from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
@@ -233,3 +237,141 @@ def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
     np.testing.assert_allclose(damped.displacements(force), plain.displacements(force), rtol=1e-9)
     with pytest.raises(InputError, match="fix some vertices"):
         RestStiffness(Simulator(Body(box_hexahedra())))
+
+
+MODES = {"position_modes": 1, "velocity_modes": 0, "force_modes": 1}
+NETWORK = NetworkSettings(**MODES, layers=1, width=16, activation="silu", recurrent=8)
+TRAINER = {"epochs": 150, "batch_size": 8, "learning_rate": 1e-2, "final_learning_rate": 1e-4, "noise": 0.0}
+TRAINER |= {"selection": "validation_loss", "rollout_every": 1000, "sequence": 10}
+TRIALS, STEPS, LAG = 6, 40, 8.0
+REST = torch.zeros(2, 3, dtype=torch.float64)
+
+
+def series(seed):
+    """Inputs that jump, and a force that follows them with a lag: the input alone does not tell it."""
+    random = torch.Generator().manual_seed(seed)
+    levels = torch.rand(TRIALS, 4, generator=random, dtype=torch.float64)
+    inputs = levels.repeat_interleave(STEPS // 4, 1)  # (R, K)
+    force, behind = [], torch.zeros(TRIALS, dtype=torch.float64)
+    for k in range(STEPS):
+        behind = behind + (inputs[:, k] - behind) / LAG
+        force.append(behind)
+    shape = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+    q = 1e-3 * inputs.flatten()[:, None, None] * shape
+    f = torch.stack(force, 1).flatten()[:, None, None] * shape
+    return Samples(q, torch.zeros_like(q), (f,), None, (STEPS,) * TRIALS)
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A trained network, and motions that it has not seen."""
+    torch.manual_seed(0)
+    train, held_out = series(1), series(2)
+    model = build_model(ResidualForce, NETWORK, REST, train.q, train.v, train.outputs[0])
+    trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TrainerSettings(**TRAINER), 0)
+    while not trainer.finished:
+        trainer.run_epoch()
+    return trainer.use_best(), held_out
+
+
+def rolled_out(model, samples):
+    """(R, K) the first component of the predicted force, and of the true one, in closed loop."""
+    q = samples.q.unflatten(0, (TRIALS, STEPS))
+    predict = LearnedPredictor(model)
+    with torch.no_grad():
+        forces = [predict(State(q[:, k], torch.zeros_like(q[:, k])), k) for k in range(STEPS)]
+    return torch.stack(forces, 1)[:, :, 0, 0], samples.outputs[0].unflatten(0, (TRIALS, STEPS))[:, :, 0, 0]
+
+
+def test_a_recurrent_network_learns_a_lag(model):
+    result, true = rolled_out(*model)
+    present = model[1].q[:, 0, 0].view(TRIALS, STEPS) * 1e3
+    ratio = ((result - true).square().mean() / (present - true).square().mean()).sqrt()
+    assert float(ratio) < 0.3
+
+
+def test_every_environment_has_its_hidden_state_of_its_size(model):
+    """Trials have the same roll-outs alone and in a batch, all from no hidden state."""
+    learned, samples = model
+    together, _ = rolled_out(learned, samples)
+    q = samples.q.unflatten(0, (TRIALS, STEPS))[3:4]
+    for _ in range(2):
+        predict = LearnedPredictor(learned)
+        with torch.no_grad():
+            alone = [predict(State(q[:, k], torch.zeros_like(q[:, k])), k)[0, 0, 0] for k in range(STEPS)]
+        torch.testing.assert_close(torch.stack(alone), together[3])
+    assert predict.hidden.shape == (1, 8)
+    inputs = torch.zeros(3, 1)
+    for wrong in (torch.zeros(3, 7), torch.zeros(2, 8)):
+        with pytest.raises(InputError, match=r"the hidden state is \(.*\): it must be \(3, 8\), or None to begin"):
+            model[0].standardised(inputs, wrong)
+
+
+SAMPLES, VERTICES = 30, 8
+SMALL = NetworkSettings(position_modes=3, velocity_modes=2, force_modes=4, layers=1, width=16)
+BOX = Range(torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 4.0]), torch.tensor([2e-3, 0.1]))
+
+
+def motion(modes, seed):
+    """(S, N, 3) samples in a space of few modes, and the (M, 3 N) orthonormal modes."""
+    random = torch.Generator().manual_seed(seed)
+    basis = torch.linalg.qr(torch.randn(3 * VERTICES, modes, generator=random, dtype=torch.float64))[0].T
+    return (torch.randn(SAMPLES, modes, generator=random, dtype=torch.float64) @ basis).view(SAMPLES, -1, 3), basis
+
+
+@pytest.fixture
+def trained():
+    """A model of float64, states of its training, and modes of displacements and velocities."""
+    torch.manual_seed(0)
+    (u, by_u), (v, by_v), (force, _) = motion(3, 1), motion(2, 2), motion(4, 3)
+    rest = torch.rand(VERTICES, 3, dtype=torch.float64)
+    model = build_model(ResidualForce, SMALL, rest, rest + u, v, force).double().eval()
+    return model, rest + u, v, by_u, by_v
+
+
+def across(basis, size):
+    """A field (N, 3) without any part along modes, whose root mean square distance is `size`."""
+    field = torch.randn(3 * VERTICES, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
+    field = field - basis.T @ (basis @ field)
+    return (size * math.sqrt(VERTICES) * field / field.norm()).view(VERTICES, 3)
+
+
+def test_the_distance_from_the_modes_is_that_of_what_they_cannot_represent(trained):
+    model, q, v, by_u, by_v = trained
+    torch.testing.assert_close(model.missed(q, v), torch.zeros(SAMPLES, 2, dtype=q.dtype), rtol=0.0, atol=1e-12)
+    away = model.missed(q + across(by_u, 3e-3), v - across(by_v, 0.2))
+    torch.testing.assert_close(away, q.new_tensor([[3e-3, 0.2]]).expand(SAMPLES, 2))
+
+
+@pytest.mark.parametrize(
+    ("inputs", "missed", "weight"),
+    [
+        ([0.0, 2.0], [0.0, 0.0], 1.0),
+        ([1.4, 4.9], [2.4e-3, 0.12], 1.0),  # within the widened box, and 1.25 times the distances
+        ([1.75, 2.0], [0.0, 0.0], 0.5),  # half a margin beyond it
+        ([0.0, -1.5], [0.0, 0.0], 0.5),
+        ([0.0, 6.1], [0.0, 0.0], 0.0),
+        ([0.0, 2.0], [3.75e-3, 0.0], 0.5),  # 1.875 times
+        ([1.75, 2.0], [0.0, 0.26], 0.0),
+    ],
+)
+def test_the_weight_falls_from_one_within_to_zero_beyond(inputs, missed, weight):
+    assert BOX.weight(torch.tensor([inputs]), torch.tensor([missed])).tolist() == pytest.approx([weight], abs=1e-5)
+
+
+def test_a_predictor_scales_its_force_and_moves_to_a_device_with_its_range(trained):
+    model, q, v, by_u, _ = trained
+    missed = model.missed(q + across(by_u, 1e-3), v)  # as if motions had been this far from the modes
+    with torch.no_grad():
+        guarded = Range.of(model.encode(q, v), missed)
+        fading = LearnedPredictor(model, range_=guarded)
+        constant = LearnedPredictor(model, range_=Range(guarded.low, guarded.high))
+        for size, weight in ((0.0, 1.0), (1.2e-3, 1.0), (1.875e-3, 0.5), (2.6e-3, 0.0)):
+            state = State(q[:5] + across(by_u, size), v[:5])
+            torch.testing.assert_close(fading(state, 0), weight * constant(state, 0), atol=1e-9, rtol=1e-6)
+        assert constant(state, 0).abs().max() > 1e-3
+    assert fading.left_at.tolist() == [-1] * 5
+    learned = Learned(torch.nn.Linear(2, 1), BOX).to(torch.device("meta"))
+    assert {x.device.type for x in (*learned.range_.edges, learned.range_.missed, *learned.network.parameters())} == {
+        "meta"
+    }

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from support.refusals import refuses
 from support.regions import beam
 from support.slopes import differences
 from support.swinging_beam import double, simulated
@@ -56,7 +57,7 @@ def test_moved_markers_are_at_their_offsets_and_rotate_with_their_stems(kind):
     np.testing.assert_allclose(markers.moved(MOVED)(q), moved, atol=1e-12)
 
 
-def test_a_placement_rotates_about_its_centre():
+def test_a_placement_rotates_about_its_centre_and_placed_markers_have_derivatives():
     points = torch.as_tensor(PLACES)
     turn = torch.as_tensor(Rotation.from_rotvec(ASKEW.turn.numpy()).as_matrix())
     np.testing.assert_allclose(ASKEW.apply(points), (points - CENTRE) @ turn.T + CENTRE + ASKEW.shift, atol=1e-15)
@@ -64,9 +65,6 @@ def test_a_placement_rotates_about_its_centre():
     np.testing.assert_allclose(still.apply(points), points + ASKEW.shift, atol=1e-15)
     again = Placement.from_plain(ASKEW.plain(LABELS), LABELS)
     torch.testing.assert_close(again.apply(points), ASKEW.apply(points))
-
-
-def test_derivatives_of_placed_markers():
     markers, q, step = PlacedMarkers.of(bind(MIXED), ASKEW), poses(), 1e-6
     direction = torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
     expected = (markers(q + step * direction) - markers(q - step * direction)) / (2.0 * step)
@@ -222,8 +220,7 @@ def test_misplaced_vertices_are_refused():
     replay, start = posed(bind())
     with pytest.raises(InputError, match=r"leave identify\.placement out"):
         Misfit([(Replay(SIM, lambda q: q[:, :4], replay.trials), start)], RANGES, accuracy=ACCURACY)
-    with pytest.raises(InputError, match="can be placed elsewhere"):
-        MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved(MOVED[:2])
+    refuses(InputError, "can be placed elsewhere", MarkerMap.at_vertices(torch.tensor([[0, 1]])).moved, MOVED[:2])
 
 
 OWN = {
@@ -264,8 +261,7 @@ def test_a_value_of_a_trial_needs_a_common_one():
     replay, _ = posed(bind())
     with pytest.raises(InputError, match="give attached_mass_factor, that of the others, too"):
         replay.prepare({"attached_mass_factor@w1": double([1.1])})
-    with pytest.raises(InputError, match="no parameter 'nothing' to identify"):
-        replay.prepare({"nothing@w1": double([1.1])})
+    refuses(InputError, "no parameter 'nothing' to identify", replay.prepare, {"nothing@w1": double([1.1])})
     both = {"attached_mass_factor": 1.0, "attached_mass_factor@w1": 1.5, "attached_mass_factor@x": 9.0}
     _, inputs, _ = replay.prepare({name: double([value]) for name, value in both.items()})
     expected = replay.trials.inputs.attached_mass.clone()

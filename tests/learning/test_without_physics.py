@@ -127,16 +127,13 @@ def test_released_bodies_are_compared_at_the_same_times_whatever_the_rate_of_the
     np.testing.assert_allclose(last, np.broadcast_to(last[0], last.shape), atol=1e-6)
 
 
-def test_a_marker_of_other_trials_stays_at_rest():
+def test_a_marker_of_other_trials_stays_at_rest_and_a_training_trial_is_predicted_without_itself():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b"])
     fake.trials.observed[:2, :, 1] = np.nan
     values, *_ = predicted(fake, ["c"])
     for model in ("interpolation", "linear"):
         np.testing.assert_allclose(values[model][0, :, 0], fake.trials.observed[2, :, 0], atol=2e-2)
         np.testing.assert_array_equal(values[model][0, :, 1], values["rest"][0, :, 1])
-
-
-def test_a_training_trial_can_be_predicted_without_itself():
     fake = experiment([1.0, 2.0, 1.5], ("rest",) * 3, ["a", "b", "c"])
     fake.trials.observed[2] += 0.3
     fitted, left_out = (predicted(fake, ["c", "a"], left_out=out)[0]["interpolation"] for out in (False, True))

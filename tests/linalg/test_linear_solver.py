@@ -9,6 +9,7 @@ import pytest
 import scipy.sparse
 import torch
 
+from support.refusals import refuses
 from warp_resphys.io.errors import InputError
 from warp_resphys.linalg.banded import BandedSolver, BorderedSolver, hubs
 from warp_resphys.linalg.choice import make_linear_solver
@@ -250,7 +251,7 @@ def test_few_hubs_of_a_narrow_band_come_last_and_many_of_a_wide_one_do_not():
     assert isinstance(make_linear_solver("auto", rows, cols, count, 3, CPU, torch.float64), BandedSolver)
 
 
-def test_compact_bodies_take_pardiso_where_it_is_installed(monkeypatch):
+def test_compact_bodies_take_pardiso_where_it_is_installed_and_bad_choices_are_refused(monkeypatch):
     """A grid of 12 nodes along every axis, which all couple to their neighbours."""
     at = np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3)
     near = np.abs(at[:, None] - at).max(-1) <= 1
@@ -262,13 +263,8 @@ def test_compact_bodies_take_pardiso_where_it_is_installed(monkeypatch):
     assert isinstance(make_linear_solver("auto", *body), BandedSolver)
     monkeypatch.setattr("warp_resphys.linalg.choice.MAX_BANDED_FLOPS", 1e9)
     assert isinstance(make_linear_solver("auto", *body), SparseSolver)
-    with pytest.raises(InputError, match="pip install mkl"):
-        make_linear_solver("pardiso", *body)
-
-
-def test_bad_choices_are_refused():
-    with pytest.raises(InputError, match="linear_solver is 'lu'"):
-        make_linear_solver("lu", *chain(3), 3, 3, CPU, torch.float64)
+    refuses(InputError, "pip install mkl", make_linear_solver, "pardiso", *body)
+    refuses(InputError, "linear_solver is 'lu'", make_linear_solver, "lu", *chain(3), 3, 3, CPU, torch.float64)
     with pytest.raises(InputError, match="linear_solver=pardiso runs on the CPU alone"):
         make_linear_solver("pardiso", *chain(3), 3, 3, torch.device("cuda"), torch.float64)
 

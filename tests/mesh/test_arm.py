@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from support.configured import settings
+from support.refusals import refuses
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import mesh_arm, section_of
@@ -151,8 +152,7 @@ def test_surfaces_are_named_as_the_contract_says(cells):
 
 def test_rotated_segments_take_tetrahedra():
     arm = ArmMesh(outline="round", rotations=(0.0, 60.0))
-    with pytest.raises(MeshError, match="set the arm's cells to tetrahedra"):
-        mesh_arm(arm)
+    refuses(MeshError, "set the arm's cells to tetrahedra", mesh_arm, arm)
     pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
     mesh, surfaces = mesh_arm(arm.changed(size=0.012, cells="tetrahedra"))
     centre = mesh.vertices[np.unique(surfaces["chamber_4"])].mean(axis=0)
@@ -161,8 +161,7 @@ def test_rotated_segments_take_tetrahedra():
 
 def test_without_gmsh_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "gmsh", None)
-    with pytest.raises(MeshError, match=r"need gmsh, which cannot be imported .*pip install gmsh"):
-        mesh_arm(ArmMesh(cells="tetrahedra"))
+    refuses(MeshError, r"need gmsh, which cannot be imported .*pip install gmsh", mesh_arm, ArmMesh(cells="tetrahedra"))
     mesh_arm(ArmMesh())
 
 
@@ -189,8 +188,7 @@ def test_without_gmsh_one_sentence(monkeypatch):
     ],
 )
 def test_measures_that_make_no_arm(changes, message):
-    with pytest.raises(InputError, match=re.escape(message)):
-        mesh_arm(ArmMesh(**changes))
+    refuses(InputError, re.escape(message), lambda: mesh_arm(ArmMesh(**changes)))
 
 
 @pytest.mark.parametrize(("option", "count"), [("arm_coarse", 530), ("arm", 1373), ("arm_fine", 1950)])

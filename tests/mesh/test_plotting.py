@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from support.refusals import refuses
 from warp_resphys import Body, InputError, MeshError, Scene, Simulator, box_hexahedra, quadratic, select_vertices
 from warp_resphys.mesh.plotting import BODY, REGIONS
 
@@ -36,7 +37,7 @@ def test_a_mesh_with_its_regions(tmp_path, mesh):
     assert drawn[REGIONS[0]][:2] == pytest.approx((0.06, 0.1))
 
 
-def test_a_body_in_a_state_and_a_scene(tmp_path):
+def test_a_body_in_a_state_and_a_scene_and_what_cannot_be_drawn(tmp_path):
     body = Body(BOX, fixed=select_vertices(BOX, x=0.0))
     state = Simulator(body).static_equilibrium(batch=2)
     drawn = actors(body.plot(state, 1, screenshot=tmp_path / "body.png", show_edges=False))
@@ -47,10 +48,5 @@ def test_a_body_in_a_state_and_a_scene(tmp_path):
     plotter = Scene({"one": body, "two": beside}).plot(screenshot=tmp_path / "scene.png")
     assert BOX.plot(plotter=plotter) is plotter
     assert len([actor for actor in plotter.actors.values() if hasattr(actor, "prop")]) == 4
-
-
-def test_what_cannot_be_drawn():
-    with pytest.raises(MeshError, match=r"positions to draw have shape \(2, 3\): give \(24, 3\)"):
-        BOX.plot(np.zeros((2, 3)))
-    with pytest.raises(InputError, match=r"shape \(2, 24, 3\), and environment is 2"):
-        Body(BOX).plot(np.zeros((2, 24, 3)), 2)
+    refuses(MeshError, r"positions to draw have shape \(2, 3\): give \(24, 3\)", BOX.plot, np.zeros((2, 3)))
+    refuses(InputError, r"shape \(2, 24, 3\), and environment is 2", Body(BOX).plot, np.zeros((2, 24, 3)), 2)

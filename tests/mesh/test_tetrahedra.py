@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from support.refusals import refuses
 from warp_resphys.io.errors import MeshError
 from warp_resphys.mesh.chambers import find_chambers
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
@@ -68,8 +69,7 @@ def test_surfaces_within_are_chambers(tmp_path):
 )
 def test_arguments_that_do_not_fit(tmp_path, changes, said):
     path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)))
-    with pytest.raises(MeshError, match=said):
-        fill_surface(path, **{"size": 0.01, "units": "mm", **changes})
+    refuses(MeshError, said, fill_surface, path, **{"size": 0.01, "units": "mm", **changes})
 
 
 def test_files_that_are_no_closed_surface(tmp_path):
@@ -79,13 +79,11 @@ def test_files_that_are_no_closed_surface(tmp_path):
         MeshError, match=r"3 edges of its triangles do not have two of them, the first at \(.*\): close"
     ):
         fill_surface(written(tmp_path, box), 0.01, "mm")
-    with pytest.raises(MeshError, match="there is no such file"):
-        fill_surface(tmp_path / "other.stl", 0.01)
+    refuses(MeshError, "there is no such file", fill_surface, tmp_path / "other.stl", 0.01)
     broken = {"torn.stl": b"solid robot\nfacet nor", "robot.obj": b"\x00\x01", "robot.xyz": b"1 2 3\n"}
     for name, content in broken.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(MeshError, match="export"):
-            fill_surface(tmp_path / name, 0.01)
+        refuses(MeshError, "export", fill_surface, tmp_path / name, 0.01)
 
 
 @pytest.mark.usefixtures("_gmsh")
@@ -110,5 +108,4 @@ def test_bodies_beside_one_another(tmp_path):
     other = trimesh.creation.box((10.0, 10.0, 10.0))
     other.apply_translation([80.0, 0.0, 0.0])
     path = written(tmp_path, trimesh.creation.box((100.0, 30.0, 20.0)), other)
-    with pytest.raises(MeshError, match=r"closed surfaces beside one another \(2 in all\)"):
-        fill_surface(path, 0.01, "mm")
+    refuses(MeshError, r"closed surfaces beside one another \(2 in all\)", fill_surface, path, 0.01, "mm")

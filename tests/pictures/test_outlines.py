@@ -5,6 +5,7 @@ import pytest
 import torch
 import trimesh
 
+from support.refusals import refuses
 from warp_resphys.io.errors import InputError
 from warp_resphys.pictures.outlines import ClosedSurface, Outline, visibility
 
@@ -36,16 +37,12 @@ def test_outline_of_a_disc():
         assert (gradient * outwards).sum(1).min() > 0.9
 
 
-def test_borders_of_the_picture_are_no_outline():
+def test_borders_of_the_picture_are_no_outline_and_a_mask_without_a_body_is_refused():
     cut = Outline.of_mask(disc(middle=np.array([101.2, 5.0])))
     assert cut.points[:, 1].min() > 1.0
     assert len(cut.points) < 0.75 * np.pi * RADIUS
     assert cut.region.area == pytest.approx(disc(middle=np.array([101.2, 5.0])).sum(), rel=0.02)
-
-
-def test_a_mask_without_a_body_is_refused():
-    with pytest.raises(InputError, match="shows nothing of the body"):
-        Outline.of_mask(np.zeros(SIZE, dtype=bool))
+    refuses(InputError, "shows nothing of the body", Outline.of_mask, np.zeros(SIZE, dtype=bool))
 
 
 def seen(mesh, focal=800.0, depth=5.0):
@@ -95,12 +92,10 @@ def test_closest_points_of_a_silhouette():
 
 def test_a_surface_is_closed_and_before_the_camera():
     box = trimesh.creation.box((2.0, 2.0, 0.2))
-    with pytest.raises(InputError, match="not closed"):
-        ClosedSurface.of(np.asarray(box.faces)[1:])
+    refuses(InputError, "not closed", ClosedSurface.of, np.asarray(box.faces)[1:])
     pixels = seen(box)
     pixels[3] = np.nan
-    with pytest.raises(InputError, match="behind the camera"):
-        ClosedSurface.of(np.asarray(box.faces)).silhouette(pixels)
+    refuses(InputError, "behind the camera", ClosedSurface.of(np.asarray(box.faces)).silhouette, pixels)
 
 
 def test_what_a_clamp_hides_does_not_count():

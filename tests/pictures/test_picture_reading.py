@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from support.refusals import refuses
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.pictures.scene_files import read_depth, read_mask, read_picture, read_scan, read_scene, read_tracked
 from warp_resphys.settings.pictures import ColourSettings
@@ -49,8 +50,7 @@ def test_cameras_and_masks_of_a_scene(tmp_path):
     assert read_mask(scene.frames[1], None).sum() == 16
     with pytest.raises(InputError, match=r"00.png: no part has a hue from 100 to 140 degrees"):
         read_mask(scene.frames[0], ColourSettings(hue=(100.0, 140.0)))
-    with pytest.raises(DataFileError, match=r"has no mask: name one in camera.json"):
-        read_mask(scene.frames[0], None)
+    refuses(DataFileError, r"has no mask: name one in camera.json", read_mask, scene.frames[0], None)
 
 
 def test_depth_images(tmp_path):
@@ -65,10 +65,8 @@ def test_depth_images(tmp_path):
     with pytest.raises(DataFileError, match="has 8 bits: write depths as a PNG of 16-bit integers"):
         read_depth(tmp_path / "00.png", 1e-3)
     np.save(tmp_path / "flat.npy", np.zeros(3))
-    with pytest.raises(DataFileError, match="has one number at each pixel"):
-        read_depth(tmp_path / "flat.npy", 1e-3)
-    with pytest.raises(DataFileError, match="cannot read the depth image"):
-        read_depth(tmp_path / "none.png", 1e-3)
+    refuses(DataFileError, "has one number at each pixel", read_depth, tmp_path / "flat.npy", 1e-3)
+    refuses(DataFileError, "cannot read the depth image", read_depth, tmp_path / "none.png", 1e-3)
 
 
 def test_scenes_with_depths_lenses_and_a_scan(tmp_path):
@@ -134,8 +132,7 @@ def test_files_that_are_no_scans_are_said(tmp_path):
         "none.ply": "there is no such file",
         "none.npy": "none.npy",
     }.items():
-        with pytest.raises(DataFileError, match=words):
-            read_scan(tmp_path / name, 1.0)
+        refuses(DataFileError, words, read_scan, tmp_path / name, 1.0)
 
 
 def test_a_turned_picture_is_read_as_it_is_seen(tmp_path):
@@ -160,8 +157,7 @@ def test_a_turned_picture_is_read_as_it_is_seen(tmp_path):
     ],
 )
 def test_a_damaged_scene_is_named(tmp_path, content, sentence):
-    with pytest.raises(DataFileError, match=sentence):
-        read_scene(write(tmp_path / "camera.json", content))
+    refuses(DataFileError, sentence, read_scene, write(tmp_path / "camera.json", content))
 
 
 def test_tracked_points_of_known_programs(tmp_path):
@@ -191,13 +187,11 @@ def test_tracked_points_of_known_programs(tmp_path):
     ],
 )
 def test_a_damaged_table_is_named(tmp_path, text, sentence):
-    with pytest.raises(DataFileError, match=sentence):
-        read_tracked(write(tmp_path / "a.csv", text), ["base", "tip"], 0.6, [0, 1])
+    refuses(DataFileError, sentence, read_tracked, write(tmp_path / "a.csv", text), ["base", "tip"], 0.6, [0, 1])
 
 
 def test_tracks_of_another_shape_are_refused(tmp_path):
-    with pytest.raises(DataFileError, match="Cannot read"):
-        read_tracked(tmp_path / "missing.csv", ["base"], 0.6, [0])
+    refuses(DataFileError, "Cannot read", read_tracked, tmp_path / "missing.csv", ["base"], 0.6, [0])
     for arrays in ({"tracks": np.zeros((4, 3, 2))}, {"tracks": np.zeros((4, 2, 2)), "visibility": np.ones(4)}):
         np.savez(tmp_path / "b.npz", **arrays)
         with pytest.raises(DataFileError, match="cannot read tracked points"):

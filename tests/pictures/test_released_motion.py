@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import warp_resphys as wr
+from support.refusals import refuses
 from support.slopes import differences
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.pictures import ClosedSurface, Cloud, Lens, Outline, Photo, PictureMisfit, PlacedCamera, SeenPose
@@ -124,12 +125,9 @@ def test_derivatives_are_those_of_differences(kind, tolerance):
 
 
 def test_what_cannot_be_released_is_named(seen):
-    with pytest.raises(wr.InputError, match="no vertex carries the force"):
-        ReleasedForce(np.array([], dtype=int), (0.0, 0.0, 1.0))
-    with pytest.raises(wr.InputError, match="give three numbers and a time"):
-        ReleasedForce(TIP, (0.0, 0.0, math.nan))
+    refuses(wr.InputError, "no vertex carries the force", ReleasedForce, np.array([], dtype=int), (0.0, 0.0, 1.0))
+    refuses(wr.InputError, "give three numbers and a time", ReleasedForce, TIP, (0.0, 0.0, math.nan))
     scan = Photo("scan", PlacedCamera(None, LOOKS, CAMERA.centre))
-    with pytest.raises(wr.InputError, match="beam moves, and a scan shows no time"):
-        replace(seen, photos=(scan,))
+    refuses(wr.InputError, "beam moves, and a scan shows no time", replace, seen, photos=(scan,))
     with pytest.raises(wr.InputError, match="no parameter 'clamp_turn' to identify"):
         PictureMisfit([seen], {"clamp_turn": Bounds(lower=0.0, upper=1.0)})

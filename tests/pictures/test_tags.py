@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.refusals import refuses
 from support.tags import draw_tag
 from warp_resphys.data.camera import Lens
 from warp_resphys.io.errors import InputError
@@ -48,12 +49,7 @@ def test_one_of_the_poses_of_a_tag_is_that_of_the_camera(turn):
         assert np.linalg.det(own[:3, :3]) > 0.0
 
 
-def test_a_tag_that_is_not_seen_has_no_pose():
+def test_a_tag_that_is_not_seen_has_no_pose_and_it_is_one_of_opencvs_with_two_edges():
     assert tag_poses(tag(3), picture(pose((0.0, 0.3, 0.0))), LENS) == []
-
-
-def test_a_tag_is_one_of_opencvs_with_two_edges():
-    with pytest.raises(InputError, match="OpenCV has no tags '9x9_1'"):
-        tag_poses(tag(dictionary="9x9_1"), np.zeros((9, 9, 3)), LENS)
-    with pytest.raises(InputError, match="must be perpendicular"):
-        tag_poses(tag(up=RIGHT), np.zeros((9, 9, 3)), LENS)
+    refuses(InputError, "OpenCV has no tags '9x9_1'", tag_poses, tag(dictionary="9x9_1"), np.zeros((9, 9, 3)), LENS)
+    refuses(InputError, "must be perpendicular", tag_poses, tag(up=RIGHT), np.zeros((9, 9, 3)), LENS)

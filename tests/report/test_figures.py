@@ -174,7 +174,7 @@ class TestInputs:
         assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two", "limit"]
         assert [line.get_color() for line in figure.legends[0].get_lines()[:2]] == list(CHAMBER_COLOURS[:2])
 
-    def test_those_of_poses_are_bars_of_the_chambers_in_use(self):
+    def test_those_of_poses_are_bars_of_the_chambers_in_use_and_not_drawn_over_time(self):
         poses = {"a": np.array([[9e3, 0.0, 1e3]]), "b": np.array([[0.0, 0.0, 0.0], [3e3, 0.0, 5e3]])}
         (figure,) = self.figures_of(Driven(PRESSURE, ("one", "two", "three"), poses, 2e4, poses=("a", "b")), "b")
         (axes,) = figure.axes
@@ -183,8 +183,6 @@ class TestInputs:
         assert [bar.get_width() for bar in axes.patches] == [9.0, 3.0, 1.0, 5.0]
         assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "three", "limit"]
         assert [line.get_xdata()[0] for line in axes.lines] == [20.0]
-
-    def test_poses_are_not_drawn_over_time(self):
         rows, trials = np.ones((3, 1)), SimpleNamespace(names=("b", "q"))
         driven = Driven(PRESSURE, ("one",), {"p": rows, "a": rows, "b": rows, "q": rows}, poses=("p", "q"))
         assert list(input_sequences(driven, trials)) == ["a, a trial of the training", "b, a test trial"]

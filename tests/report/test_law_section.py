@@ -12,18 +12,8 @@ from support.made_up_run import vertex_settings, write_vertex_run
 from support.report_page import report
 from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.io.safe_files import read_json, write_json
-from warp_resphys.report.law_section import (
-    ACROSS,
-    ALONG,
-    drawn_stretches,
-    law_text,
-    not_needed_text,
-    outside_text,
-    small_strain,
-    small_strain_of,
-    uniaxial_stress,
-    wording,
-)
+from warp_resphys.report import law_section
+from warp_resphys.report.law_section import ACROSS, ALONG, uniaxial_stress
 from warp_resphys.report.page import Cell
 from warp_resphys.report.run_page import range_table
 from warp_resphys.report.wording import number_text
@@ -81,7 +71,7 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
     means = {row["name"]: row["errors_mm"] for row in read_json(tmp_path / "errors.json")["per_trajectory"]}
     inside, outside = (number_text(means[name]["law"]) for name in ("0.07 kg", OTHER))
     assert inside != outside
-    for said in (
+    page.says(
         "Beyond the training loads, ",
         "mean error of the vertices [mm]weights of the paperother loads",
         f"+ law of its material{inside}{outside}",
@@ -93,8 +83,7 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
         "the shear modulus of the law is 108 kPa",
         "With elastic terms and relaxation40.30 %0.012 %chosen",
         "Shape and volume alone (neo-Hookean)22.0 %failed",
-    ):
-        assert said in page.text
+    )
     assert (tmp_path / "figures" / "law.png").is_file()
     assert (tmp_path / "figures" / "error_over_time.png").is_file()
 
@@ -105,18 +94,17 @@ def test_a_law_that_is_not_used_is_said_to_be_so(tmp_path):
     said = "The identified law is not used: its root mean square error on the validation trials (80 g) is 20 %"
     assert said in page.text
     assert "with the law" not in page.text
-    assert "failed" in law_text(law(validation=errors_on(["0.05 kg"], 0.1, None)))
+    assert "failed" in law_section.law_text(law(validation=errors_on(["0.05 kg"], 0.1, None)))
 
 
-def test_a_law_by_file_that_its_own_run_did_not_use_is_said_to_be_so():
+def test_a_law_that_its_own_run_did_not_use_and_terms_that_it_does_not_have_are_named():
     given = law(file="other.json", validation=errors_on(["80 g"], 0.1, 0.2))
-    assert "did not use it" not in law_text({**given, "accepted_there": True})
-    assert law_text({**given, "accepted_there": False}).endswith("did not use it: it was not clearly closer there.")
-
-
-def test_terms_that_the_law_does_not_have_are_named():
-    assert "viscosity in volume and fibres." in not_needed_text(law(), LawSettings(terms=()))
-    assert wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
+    assert "did not use it" not in law_section.law_text({**given, "accepted_there": True})
+    assert law_section.law_text({**given, "accepted_there": False}).endswith(
+        "did not use it: it was not clearly closer there."
+    )
+    assert "viscosity in volume and fibres." in law_section.not_needed_text(law(), LawSettings(terms=()))
+    assert law_section.wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
 
 
 def test_where_the_force_fades_out_the_law_remains():
@@ -159,23 +147,23 @@ def stresses(kernel, moduli, stretch, sides):
 
 
 def test_moduli_at_small_strains():
-    moduli = small_strain(TERMS)
+    moduli = law_section.small_strain(TERMS)
     step = 1e-5
     low, high = uniaxial_stress(TERMS, np.array([1.0 - step, 1.0 + step]))
     assert (high - low) / (2.0 * step) == pytest.approx(moduli.youngs_modulus, rel=1e-6)
     hookean = MaterialSettings(model="stable_neo_hookean", youngs_modulus=264e3, poissons_ratio=0.45)
-    found = small_strain_of(hookean)
+    found = law_section.small_strain_of(hookean)
     assert (found.youngs_modulus, found.poissons_ratio) == pytest.approx((264e3, 0.45))
-    assert small_strain_of(MaterialSettings(model="law", **TERMS)) == moduli
-    x = drawn_stretches({"all trials": (0.8, 1.3)})
+    assert law_section.small_strain_of(MaterialSettings(model="law", **TERMS)) == moduli
+    x = law_section.drawn_stretches({"all trials": (0.8, 1.3)})
     assert x[0] < 0.8 < 1.3 < x[-1]
     assert 1.0 in x
 
 
 def test_test_trials_beyond_the_stretches_of_the_training_are_said():
     stretches = {"all test trials": (0.7, 1.4), "the training": (0.9, 1.1)}
-    said = outside_text(SimpleNamespace(outside=0.123, stretches=stretches))
+    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches))
     assert said.startswith("In 12 % of the cells and times of all test trials, a principal stretch lies outside of ")
     assert "0.90 to 1.10" in said
-    assert outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
-    assert outside_text(SimpleNamespace(outside=None, stretches={})) == ""
+    assert law_section.outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
+    assert law_section.outside_text(SimpleNamespace(outside=None, stretches={})) == ""

@@ -16,31 +16,14 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.search import Identification
 from warp_resphys.learning.identification.uncertainty import Uncertainty
 from warp_resphys.learning.metrics import PUBLISHED_MM, PUBLISHED_WINDOWS_MM
+from warp_resphys.report import sections, wording
 from warp_resphys.report.body_motions import instants
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, at_times
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import Cell, PageTable, Row
 from warp_resphys.report.run_page import range_table
-from warp_resphys.report.sections import (
-    gain_text,
-    horizon_table,
-    published_beside,
-    residual_table,
-    rest_table,
-    shapes_table,
-    trials_section,
-)
-from warp_resphys.report.wording import (
-    MINUS,
-    NO_BREAK_SPACE,
-    NONE,
-    duration_text,
-    error_parts,
-    number_text,
-    share_text,
-    shown_models,
-)
+from warp_resphys.report.wording import MINUS, NO_BREAK_SPACE, NONE
 from warp_resphys.settings.learning import Bounds
 
 TIMES = "\N{MULTIPLICATION SIGN}"
@@ -73,23 +56,21 @@ MORE = {"sysid": summary(None, 1), "resphys": summary(1.5)}
 
 
 class TestErrors:
-    def test_by_horizon(self):
+    def test_they_are_by_horizon_and_published_ones_stand_beside_the_same_model(self):
         metrics = {"horizons": {"10": MORE, "5": ERRORS}}
-        table = horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
+        table = sections.horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
         assert table.columns == ["SysID", "ResPhys"]
         assert {row.head: row.cells for row in table.rows} == {
             "First 5 s": [Cell("2.00", "7.51 ± 3.63"), Cell("1.00", "5.79 ± 3.09")],
             "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50", "6.10 ± 3.22")],
         }
-        (row,) = horizon_table({"horizons": {"5": ERRORS}}, {}).rows
+        (row,) = sections.horizon_table({"horizons": {"5": ERRORS}}, {}).rows
         assert row.cells == [Cell("2.00"), Cell("1.00")]
-        assert horizon_table({}, {}) is None
-
-    def test_published_errors_stand_beside_the_same_model(self):
+        assert sections.horizon_table({}, {}) is None
         published = PUBLISHED_MM["beam_real"]
-        beside = published_beside(published, ["published", "simulation", "sysid", "resphys"])
+        beside = sections.published_beside(published, ["published", "simulation", "sysid", "resphys"])
         assert beside.keys() == {"published", "sysid", "simfree", "resphys"}
-        beside = published_beside(published, ["simulation", "sysid_elastic", "sysid"])
+        beside = sections.published_beside(published, ["simulation", "sysid_elastic", "sysid"])
         assert beside["sysid_elastic"] == ("1.32", "± 1.38")
 
 
@@ -186,30 +167,28 @@ class TestIdentification:
 def test_rows_of_markers_that_were_never_seen():
     table = quality_table([MarkerQuality("A", False, 0.0, 1, 9, 9, (), None, None)])
     assert table == {"A": ["0.0 %", "1", "9", "9", "0", "", ""]}
-    table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
+    table = sections.residual_table({"t": {"rms_mm": 0.5, "residual_mm": {"A": None, "B": 0.5}, "outliers": []}})
     assert table.columns == ["A", "B", "Root mean square"]
     assert table.rows[0].cells == [Cell(NONE), Cell("0.50"), Cell("0.50")]
     many = {str(marker): 0.1 for marker in range(9)}
-    table = residual_table({"t": {"rms_mm": 0.5, "residual_mm": many, "outliers": ["3"]}})
+    table = sections.residual_table({"t": {"rms_mm": 0.5, "residual_mm": many, "outliers": ["3"]}})
     assert table.columns == ["t"]
     assert [row.head for row in table.rows] == [*many, "Root mean square"]
     assert table.rows[3].cells == [Cell("0.10", "left out")]
     fit = {"rms_mm": 0.5, "residual_mm": many | {"4": 0.7, "5": None}, "outliers": []}
-    table = residual_table({f"t{k}": fit for k in range(9)})
+    table = sections.residual_table({f"t{k}": fit for k in range(9)})
     assert table.columns == ["Largest", "Marker", "Root mean square"]
     assert [cell.text for cell in table.rows[8].cells] == ["0.70", "4", "0.50"]
 
 
 class TestWhatIsShown:
-    def test_bodies_are_brought_to_the_frames(self):
+    def test_bodies_at_frames_instants_that_lie_apart_the_uncorrected_model_and_the_best_one(self):
         positions = np.arange(4.0)[:, None, None] * np.ones((1, 2, 3))
         times = np.array([0.0, 0.1, 0.2, 0.3])
         between = at_times(positions, times, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
         np.testing.assert_allclose(between[:, 0, 0], [0.0, 0.5, 1.1, 3.0, 3.0])
         positions[2:] = np.nan
         np.testing.assert_array_equal(at_times(positions, times, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan])
-
-    def test_instants_lie_apart(self):
         measured, rest = np.zeros((100, 1, 3)), np.zeros((1, 3))
         measured[40, 0, 2] = -1.0
         simulated = measured.copy()
@@ -220,10 +199,8 @@ class TestWhatIsShown:
         measured[70] = np.nan
         assert instants(measured, rest, simulated) == [25, 40, 97]
         assert instants(measured[:1], rest, simulated[:1]) == [0]
-
-    def test_the_uncorrected_model_and_the_best_one(self):
-        assert shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
-        assert shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
+        assert wording.shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
+        assert wording.shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
 
 
 def test_trials_out_of_range_are_counted_where_they_belong():
@@ -248,15 +225,22 @@ def test_trials_out_of_range_are_counted_where_they_belong():
     assert range_table({}, ["a"]) is None
 
 
-def test_numbers_have_sensible_digits():
-    shown = [number_text(value) for value in (4.48812, 0.000721, 0.0, None)]
+def test_numbers_have_sensible_digits_and_shares_those_for_what_is_left():
+    shown = [wording.number_text(value) for value in (4.48812, 0.000721, 0.0, None)]
     assert shown == ["4.49", "0.00072", "0", "diverged"]
-    assert [number_text(value) for value in (2.14e-9, 0.0999, 0.154, 1234.5)] == ["2.1e-09", "0.100", "0.154", "1,234"]
+    assert [wording.number_text(value) for value in (2.14e-9, 0.0999, 0.154, 1234.5)] == [
+        "2.1e-09",
+        "0.100",
+        "0.154",
+        "1,234",
+    ]
     deviating = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
-    assert error_parts(deviating) == ("0.00072", "± 0.00031")
-    assert error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
-    shown = [duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
+    assert wording.error_parts(deviating) == ("0.00072", "± 0.00031")
+    assert wording.error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
+    shown = [wording.duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
     assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]
+    shown = [wording.share_text(share) for share in (0.5, 0.897, 0.9958, 0.99976, 1.0, -0.2)]
+    assert shown == ["50 %", "90 %", "99.6 %", "99.98 %", "100 %", f"{MINUS}20 %"]
 
 
 def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
@@ -267,12 +251,12 @@ def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():
     metrics = {"per_trajectory": rows, "errors_mm": {"sysid": {"mean": 1.5}}, "intervals": covered}
     run = SimpleNamespace(test_titles=("weights", "other loads"))
     data = SimpleNamespace(metrics=metrics, settings=run, others=("b",), pages={}, driven=None)
-    (table,) = trials_section(data, None).blocks
+    (table,) = sections.trials_section(data, None).blocks
     assert [(row.head, row.cells[0].text, row.small) for row in table.rows] == [
         ("a", "1.00", "amplitude 20 mm, coverage 93 %"),
         ("b", "2.00", "amplitude 20 mm, other loads"),
     ]
-    assert trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None) is None
+    assert sections.trials_section(SimpleNamespace(metrics={}, others=(), pages={}, driven=None), None) is None
 
 
 def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
@@ -282,19 +266,19 @@ def test_what_could_explain_the_remaining_error_is_that_of_the_best_model():
     quantity = SimpleNamespace(shown=lambda value: f"{value:g} kPa")
     fits = {"sysid": [fit("a", 2.0, scale=1.0, zero=0.5), fit("b", 4.0, scale=1.0)], "simulation": [fit("a", 9.0)]}
     driven = Driven(quantity, ("c",), {})
-    (table,) = rest_table(fits, driven)
+    (table,) = sections.rest_table(fits, driven)
     assert table.columns == ["As it is", "Refitted gain", "Refitted offset"]
     assert [[(cell.text, cell.small) for cell in row.cells] for row in table.rows] == [
         [("2.00", ""), ("1.00", "+5.0 %"), ("0.500", "2 kPa")],
         [("4.00", ""), ("1.00", "+5.0 %"), (NONE, "")],
         [("3.00", ""), ("1.00", ""), ("2.25", "")],
     ]
-    assert rest_table({}, None) == rest_table({"sysid": [fit("a", 2.0)]}, None) == []
+    assert sections.rest_table({}, None) == sections.rest_table({"sysid": [fit("a", 2.0)]}, None) == []
 
     def text(gains, left=1.0, pressures=(3.0, 1.0, 2.0)):
         rows = [fit(n, 2.0, scale=left) | {"values": {"scale": gain}} for n, gain in zip("abc", gains, strict=True)]
         values = {n: np.array([[0.0], [-p]]) for n, p in zip("abc", pressures, strict=True)}
-        return gain_text(rows, Driven(quantity, ("c",), values))
+        return sections.gain_text(rows, Driven(quantity, ("c",), values))
 
     assert "from +2.1 % at 1 kPa to +11.0 % at 3 kPa" in text([0.11, 0.021, 0.066])
     assert "may lack physics" in text([-0.11, -0.021, -0.066])
@@ -309,15 +293,10 @@ def result(simulation, sysid=None, law=None, **more):
     return {"vertices": 225, "moved_mm": 12.5, "errors_mm": kept, **more}
 
 
-def test_shares_have_digits_for_what_is_left():
-    shown = [share_text(share) for share in (0.5, 0.897, 0.9958, 0.99976, 1.0, -0.2)]
-    assert shown == ["50 %", "90 %", "99.6 %", "99.98 %", "100 %", f"{MINUS}20 %"]
-
-
 def test_a_model_that_diverges_on_a_body():
     lost = result(1.0, 0.2)
     lost["errors_mm"]["law"] = None
-    rows = {row.head: [cell.text for cell in row.cells] for row in shapes_table({"rod": lost}).rows}
+    rows = {row.head: [cell.text for cell in row.cells] for row in sections.shapes_table({"rod": lost}).rows}
     assert rows == {"rod": ["1.00", "0.200", "diverged"]}
 
 
@@ -329,6 +308,5 @@ def test_page_has_the_bodies(tmp_path):
     shape = {"mesh": vertex_settings().mesh, "fixed": {"x": 0.0}, "held": {"twist_deg": 10.0}}
     ranges = {"youngs_modulus": {"lower": 1e5, "upper": 1e6}}
     page = report(tmp_path, vertex_settings().changed(identify={"parameters": ranges}, shapes={"thin": shape}))
-    for said in ("Other bodies of the same material", "thin <beam>", "removes 99 %", "225 vertices, moves by 12.5 mm"):
-        assert said in page.text
+    page.says("Other bodies of the same material", "thin <beam>", "removes 99 %", "225 vertices, moves by 12.5 mm")
     assert "was learned at, with the share of cells and times: thin <beam> (12 %)." in page.text

@@ -92,14 +92,12 @@ class TestSentences:
             "+ learned force (ResPhys)": (["0.380"], "best"),
         }
 
-    def test_what_a_regression_can_do_needs_no_simulator(self):
+    def test_what_a_regression_or_a_simpler_model_can_do_needs_no_better_one(self):
         errors = {**self.ERRORS, "regression": [1e-3, 1.2e-3, 1.1e-3, 1e-3, 1.3e-3]}
         first, do = sentences(errors)
         said = "Kernel regression, without physics, has 99.7 % less error than any corrected simulator"
         assert first.startswith(said)
         assert do == "Kernel regression is enough for trials like these; to judge the simulator, test it on others."
-
-    def test_a_simpler_model_is_advised_only_where_it_is_as_good(self):
         said = sentences({**self.ERRORS, "resphys": [0.5, 0.6, 0.6, 0.5, 0.6]})
         assert said[1] == "Use SysID, which is simpler than ResPhys and not significantly worse."
         wide = {"sysid": [2.0, 0.1, 0.1, 0.1, 0.1], "resphys": [0.2, 0.2, 0.2, 0.2, 0.2]}

@@ -16,6 +16,7 @@ import torch
 import warp_resphys
 from support.main_job import run_without_report
 from support.played_run import check_robots
+from support.refusals import refuses
 from support.segment_run import TRACKED, place_segment
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.safe_files import read_json, write_json
@@ -80,8 +81,7 @@ class TestRollouts:
         folds = sorted(folder.glob("fold_*"))
         assert len(folds) == 2
         assert warp_resphys.load(folds[0]).description.name == f"run/{folds[0].name}"
-        with pytest.raises(DataFileError, match=rf"is a cross-validation.*{folds[0].name}.*{folds[1].name}"):
-            warp_resphys.load(folder)
+        refuses(DataFileError, rf"is a cross-validation.*{folds[0].name}.*{folds[1].name}", warp_resphys.load, folder)
 
     def test_steps_are_a_rollout(self, robot):
         pressure = wave(5, 2)
@@ -119,8 +119,7 @@ class TestRollouts:
         assert [text.get_text() for text in axes.get_legend().get_texts()] == list(robot.labels)
         moved = 1e3 * (motion.markers[:, 0, :, 0] - motion.markers[0, 0, :, 0]).numpy()
         np.testing.assert_allclose(np.stack([line.get_ydata() for line in axes.lines], 1), moved)
-        with pytest.raises(InputError, match="environment is 1"):
-            motion.plot(environment=1)
+        refuses(InputError, "environment is 1", motion.plot, environment=1)
         plt.close(axes.figure)
 
     def test_a_settled_robot_stays_at_rest(self, robot):
@@ -246,26 +245,19 @@ class TestBadInput:
         ],
     )  # fmt: skip
     def test_calls(self, robot, call, sentence):
-        with pytest.raises(InputError, match=sentence):
-            call(robot, robot.begin())
+        refuses(InputError, sentence, call, robot, robot.begin())
 
     def test_models_and_files(self, arm, robot, tmp_path):
-        with pytest.raises(InputError, match=r"'resfys': .* has 'simulation', .*'sysid'"):
-            warp_resphys.load(arm, "resfys")
+        refuses(InputError, r"'resfys': .* has 'simulation', .*'sysid'", warp_resphys.load, arm, "resfys")
         kept = robot.save(tmp_path / "robot.safetensors")
-        with pytest.raises(InputError, match=r"'sysid', but .* 'resphys'"):
-            warp_resphys.load(kept, "sysid")
-        with pytest.raises(InputError, match="no trials"):
-            warp_resphys.trial_names(warp_resphys.load(kept))
+        refuses(InputError, r"'sysid', but .* 'resphys'", warp_resphys.load, kept, "sysid")
+        refuses(InputError, "no trials", warp_resphys.trial_names, warp_resphys.load(kept))
         kept.write_bytes(kept.read_bytes()[:-9])
-        with pytest.raises(DataFileError, match="not a complete safetensors file"):
-            warp_resphys.load(kept)
+        refuses(DataFileError, "not a complete safetensors file", warp_resphys.load, kept)
 
     def test_a_folder_without_a_run(self, tmp_path):
-        with pytest.raises(DataFileError, match="does not exist"):
-            warp_resphys.load(tmp_path / "nothing")
-        with pytest.raises(DataFileError, match="not a run folder"):
-            warp_resphys.load(tmp_path)
+        refuses(DataFileError, "does not exist", warp_resphys.load, tmp_path / "nothing")
+        refuses(DataFileError, "not a run folder", warp_resphys.load, tmp_path)
         (tmp_path / "pulls.csv").write_text("time [s]\n")
         with pytest.raises(DataFileError, match=r"pulls\.csv is no robot: name a run folder, or a \.safetensors file"):
             warp_resphys.load(tmp_path / "pulls.csv")
@@ -285,8 +277,7 @@ class TestBadInput:
             (folder / file).unlink()
         else:
             write_json(folder / file, {**read_json(folder / file), **change})
-        with pytest.raises(DataFileError, match=sentence):
-            warp_resphys.load(folder)
+        refuses(DataFileError, sentence, warp_resphys.load, folder)
 
     def test_a_simulator_can_be_loaded_before_the_run_is_evaluated(self, arm, tmp_path):
         folder = Path(shutil.copytree(arm, tmp_path / "run"))
@@ -298,11 +289,9 @@ class TestBadInput:
         name = warp_resphys.trial_names(early)[0]
         one, other = (warp_resphys.recorded_trial(robot, name) for robot in (early, late))
         torch.testing.assert_close(one.start.q, other.start.q)
-        with pytest.raises(DataFileError, match="was not completed"):
-            warp_resphys.load(folder)
+        refuses(DataFileError, "was not completed", warp_resphys.load, folder)
         (folder / "stages/identify.json").unlink()
-        with pytest.raises(DataFileError, match="was not completed"):
-            warp_resphys.load(folder, "sysid")
+        refuses(DataFileError, "was not completed", warp_resphys.load, folder, "sysid")
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import torch
 
 import warp_resphys
 from support.configured import settings
+from support.refusals import refuses
 from warp_resphys import Body, Corotated, Inputs, RobotScene, Simulator, SurfaceContact, box_hexahedra, select_vertices
 from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.io.errors import InputError, MeshError
@@ -120,8 +121,7 @@ def test_gradient_of_a_push_through_contact():
 )
 def test_what_does_not_fit_is_refused(robots, more, message):
     robot = beam()
-    with pytest.raises(InputError, match=message):
-        RobotScene({name: (robot, pose) for name, pose in robots.items()}, *more)
+    refuses(InputError, message, RobotScene, {name: (robot, pose) for name, pose in robots.items()}, *more)
 
 
 def test_robots_that_do_not_fit_are_refused(finished):
@@ -134,8 +134,7 @@ def test_robots_that_do_not_fit_are_refused(finished):
             "one time step and integrator, these have one 10 ms and bdf2, two 5 ms",
         ),
     ):
-        with pytest.raises(InputError, match=message):
-            RobotScene(robots)
+        refuses(InputError, message, RobotScene, robots)
     with pytest.raises(InputError, match="no robot 'hand' in the scene: it has one"):
         RobotScene({"one": (robot, AWAY)}).begin(inputs={"hand": {}})
 
@@ -162,7 +161,5 @@ def test_its_law_moves_another_body_as_a_simulator_of_it_does(of_a_law):
     assert (state.q - alone.rest_positions).abs().max() > 1e-3
     kept = other.description
     assert (kept.learned, kept.markers, kept.intervals) == (None, None, None)
-    with pytest.raises(InputError, match="no_such_key"):
-        of_a_law.on(LONG, no_such_key=1)
-    with pytest.raises(MeshError, match="no vertex"):
-        of_a_law.on(LONG, fixed={"x": 5.0})
+    refuses(InputError, "no_such_key", of_a_law.on, LONG, no_such_key=1)
+    refuses(MeshError, "no vertex", of_a_law.on, LONG, fixed={"x": 5.0})

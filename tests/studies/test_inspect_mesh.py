@@ -7,6 +7,7 @@ import trimesh
 from matplotlib.image import imread
 
 from support.command_line import sentence, settings_of
+from support.refusals import refuses
 from warp_resphys import Body, Corotated, Simulator, box_hexahedra, box_tetrahedra, read_mesh
 from warp_resphys.io.errors import InputError, MeshError, ResphysWarning
 from warp_resphys.mesh import read_surfaces, write_mesh
@@ -41,13 +42,11 @@ def arm():
 
 
 class TestQuality:
-    def test_ideal_cells(self):
+    def test_ideal_cells_are_worth_one_and_a_sheared_brick_the_sine_of_its_angle(self):
         assert scaled_jacobian(box_hexahedra((3.0, 1.0, 1.0), (1, 1, 1))) == pytest.approx(1.0)
         regular = Mesh(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 2, 1, 3]]))
         np.testing.assert_allclose(np.abs(scaled_jacobian(regular)), 1.0)
         np.testing.assert_allclose(scaled_jacobian(quadratic(regular)), scaled_jacobian(regular))
-
-    def test_a_sheared_brick_is_worth_the_sine_of_its_angle(self):
         box = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
         sheared = Mesh(box.vertices + box.vertices[:, 1:2] * [[1.0 / np.tan(0.5), 0.0, 0.0]], box.cells)
         assert scaled_jacobian(sheared) == pytest.approx(np.sin(0.5))
@@ -95,11 +94,9 @@ class TestQuadraticCells:
 
 
 class TestOpenCavities:
-    def test_closed_chambers_are_none(self, arm):
+    def test_closed_chambers_are_none_without_its_last_cap(self, arm):
         assert open_cavities(arm[0]) == []
         assert open_cavities(box_tetrahedra()) == []
-
-    def test_an_arm_without_its_last_cap(self, arm):
         mesh, _ = arm
         cavities = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
         assert len(cavities) == 3
@@ -130,10 +127,8 @@ class TestNamedSurfaces:
         np.testing.assert_array_equal(read_surfaces(tmp_path / "box.msh")["all"], surfaces["all"])
 
     def test_unknown_extension(self, tmp_path, arm):
-        with pytest.raises(MeshError, match=r"meshio does not know the extension '\.arm'"):
-            write_mesh(tmp_path / "mesh.arm", arm[0])
-        with pytest.raises(MeshError, match=r"mesh\.stl: meshio cannot write such a file"):
-            write_mesh(tmp_path / "mesh.stl", arm[0])
+        refuses(MeshError, r"meshio does not know the extension '\.arm'", write_mesh, tmp_path / "mesh.arm", arm[0])
+        refuses(MeshError, r"mesh\.stl: meshio cannot write such a file", write_mesh, tmp_path / "mesh.stl", arm[0])
         assert not list(tmp_path.iterdir())
 
 
@@ -148,8 +143,7 @@ def test_published_arm(shared_data):
     assert rows["fixed"] == "36 vertices at z = 0 m, 21 of them used"
     assert rows["pieces"] == "1 of the body, 7 of its boundary"
     assert rows["open cavities"] == "none"
-    with pytest.raises(MeshError, match="read with units=mm"):
-        inspected(f"mesh.path={path}", "mesh.units=mm")
+    refuses(MeshError, "read with units=mm", inspected, f"mesh.path={path}", "mesh.units=mm")
 
 
 def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):

@@ -6,6 +6,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from support.command_line import settings_of
+from support.refusals import refuses
 from warp_resphys.data.recordings.marker_quality import quality
 from warp_resphys.data.recordings.processing import Release
 from warp_resphys.data.recordings.recording import Recording
@@ -91,8 +92,7 @@ def test_picture_shows_what_is_seen_filled_and_masked():
 def test_files_are_told_by_their_ends():
     settings = configured("files=[a.c3d,body.vtk,b.h5]")
     assert (settings.recording.path, settings.compare_with, settings.mesh.path) == ("a.c3d", ("b.h5",), "body.vtk")
-    with pytest.raises(InputError, match=r"^a\.msh and b\.msh are two meshes"):
-        configured("files=[a.msh,b.msh]")
+    refuses(InputError, r"^a\.msh and b\.msh are two meshes", configured, "files=[a.msh,b.msh]")
 
 
 @pytest.mark.parametrize(
@@ -105,5 +105,4 @@ def test_files_are_told_by_their_ends():
     ],
 )
 def test_wrong_settings(tmp_path, path, overrides, message):
-    with pytest.raises(InputError, match=message):
-        inspect_recording(configured(f"recording.path={path}", *overrides), tmp_path)
+    refuses(InputError, message, lambda: inspect_recording(configured(f"recording.path={path}", *overrides), tmp_path))

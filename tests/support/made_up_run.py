@@ -150,6 +150,12 @@ def write_split(folder: Path, test, models=BEAM_MODELS, diverged=()):
     _write_stages(folder, identify=95.0)
 
 
+def write_beam_run(folder: Path, *test, **more):
+    """All files of a run of a beam."""
+    write_recordings(folder)
+    write_split(folder, list(test), **more)
+
+
 def _search(found):
     """Content of identification.json for a model of these parameters: three searches."""
 

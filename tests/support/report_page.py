@@ -38,6 +38,14 @@ class Page(HTMLParser):
         else:
             self.inside[-1] += data
 
+    def says(self, *words):
+        """Checks that its text has words."""
+        assert [word for word in words if word not in self.text] == []
+
+    def lacks(self, *words):
+        """Checks that its text does not have words."""
+        assert [word for word in words if word in self.text] == []
+
     def allows_its_scripts_alone(self):
         """Whether the content security policy allows exactly the page's own scripts."""
         digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in self.scripts]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.refusals import refuses
 from warp_resphys import InputError, Twin, load
 from warp_resphys.control.controllers import conditioned
 from warp_resphys.twin.estimator import adapted, distances
@@ -222,10 +223,8 @@ def test_it_refines_a_parameter_as_it_runs(robot):
     assert value == pytest.approx(1.2 * stiff, rel=0.05)
     assert deviation < 0.1 * stiff
     assert abs(value - 1.2 * stiff) < 3.0 * deviation
-    with pytest.raises(InputError, match="there is no parameter 'wobble'"):
-        Twin(robot, refine={"wobble": 1.0})
-    with pytest.raises(InputError, match=r"refine\.youngs_modulus is -1"):
-        Twin(robot, refine={"youngs_modulus": -1.0})
+    refuses(InputError, "there is no parameter 'wobble'", Twin, robot, refine={"wobble": 1.0})
+    refuses(InputError, r"refine\.youngs_modulus is -1", Twin, robot, refine={"youngs_modulus": -1.0})
 
 
 def test_a_clock_that_is_set_back_and_a_gap_start_it_again(robot, swing):
@@ -254,8 +253,7 @@ def test_a_clock_that_is_set_back_and_a_gap_start_it_again(robot, swing):
 def test_a_wrong_packet_is_one_sentence_and_is_left_out(robot, swing, packet, message):
     twin = followed(robot, swing[0][:5])
     before = twin.now
-    with pytest.raises(InputError, match=message):
-        twin.take(packet[0], packet[1], **packet[2])
+    refuses(InputError, message, twin.take, packet[0], packet[1], **packet[2])
     assert torch.equal(before.state.q, twin.now.state.q)
 
 
@@ -263,8 +261,7 @@ def test_millimetres_are_refused_and_unknown_markers_counted(robot, swing):
     twin = Twin(robot)
     with pytest.raises(InputError, match="no packet"):
         _ = twin.now
-    with pytest.raises(InputError, match="give positions in metres"):
-        twin.take(0.0, 1e3 * swing[0][0])
+    refuses(InputError, "give positions in metres", twin.take, 0.0, 1e3 * swing[0][0])
     twin.take(0.0, {"vertex_3": swing[0][0][3], "nose": [0, 0, 0], "vertex_4": [None, None, None]})
     assert twin.counts == {"unknown marker 'nose'": 1}
     assert np.isfinite(twin.now.markers).all()
@@ -296,13 +293,11 @@ def test_packets_over_udp_and_from_a_file(robot, folder):
     ):
         assert sum(words in message for message in listener.refused) == 1
     assert sum("is no JSON" in message for message in listener.refused) == 2
-    with pytest.raises(InputError, match="cannot be listened at"):
-        Listener(f"udp://127.0.0.1:{listener.address[1]}")
+    refuses(InputError, "cannot be listened at", Listener, f"udp://127.0.0.1:{listener.address[1]}")
     sender.close()
     listener.close()
     for wrong in ("tcp://127.0.0.1:1", "udp://127.0.0.1", "udp://x:y"):
-        with pytest.raises(InputError, match="give udp://HOST:PORT"):
-            Listener(wrong)
+        refuses(InputError, "give udp://HOST:PORT", Listener, wrong)
     motion = robot.rollout(robot.begin(), 4)
     motion.write_csv("swing.csv")
     read = list(recorded_packets(robot, "swing.csv"))
@@ -336,8 +331,7 @@ def test_predictions_follow_a_plan_of_commands(robot):
     height = twin.ahead().markers[:, fixed, 2] - rest[fixed, 2].numpy()
     np.testing.assert_allclose(height.mean(axis=1), [0.0, 2e-3, 2e-3, 2e-3, 2e-3], atol=1e-6)
     twin.plan([])
-    with pytest.raises(InputError, match="there is no input 'wind'"):
-        twin.plan([(0.1, {"wind": 1.0})])
+    refuses(InputError, "there is no input 'wind'", twin.plan, [(0.1, {"wind": 1.0})])
     assert twin.ahead(7 * h).markers[1, fixed[0], 2] - rest[fixed[0], 2] == pytest.approx(0.0, abs=1e-6)
 
 

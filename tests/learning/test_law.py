@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from support import regions
 from support.refusals import refuses
-from support.regions import beam
 from warp_resphys import Body, InputError, Inputs, Simulator, SolverSettings, box_hexahedra, evaluate, select_vertices
 from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
@@ -309,8 +309,9 @@ def test_a_law_is_identified_from_observed_motions_and_simulates_on():
 
 
 def test_materials_of_regions_have_no_law():
-    regions = SimpleNamespace(materials={"tip": None, "base": None})
-    refuses(InputError, "a law describes one material", identify_law, regions, None)
+    robot = Simulator(Body(regions.beam()), {"beam": Corotated(), "cap": Corotated()})
+    motions = ObservedMotions.of(robot, robot.rest_positions.expand(2, 1, -1, -1))
+    refuses(InputError, "a law describes one material", identify_law, robot, motions)
 
 
 WHOLE = ("elastic", "branches", "fibres")

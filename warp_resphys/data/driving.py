@@ -56,14 +56,14 @@ def phases(since: NDArray[np.float64], sizes: NDArray[np.float64], before: float
     return np.select([rests, grew[last] < 0.0, since <= _RISE], ["", "release", "rise"], "hold")
 
 
-def driving(dataset: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
+def driving(trials: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
     """Returns what acts during each frame, (R, T, C) by input, base and obstacle; a pose has the last values."""
-    rows = dataset.rows(names)
-    series = {name: values[rows] for name, values in dataset.inputs.items()}
-    series |= {} if dataset.base is None else {"base": dataset.base[rows]}
-    series |= {f"obstacle {name}": poses[rows] for name, poses in dataset.obstacles.items()}
-    steps = (dataset.times[rows] / dataset.time_step + 1e-6).astype(np.int64)
-    posed = np.array([dataset.begins[row] == STATIC for row in rows], dtype=bool)
+    rows = trials.rows(names)
+    series = {name: values[rows] for name, values in trials.inputs.items()}
+    series |= {} if trials.base is None else {"base": trials.base[rows]}
+    series |= {f"obstacle {name}": poses[rows] for name, poses in trials.obstacles.items()}
+    steps = (trials.times[rows] / trials.time_step + 1e-6).astype(np.int64)
+    posed = np.array([trials.begins[row] == STATIC for row in rows], dtype=bool)
     steps[posed] = np.iinfo(np.int64).max
     return {
         name: np.take_along_axis(values, np.minimum(steps, values.shape[1] - 1)[..., None], 1)
@@ -71,36 +71,36 @@ def driving(dataset: Trials, names: Sequence[str]) -> dict[str, FloatArray]:
     }
 
 
-def since_change(dataset: Trials, names: Sequence[str]) -> FloatArray:
+def since_change(trials: Trials, names: Sequence[str]) -> FloatArray:
     """Returns the times (R, T) since the last change of the inputs [s], see `time_since_change`."""
-    rows = dataset.rows(names)
-    acting = [np.moveaxis(values, 0, 1) for values in driving(dataset, names).values()]
-    since = time_since_change(dataset.times[rows].T, acting).T
-    since[[dataset.begins[row] == STATIC for row in rows]] = np.inf
+    rows = trials.rows(names)
+    acting = [np.moveaxis(values, 0, 1) for values in driving(trials, names).values()]
+    since = time_since_change(trials.times[rows].T, acting).T
+    since[[trials.begins[row] == STATIC for row in rows]] = np.inf
     return since
 
 
-def first_change(dataset: Trials, name: str) -> float:
+def first_change(trials: Trials, name: str) -> float:
     """Returns the time at which the inputs of a trial begin to change by more than noise [s]; zero if none does."""
-    changes = np.flatnonzero(since_change(dataset, [name])[0] == 0.0)  # The first frame counts as one.
-    return float(dataset.times[dataset.rows([name])[0], changes[1]]) if len(changes) > 1 else 0.0
+    changes = np.flatnonzero(since_change(trials, [name])[0] == 0.0)  # The first frame counts as one.
+    return float(trials.times[trials.rows([name])[0], changes[1]]) if len(changes) > 1 else 0.0
 
 
-def phases_of(dataset: Trials, names: Sequence[str]) -> NDArray[np.str_]:
+def phases_of(trials: Trials, names: Sequence[str]) -> NDArray[np.str_]:
     """Returns the phases (R, T) of driven trials, see `phases`; empty words for others and for poses.
 
     The size of the inputs is their norm, each kind over its largest value.
     """
-    rows, acting = dataset.rows(names), driving(dataset, names)
-    largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in dataset.inputs.items()}
+    rows, acting = trials.rows(names), driving(trials, names)
+    largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in trials.inputs.items()}
     kinds = {name: acting[name] / size for name, size in largest.items() if size}
-    found = np.full(dataset.times[rows].shape, "", dtype="<U7")
+    found = np.full(trials.times[rows].shape, "", dtype="<U7")
     if not kinds:
         return found
     sizes = np.linalg.norm(np.concatenate([*kinds.values()], 2), axis=2)  # (R, T)
-    since = time_since_change(dataset.times[rows].T, [sizes.T[..., None]]).T
+    since = time_since_change(trials.times[rows].T, [sizes.T[..., None]]).T
     for k, row in enumerate(rows):
-        if dataset.begins[row] != STATIC:
-            before = [dataset.resting[name][row] / largest[name] for name in kinds if name in dataset.resting]
+        if trials.begins[row] != STATIC:
+            before = [trials.resting[name][row] / largest[name] for name in kinds if name in trials.resting]
             found[k] = phases(since[k], sizes[k], float(np.linalg.norm(np.concatenate([[0.0], *before]))))
     return found

@@ -69,10 +69,10 @@ class Experiment:
     def trials(self) -> Trials:
         """All trials, including those with scaled inputs if the stage tests them."""
         shared = self.folder / self.settings.shared
-        dataset = Trials.read(shared / DATASET)
+        trials = Trials.read(shared / DATASET)
         if len(self.settings.groups) > 1:
-            dataset = dataset.joined(Trials.read(shared / SCALED_DATASET))
-        return dataset
+            trials = trials.joined(Trials.read(shared / SCALED_DATASET))
+        return trials
 
     @cached_property
     def body(self) -> Body:
@@ -128,16 +128,16 @@ class Experiment:
     @cached_property
     def motions(self) -> ObservedMotions:
         """The trials with their observation: M markers, or all vertices."""
-        settings, dataset = self.settings, self.trials
+        settings, trials = self.settings, self.trials
         observe: Observation = WHOLE_STATE
-        if dataset.bound is not None:
+        if trials.bound is not None:
             markers = settings.markers
             assert markers is not None
-            bound = bound_markers(markers, self.body.mesh, dataset.bound, dataset.labels)
-            observe = ViewedMarkers.of(bound, marker_view_of(markers, dataset.labels, dataset.sets)).to(self.like)
+            bound = bound_markers(markers, self.body.mesh, trials.bound, trials.labels)
+            observe = ViewedMarkers.of(bound, marker_view_of(markers, trials.labels, trials.sets)).to(self.like)
         given = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
         return ObservedMotions(
-            dataset, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **given
+            trials, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **given
         )
 
     def identified(self, model: str) -> Identification:

@@ -66,14 +66,14 @@ def identify(context: StageContext) -> None:
         path.unlink(missing_ok=True)
 
 
-def _accuracy(settings: StageSettings, dataset: Trials) -> Accuracy | None:
+def _accuracy(settings: StageSettings, trials: Trials) -> Accuracy | None:
     """Prior standard deviations of marker places; None if they are not identified."""
-    wanted, markers, bound = settings.identify.placement, settings.markers, dataset.bound
+    wanted, markers, bound = settings.identify.placement, settings.markers, trials.bound
     if wanted is None or markers is None or bound is None:
         return None
     turn, mounting = (None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting))
     centre = np.mean([*markers.reference.values()] or [*markers.tracked.values()], axis=0).tolist()
-    bodies = tuple((own.start, bound[own] - bound[own].mean(axis=0)) for own in corners_of(dataset.labels).values())
+    bodies = tuple((own.start, bound[own] - bound[own].mean(axis=0)) for own in corners_of(trials.labels).values())
     return Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies, centre)
 
 

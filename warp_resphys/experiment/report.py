@@ -234,28 +234,28 @@ class RunReader:
 
         Roll-outs with scaled inputs are left out.
         """
-        dataset, run = self.dataset, self.run
-        bound = whole_mesh(run).vertices if dataset.bound is None else dataset.bound
+        trials, run = self.dataset, self.run
+        bound = whole_mesh(run).vertices if trials.bound is None else trials.bound
         errors: ErrorTables = read_json(self.folder / ERRORS)
         with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
             rolled = tuple(map(str, read_attribute(file, "names")))
             test = [name for name in rolled if self.scaled is None or name not in self.scaled.names]
             models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
-            unknown = sorted(set(test) - set(dataset.names))
+            unknown = sorted(set(test) - set(trials.names))
             if unknown or not models:
                 what = f"names trials that {self.common / DATASET} does not hold ({', '.join(unknown)})"
                 what = what if unknown else "holds no model"
                 raise DataFileError(f"{self.folder / ROLLOUTS} {what}: delete it and run the same command again.")
-            shape = (len(rolled), *dataset.observed.shape[1:])
-            spread, known = (*shape[:2], len(owners(dataset.labels))), [m for m in models if f"{m}_spread" in file]
+            shape = (len(rolled), *trials.observed.shape[1:])
+            spread, known = (*shape[:2], len(owners(trials.labels))), [m for m in models if f"{m}_spread" in file]
             positions = {m: read_array(file, f"{m}_observed", shape)[: len(test)] for m in models}
             spreads = {m: read_array(file, f"{m}_spread", spread)[: len(test)] for m in known}
         calibrated = errors["intervals"]["models"] if "intervals" in errors else {}
-        half_widths = half_widths_of(dataset, test, calibrated, positions, spreads)
-        unseen = None if run.markers is None else marker_view_of(run.markers, dataset.labels, dataset.sets).unseen
-        rows = dataset.rows(test)
-        times, target = dataset.times[rows], dataset.observed[rows]
-        begins = tuple(dataset.begins[row] for row in rows)
+        half_widths = half_widths_of(trials, test, calibrated, positions, spreads)
+        unseen = None if run.markers is None else marker_view_of(run.markers, trials.labels, trials.sets).unseen
+        rows = trials.rows(test)
+        times, target = trials.times[rows], trials.observed[rows]
+        begins = tuple(trials.begins[row] for row in rows)
         seconds, length = run.trial_seconds, times.shape[1]
         if seconds is not None:
             target = np.where((times <= seconds)[..., None, None], target, np.nan)
@@ -264,14 +264,14 @@ class RunReader:
             length = 1
         return TrialResults(
             names=tuple(test),
-            labels=owners(dataset.labels),
+            labels=owners(trials.labels),
             begins=begins,
             times=times[:, :length],
-            target=as_markers(target[:, :length], dataset.labels),
-            positions={model: as_markers(points[:, :length], dataset.labels) for model, points in positions.items()},
-            bound=as_markers(bound, dataset.labels),
-            gravity=dataset.gravity,
-            time_step=dataset.time_step,
+            target=as_markers(target[:, :length], trials.labels),
+            positions={model: as_markers(points[:, :length], trials.labels) for model, points in positions.items()},
+            bound=as_markers(bound, trials.labels),
+            gravity=trials.gravity,
+            time_step=trials.time_step,
             half_widths={model: widths[:, :length] for model, widths in half_widths.items()},
             axes=tuple(axis for axis in range(3) if axis != unseen),
         )
@@ -279,7 +279,7 @@ class RunReader:
     @cached_property
     def film(self) -> Film | None:
         """Bodies of the film, placed as their markers are seen; None if there is no film."""
-        dataset, run = self.dataset, self.run
+        trials, run = self.dataset, self.run
         with read_hdf5(self.folder / ROLLOUTS, "rollouts") as file:
             if "film_steps" not in file:
                 return None
@@ -288,11 +288,11 @@ class RunReader:
             shape = (len(steps), None, 3)
             bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
             trial, times = str(read_attribute(file, "film_trial")), float(read_attribute(file, "time_step")) * steps
-        if dataset.bound is not None and run.markers is not None:
-            view = marker_view_of(run.markers, dataset.labels, dataset.sets)
+        if trials.bound is not None and run.markers is not None:
+            view = marker_view_of(run.markers, trials.labels, trials.sets)
             if view.own:
-                has = np.flatnonzero(dataset.present[dataset.names.index(trial)]).tolist()
-                markers = bound_markers(run.markers, self.body.mesh, dataset.bound, dataset.labels)
+                has = np.flatnonzero(trials.present[trials.names.index(trial)]).tolist()
+                markers = bound_markers(run.markers, self.body.mesh, trials.bound, trials.labels)
                 view, at = view.select(has), {model: torch.from_numpy(q) for model, q in bodies.items()}
                 bodies = {model: view.carried(q, markers(q)[:, has]).numpy() for model, q in at.items()}
         return Film(trial, times, bodies)
@@ -300,19 +300,19 @@ class RunReader:
     @cached_property
     def driven(self) -> Driven | None:
         """Driving inputs of all trials; None without actuators."""
-        dataset, scaled, quantity = self.dataset, self.scaled, driving_quantity(self.run)
-        if quantity is None or quantity.name not in dataset.inputs:
+        trials, scaled, quantity = self.dataset, self.scaled, driving_quantity(self.run)
+        if quantity is None or quantity.name not in trials.inputs:
             return None
         values: dict[str, FloatArray] = {}
-        for trials in filter(None, (dataset, scaled)):
-            values |= dict(zip(trials.names, trials.inputs[quantity.name], strict=True))
+        for one in filter(None, (trials, scaled)):
+            values |= dict(zip(one.names, one.inputs[quantity.name], strict=True))
         return Driven(
             quantity,
-            dataset.channels[quantity.name],
+            trials.channels[quantity.name],
             values,
             self.run.input_limit,
             scaled=() if scaled is None else scaled.names,
-            poses=tuple(n for n, begins in zip(dataset.names, dataset.begins, strict=True) if begins == STATIC),
+            poses=tuple(n for n, begins in zip(trials.names, trials.begins, strict=True) if begins == STATIC),
         )
 
     def recordings(self, mesh: Mesh, moved: Mapping[str, FloatArray]) -> Recordings | None:

@@ -87,8 +87,8 @@ class Comparison:
     @cached_property
     def film_steps(self) -> IntArray:
         """Steps of the inputs at which vertices are kept."""
-        dataset = self.motions.trials
-        steps = int(dataset.seconds([self.filmed]) / dataset.time_step + 1e-6)
+        trials = self.motions.trials
+        steps = int(trials.seconds([self.filmed]) / trials.time_step + 1e-6)
         return np.arange(0, steps + 1, max(-(-steps // _FILM_FRAMES), 1))
 
     @cached_property
@@ -157,8 +157,8 @@ class Comparison:
         return found
 
     def _spreads(self, names: Sequence[str], linear: Linear, left_out: bool = False) -> dict[str, FloatArray]:
-        dataset, models = self.motions.trials, self.models
-        spreads = {m: parameter_spread(dataset, names, models[m].identified, x, left_out) for m, x in linear.items()}
+        trials, models = self.motions.trials, self.models
+        spreads = {m: parameter_spread(trials, names, models[m].identified, x, left_out) for m, x in linear.items()}
         return {model: spread for model, spread in spreads.items() if spread is not None}
 
     @cached_property
@@ -202,29 +202,29 @@ class Comparison:
         Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`). The
         intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
         """
-        motions, dataset, test = self.motions, self.motions.trials, self.groups["1"]
-        names = [*chain(*dataset.batches(self.calibration))]
-        observed, target = dataset.observed[dataset.rows(names)], counted(motions, self.train, test)
-        rest = rest_places(dataset)
+        motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
+        names = [*chain(*trials.batches(self.calibration))]
+        observed, target = trials.observed[trials.rows(names)], counted(motions, self.train, test)
+        rest = rest_places(trials)
         learned = [row for row, name in enumerate(names) if name in self.train]
         observed[learned, motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
         linear = self._linearised(names, uncertain=True)
-        changes = {m: left_out_changes(dataset, names, self.models[m].identified, x) for m, x in linear.items()}
+        changes = {m: left_out_changes(trials, names, self.models[m].identified, x) for m, x in linear.items()}
         simulated, *_ = without_physics(motions, names, self.train, left_out=True)
         for model, parts in self._rolled_out[1].items():
             change = changes.get(model)
-            simulated[model] = self.parts.joined(parts, "observed", dataset.observed.shape[1])
+            simulated[model] = self.parts.joined(parts, "observed", trials.observed.shape[1])
             simulated[model] += 0.0 if change is None else change
         spreads, models = self._spreads(names, linear, left_out=True), dict[str, ModelIntervals]()
         for model in (model for model in simulated if model in self.simulated):
-            trials = predicted_trials(dataset, names, simulated[model], observed, spreads.get(model))
-            if (intervals := Intervals.calibrated(trials, rest)) is None:
+            predicted = predicted_trials(trials, names, simulated[model], observed, spreads.get(model))
+            if (intervals := Intervals.calibrated(predicted, rest)) is None:
                 continue
             new = self.simulated[model][: len(test)]
-            tested = predicted_trials(dataset, test, new, target, self.spreads.get(model))
+            tested = predicted_trials(trials, test, new, target, self.spreads.get(model))
             covered = coverage({name: intervals.covered(trial, rest) for name, trial in tested.items()})
             models[model] = {**intervals.plain(), **covered}
-            alone = Intervals.calibrated({name: replace(trial, spread=None) for name, trial in trials.items()}, rest)
+            alone = Intervals.calibrated({name: replace(trial, spread=None) for name, trial in predicted.items()}, rest)
             if model in self.spreads and alone is not None:
                 models[model]["without_spread"] = alone.plain()
         without = any(change is not None for change in changes.values())

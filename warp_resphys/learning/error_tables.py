@@ -68,17 +68,17 @@ class ComparedModels:
 
     def errors(self) -> ErrorTables:
         """Returns the tables that depend on the roll-outs alone."""
-        dataset, names = self.motions.trials, self.groups["1"]
+        trials, names = self.motions.trials, self.groups["1"]
         every, count = [name for group in self.groups.values() for name in group], len(names)
         points = counted(self.motions, self.train, every)
-        observed = as_markers(points, dataset.labels)
-        first = [first_frame(dataset, [name]) for name in every]
-        models = {model: as_markers(values, dataset.labels) for model, values in self.simulated.items()}
+        observed = as_markers(points, trials.labels)
+        first = [first_frame(trials, [name]) for name in every]
+        models = {model: as_markers(values, trials.labels) for model, values in self.simulated.items()}
         test = {model: values[:count] for model, values in models.items()}
         if self.reconstructed is not None:
             test["reconstruction"] = self.reconstructed
         errors = {model: _errors(x, observed, first) for model, x in test.items()}
-        sizes = {name: 1e3 * size for name, size in amplitudes(dataset, names).items()}
+        sizes = {name: 1e3 * size for name, size in amplitudes(trials, names).items()}
         content: ErrorTables = {
             "errors_mm": {model: summarise(rows) for model, rows in errors.items()},
             "per_trajectory": [
@@ -88,11 +88,11 @@ class ComparedModels:
         if self.reconstructed is not None:
             against = {m: _errors(x, self.reconstructed, first) for m, x in test.items() if m != "reconstruction"}
             content["errors_vs_reconstruction_mm"] = {model: summarise(rows) for model, rows in against.items()}
-        if dataset.bound is not None:
-            labels = owners(dataset.labels)
+        if trials.bound is not None:
+            labels = owners(trials.labels)
             seen = observed[:count]
             content["per_marker"] = {model: errors_per_marker(x, seen, labels) for model, x in test.items()}
-        if bodies := corners_of(dataset.labels):
+        if bodies := corners_of(trials.labels):
             content["orientations_deg"] = {
                 model: {name: _mean_angle(x[:count, :, at], points[:count, :, at]) for name, at in bodies.items()}
                 for model, x in self.simulated.items()
@@ -128,17 +128,17 @@ class ComparedModels:
 
     def _by_scale(self, models: Mapping[str, FloatArray], observed: FloatArray) -> ErrorTables:
         """Returns the entries on trials that left the training range, and on scaled inputs."""
-        dataset, count = self.motions.trials, len(self.groups["1"])
+        trials, count = self.motions.trials, len(self.groups["1"])
         content: ErrorTables = {}
         at = {scale: slice(i * count, (i + 1) * count) for i, scale in enumerate(self.groups)}
         ranges = {
-            scale: {m: _range(steps[rows], self.groups[scale], dataset.time_step) for m, steps in self.left.items()}
+            scale: {m: _range(steps[rows], self.groups[scale], trials.time_step) for m, steps in self.left.items()}
             for scale, rows in at.items()
         }
         if self.left:
             content["range"] = ranges["1"]
         if len(self.groups) > 1:
-            first = [first_frame(dataset, [name]) for name in self.groups["1"]]
+            first = [first_frame(trials, [name]) for name in self.groups["1"]]
             content["scales"] = {
                 scale: {m: summarise(_errors(x[rows], observed[rows], first)) for m, x in models.items()}
                 for scale, rows in at.items()
@@ -157,13 +157,13 @@ def counted(motions: ObservedMotions, train: Sequence[str], names: Sequence[str]
     return observed
 
 
-def amplitudes(dataset: Trials, names: Sequence[str]) -> dict[str, float]:
+def amplitudes(trials: Trials, names: Sequence[str]) -> dict[str, float]:
     """Root mean square displacement of the observed points [m], by trial."""
     sizes = dict[str, float]()
-    for name, row in zip(names, dataset.rows(names), strict=True):
-        frames = slice(1 if dataset.begin_of(name) == STATIC else None)
-        places = (dataset.observed[row, frames], dataset.held[row])
-        moved, before = (as_markers(x, dataset.labels) for x in places)
+    for name, row in zip(names, trials.rows(names), strict=True):
+        frames = slice(1 if trials.begin_of(name) == STATIC else None)
+        places = (trials.observed[row, frames], trials.held[row])
+        moved, before = (as_markers(x, trials.labels) for x in places)
         sizes[name] = float(np.sqrt(np.nanmean(np.square(moved - before).sum(-1))))
     return sizes
 

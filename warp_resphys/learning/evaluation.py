@@ -55,13 +55,13 @@ def evaluate(
         InputError: an input that the body does not take.
         ConvergenceError: no initial equilibrium.
     """
-    dataset, parts = motions.trials, parts or Parts("evaluate")
-    names = dataset.chosen(names)
+    trials, parts = motions.trials, parts or Parts("evaluate")
+    names = trials.chosen(names)
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
     order = [name for part in cut_up for name in part.names]
-    points = parts.joined(cut_up, "observed", dataset.observed.shape[1])[[order.index(name) for name in names]]
-    shown, observed = simulator.tensor(points), simulator.tensor(dataset.observed[dataset.rows(names)])
+    points = parts.joined(cut_up, "observed", trials.observed.shape[1])[[order.index(name) for name in names]]
+    shown, observed = simulator.tensor(points), simulator.tensor(trials.observed[trials.rows(names)])
     away = motions.observe.residual(shown.nan_to_num(math.inf), observed).norm(dim=-1).nan_to_num(math.inf)
     seen = torch.isfinite(observed).all(-1)
     return np.asarray(torch.where(seen, away, torch.nan).nanmean(2).T.cpu().numpy())
@@ -252,9 +252,9 @@ class TrialRollout:
         return [marker_errors(x[: len(y)], y) for x, y in pairs]
 
 
-def first_frame(dataset: Trials, names: Sequence[str]) -> int:
+def first_frame(trials: Trials, names: Sequence[str]) -> int:
     """First frame that counts in errors: 1 if the roll-out starts from the given state, else 0."""
-    return int(dataset.begin_of(names[0]) == GIVEN)
+    return int(trials.begin_of(names[0]) == GIVEN)
 
 
 def rollout_error(

@@ -276,20 +276,20 @@ def _quantiles(scores: Sequence[FloatArray], level: float) -> FloatArray:
 
 
 def intervals_of_each_other(
-    dataset: Trials, names: Sequence[str], simulated: Sequence[FloatArray], spreads: Sequence[FloatArray] | None
+    trials: Trials, names: Sequence[str], simulated: Sequence[FloatArray], spreads: Sequence[FloatArray] | None
 ) -> ModelIntervals | None:
     """Coverage of intervals of which each trial's are calibrated on the others; None if some cannot be calibrated.
 
     Args:
-        dataset: with the trials.
+        trials: with those of the names.
         names: names of R trials.
         simulated: (T, M, 3) of each trial, by models that have not learned from it [m].
         spreads: (T, M) variances due to the parameters [m^2]; None if they are not known.
     """
-    trials = predicted_trials(dataset, names, simulated, dataset.observed[dataset.rows(names)], spreads)
-    covered, rest = dict[str, tuple[FloatArray, FloatArray]](), rest_places(dataset)
-    for out, trial in trials.items():
-        intervals = Intervals.calibrated({name: other for name, other in trials.items() if name != out}, rest)
+    predicted = predicted_trials(trials, names, simulated, trials.observed[trials.rows(names)], spreads)
+    covered, rest = dict[str, tuple[FloatArray, FloatArray]](), rest_places(trials)
+    for out, trial in predicted.items():
+        intervals = Intervals.calibrated({name: other for name, other in predicted.items() if name != out}, rest)
         if intervals is None:
             return None
         covered[out] = intervals.covered(trial, rest)
@@ -297,7 +297,7 @@ def intervals_of_each_other(
 
 
 def half_widths_of(
-    dataset: Trials,
+    trials: Trials,
     names: Sequence[str],
     intervals: Mapping[str, ModelIntervals],
     simulated: Mapping[str, FloatArray],
@@ -306,31 +306,31 @@ def half_widths_of(
     """Half-widths (R, T, M) of the intervals of markers and rigid bodies [m], by model that has intervals.
 
     Args:
-        dataset: with the trials.
+        trials: with those of the names.
         names: names of R trials.
         intervals: by model, as in errors.json.
         simulated: (R, T, M, 3) [m] by model.
         spreads: (R, T, M) variances due to the parameters [m^2], by model.
     """
     known = {model: Intervals.from_plain(plain) for model, plain in intervals.items()}
-    since = since_change(dataset, names)
+    since = since_change(trials, names)
     return {
         model: of_model.half_widths(
-            as_markers(simulated[model], dataset.labels), rest_places(dataset), since, spreads.get(model)
+            as_markers(simulated[model], trials.labels), rest_places(trials), since, spreads.get(model)
         )
         for model, of_model in known.items()
         if of_model is not None and model in simulated
     }
 
 
-def rest_places(dataset: Trials) -> FloatArray:
+def rest_places(trials: Trials) -> FloatArray:
     """(M, 3) markers on the undeformed body [m]; a rigid body is one."""
-    assert dataset.bound is not None
-    return as_markers(dataset.bound, dataset.labels)
+    assert trials.bound is not None
+    return as_markers(trials.bound, trials.labels)
 
 
 def predicted_trials(
-    dataset: Trials,
+    trials: Trials,
     names: Sequence[str],
     simulated: Sequence[FloatArray] | FloatArray,
     observed: FloatArray,
@@ -338,8 +338,8 @@ def predicted_trials(
 ) -> dict[str, Predicted]:
     """Trials as they were predicted and observed; rigid bodies count as one marker."""
     known = [None] * len(names) if spreads is None else spreads
-    rows = zip(names, simulated, observed, since_change(dataset, names), known, strict=True)
+    rows = zip(names, simulated, observed, since_change(trials, names), known, strict=True)
     return {
-        name: Predicted(as_markers(x, dataset.labels), as_markers(y, dataset.labels), since, spread)
+        name: Predicted(as_markers(x, trials.labels), as_markers(y, trials.labels), since, spread)
         for name, x, y, since, spread in rows
     }

@@ -43,47 +43,47 @@ def without_physics(
         By model: the observed points (R, T, M, 3) [m], the settings in words, and of models that cannot predict all
         trials, the reason.
     """
-    dataset = motions.trials
-    shape = (len(names), *dataset.observed.shape[1:])
+    trials = motions.trials
+    shape = (len(names), *trials.observed.shape[1:])
     values: dict[str, FloatArray] = {}
     settings: dict[str, str] = {}
     missing: dict[str, str] = {}
-    for batch in _batches(dataset, names, train if left_out else ()):
-        begins, without = _kind(dataset.begin_of(batch[0])), batch if left_out else ()
-        alike = [name for name in train if name not in without and _kind(dataset.begin_of(name)) == begins]
-        shown = _at_steps(dataset, alike, batch) if begins == "released" else dataset
-        trials, asked = _motions(motions, shown, alike, batch)
-        trials = trials.select(np.asarray(np.isfinite(trials.values).any((1, 2))))
-        made = predictions(trials, asked) if len(trials.values) else {REST: at_rest(asked)}
+    for batch in _batches(trials, names, train if left_out else ()):
+        begins, without = _kind(trials.begin_of(batch[0])), batch if left_out else ()
+        alike = [name for name in train if name not in without and _kind(trials.begin_of(name)) == begins]
+        shown = _at_steps(trials, alike, batch) if begins == "released" else trials
+        plain, asked = _motions(motions, shown, alike, batch)
+        plain = plain.select(np.asarray(np.isfinite(plain.values).any((1, 2))))
+        made = predictions(plain, asked) if len(plain.values) else {REST: at_rest(asked)}
         rows = [names.index(name) for name in batch]
         for model, own in made.items():
             seen = np.isfinite(own.values).any(1, keepdims=True)
             known = np.where(seen, own.values, made[REST].values).reshape(len(batch), -1, *shape[2:])
             if begins == "released":
-                times = torch.from_numpy(dataset.times[dataset.rows(batch)])
-                known = sample(torch.from_numpy(known), times, dataset.time_step).numpy()
+                times = torch.from_numpy(trials.times[trials.rows(batch)])
+                known = sample(torch.from_numpy(known), times, trials.time_step).numpy()
             elif begins == RESTING[0] and motions.release.delay > 0.0:
                 known = _on_time(motions, batch, known)
             values.setdefault(model, np.full(shape, np.nan))[rows] = known
             settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), own.settings))))
         for model in (model for model in BASELINES if model not in made):
-            reason = _LACKING[model] if len(trials.values) else f"no other training trial begins like {batch[0]}"
+            reason = _LACKING[model] if len(plain.values) else f"no other training trial begins like {batch[0]}"
             missing.setdefault(model, reason)
     whole = [model for model in BASELINES if model in values and model not in missing]
     return {model: values[model] for model in whole}, {model: settings[model] for model in whole}, missing
 
 
-def _at_steps(dataset: Trials, learned: Sequence[str], asked: Sequence[str]) -> Trials:
-    """A dataset with the observations of some trials at the time steps, as far as these and others last."""
-    rows, step = dataset.rows(learned), dataset.time_step
-    last = float(dataset.times[[*rows, *dataset.rows(asked)]].max())
+def _at_steps(trials: Trials, learned: Sequence[str], asked: Sequence[str]) -> Trials:
+    """Returns the trials with the observations of some at the time steps, as far as these and others last."""
+    rows, step = trials.rows(learned), trials.time_step
+    last = float(trials.times[[*rows, *trials.rows(asked)]].max())
     times = step * np.arange(int(np.ceil(last / step - 1e-6)) + 1)
-    observed = np.full((len(dataset.names), len(times), *dataset.observed.shape[2:]), np.nan)
+    observed = np.full((len(trials.names), len(times), *trials.observed.shape[2:]), np.nan)
     if rows:
-        own_times, seen, held = (torch.from_numpy(x[rows]) for x in (dataset.times, dataset.observed, dataset.held))
+        own_times, seen, held = (torch.from_numpy(x[rows]) for x in (trials.times, trials.observed, trials.held))
         positions = at_steps(TrialBatch(tuple(learned), own_times, seen, held), step)
         observed[rows, : positions.shape[1]] = positions
-    return replace(dataset, times=np.broadcast_to(times, (len(dataset.names), len(times))), observed=observed)
+    return replace(trials, times=np.broadcast_to(times, (len(trials.names), len(times))), observed=observed)
 
 
 def _kind(begins: str) -> str:
@@ -93,12 +93,12 @@ def _kind(begins: str) -> str:
 
 def _on_time(motions: ObservedMotions, names: Sequence[str], predicted: FloatArray) -> FloatArray:
     """(R, T, M, 3) predicted motions with the delay that the first frames of each trial show [m]."""
-    dataset, settings = motions.trials, motions.release
-    rows = dataset.rows(names)
+    trials, settings = motions.trials, motions.release
+    rows = trials.rows(names)
     shown: BoolArray = np.asarray(np.isfinite(predicted).all(axis=(2, 3)))
     last = np.maximum.accumulate(np.where(shown, np.arange(shown.shape[1]), 0), axis=1)  # held after the prediction
     series = torch.from_numpy(np.take_along_axis(predicted, last[..., None, None], 1))
-    times, observed = torch.from_numpy(dataset.times[rows]), torch.from_numpy(dataset.observed[rows])
+    times, observed = torch.from_numpy(trials.times[rows]), torch.from_numpy(trials.observed[rows])
     first = times[:, : int((times <= settings.window + 1e-9).any(0).sum())]
 
     def delayed(times: torch.Tensor, delay: torch.Tensor) -> torch.Tensor:
@@ -111,31 +111,31 @@ def _on_time(motions: ObservedMotions, names: Sequence[str], predicted: FloatArr
     return np.where(shown[..., None, None], moved, np.nan)
 
 
-def _batches(dataset: Trials, names: Sequence[str], alone: Sequence[str]) -> Iterator[Sequence[str]]:
+def _batches(trials: Trials, names: Sequence[str], alone: Sequence[str]) -> Iterator[Sequence[str]]:
     """Trials that begin in the same way; some by themselves."""
-    for batch in dataset.batches(names):
+    for batch in trials.batches(names):
         yield from ([name] for name in batch if name in alone)
         if others := [name for name in batch if name not in alone]:
             yield others
 
 
 def _motions(
-    motions: ObservedMotions, dataset: Trials, learned: Sequence[str], asked: Sequence[str]
+    motions: ObservedMotions, trials: Trials, learned: Sequence[str], asked: Sequence[str]
 ) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
     made = list[PlainTrials]()
     for names in (learned, asked):
-        rows = dataset.rows(names)
+        rows = trials.rows(names)
         values, first = (
-            x[rows].reshape(len(rows), *x.shape[1:-2], 3 * x.shape[-2]) for x in (dataset.observed, dataset.held)
+            x[rows].reshape(len(rows), *x.shape[1:-2], 3 * x.shape[-2]) for x in (trials.observed, trials.held)
         )
-        acting, loads = driving(dataset, names), dataset.payload[rows][:, None]
+        acting, loads = driving(trials, names), trials.payload[rows][:, None]
         if not made:
             values[:, motions.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
             sizes, load = {name: _size(own) for name, own in acting.items()}, _size(loads)
             ends = np.array([_end(own) for own in values]).reshape(-1, first.shape[1])
             rest = np.array([_mean(column) for column in ends.T])
-        settles = dataset.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
+        settles = trials.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
         frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
         origin = np.where(np.isfinite(rest), rest, first) if settles else first
         made.append(PlainTrials(values, origin, first, np.concatenate(frames, 2), loads / load))

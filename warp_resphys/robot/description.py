@@ -251,13 +251,13 @@ def describe(folder: Path, model: str) -> Description:
         raise InputError(f"the model is {model!r}: {folder} has {listed(models)}.")
     kind, _ = experiment.sources(model)
     kind = "simulation" if kind == "identified" and settings.identify is None else kind
-    simulator, dataset = experiment.simulator(kind), experiment.trials
+    simulator, trials = experiment.simulator(kind), experiment.trials
     identified = experiment.identified(model)
     errors: ErrorTables = read_if_there(folder / ERRORS)
     calibrated = errors["intervals"]["models"].get(model, {}) if "intervals" in errors else {}
     learned, actuation = experiment.learned(model), settings.actuation
     base = None if learned is None else experiment.motions.base_movement_mask(simulator)
-    moved = dataset.contact_at(dataset.names, simulator.body, dataset.time_step)
+    moved = trials.contact_at(trials.names, simulator.body, trials.time_step)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),
         model=model,
@@ -268,9 +268,9 @@ def describe(folder: Path, model: str) -> Description:
         uncertainty=identified.uncertainty,
         payload_at=settings.payload_at,
         markers=settings.markers,
-        labels=dataset.labels,
-        sets=dataset.sets,
-        bound=None if dataset.bound is None else torch.from_numpy(dataset.bound),
+        labels=trials.labels,
+        sets=trials.sets,
+        bound=None if trials.bound is None else torch.from_numpy(trials.bound),
         placement=identified.placement,
         learned=learned,
         filters=actuation.filter_time_constants,
@@ -278,7 +278,7 @@ def describe(folder: Path, model: str) -> Description:
         told_of_base=None if base is None else tuple(base.tolist()),
         seen={
             name: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist()))
-            for name, x in {**dataset.inputs, **moved}.items()
+            for name, x in {**trials.inputs, **moved}.items()
         },
         intervals=Intervals.from_plain(calibrated.get("without_spread", calibrated)),
         level=errors["intervals"]["level"] if "intervals" in errors else LEVEL,

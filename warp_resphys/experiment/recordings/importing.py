@@ -74,10 +74,10 @@ def import_scaled(context: StageContext) -> None:
         DataFileError: a recording cannot be read or used.
     """
     recorded = RegisteredTrials(context.settings, context.run_dir)
-    dataset = Trials.read(context.run_dir / DATASET)
-    assert dataset.bound is not None
-    shifts = _shifts(recorded, dataset.bound, _offsets(recorded))
-    _dataset(recorded, dataset.bound, shifts, dataset.gravity).write(context.run_dir / SCALED_DATASET)
+    trials = Trials.read(context.run_dir / DATASET)
+    assert trials.bound is not None
+    shifts = _shifts(recorded, trials.bound, _offsets(recorded))
+    _dataset(recorded, trials.bound, shifts, trials.gravity).write(context.run_dir / SCALED_DATASET)
 
 
 def _check_input_unit(recorded: RegisteredTrials) -> None:

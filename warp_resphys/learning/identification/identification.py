@@ -129,9 +129,9 @@ def _learned(motions: ObservedMotions, replays: Sequence[tuple[Replay, Start]], 
     return min(motions.train_fraction * max(float(r.trials.times.max()) for r, _ in replays), seconds or math.inf)
 
 
-def _bounds_of_owners(ranges: Mapping[str, Bounds], dataset: Trials, names: Sequence[str]) -> dict[str, Bounds]:
+def _bounds_of_owners(ranges: Mapping[str, Bounds], trials: Trials, names: Sequence[str]) -> dict[str, Bounds]:
     """Bounds of all parameters, and of the values of trials and sessions."""
-    owners = {"session": list(dict.fromkeys(map(dataset.session, names))), "trial": [*names]}
+    owners = {"session": list(dict.fromkeys(map(trials.session, names))), "trial": [*names]}
     return {
         full: limits
         for name, limits in ranges.items()

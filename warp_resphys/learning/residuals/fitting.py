@@ -158,10 +158,10 @@ class Fitting:
 
         States are the reconstructed ones; those of the trials themselves, with zero forces, if `simulated` and known.
         """
-        dataset = self.motions.trials
-        if simulated and dataset.velocity is not None:
-            rows = dataset.rows(names)
-            q, v = (torch.as_tensor(field[rows], device=self.device) for field in (dataset.observed, dataset.velocity))
+        trials = self.motions.trials
+        if simulated and trials.velocity is not None:
+            rows = trials.rows(names)
+            q, v = (torch.as_tensor(field[rows], device=self.device) for field in (trials.observed, trials.velocity))
             return q, v, q.new_zeros(()).expand_as(q), torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool)
         if self.reconstructed is None:
             raise InputError("the trials have no velocities of all vertices to learn from: reconstruct them first.")

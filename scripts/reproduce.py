@@ -100,8 +100,8 @@ def main() -> None:
         beams, robots = selected(options.only)
         runs = []
         for name, variant in beams:
-            own = ROWS["beams"][name].get("overrides", ())
-            overrides = [*own, *ROWS["variants"][variant]["overrides"], *beyond]
+            of_beam = ROWS["beams"][name].get("overrides", ())
+            overrides = [*of_beam, *ROWS["variants"][variant]["overrides"], *beyond]
             runs.append(run_of(f"{name}/{variant}", name, overrides))
         folders = {name: ROWS["robots"][name].get("recordings") for name in robots}  # none where a simulation plays
         places = {name: folder and options.data / folder for name, folder in folders.items()}
@@ -201,7 +201,7 @@ def measure(run: Run, beyond: Sequence[str]) -> dict[str, Any]:
     how = "each held out once" if len(folds) > 1 else "held out"
     if run.data.get("train_fraction", 1.0) < 1.0 and {*tested} <= {*run.data["train"]}:
         how = "in the part that was not used for training"
-    errors = {model: own for model, own in trial_errors(metrics).items() if model in COMPARED}
+    errors = {model: error for model, error in trial_errors(metrics).items() if model in COMPARED}
     intervals = metrics["intervals"]["models"].get("resphys") if "intervals" in metrics else None
     return {
         "day": str(made["finished"]).partition("T")[0],
@@ -275,7 +275,7 @@ def _time_table(labels: Sequence[str], columns: Mapping[str, Run]) -> list[str]:
 
     rows = []
     for key, (label, mean, std) in timing["published"].items():
-        ours = [text(own[key]["mean"], own[key]["std"], n) for own, n in zip(seconds, steps, strict=True)]
+        ours = [text(second[key]["mean"], second[key]["std"], n) for second, n in zip(seconds, steps, strict=True)]
         rows.append([label, text(mean, std, timing["steps"]), *ours])
     note = f"Published: trajectories of {timing['steps']} steps; here: of {' and '.join(sorted({*map(str, steps)}))}."
     return [

@@ -91,8 +91,8 @@ def measure_grippers(arguments: argparse.Namespace) -> dict[str, Any]:
     rows = list[dict[str, Any]]()
     for batch in arguments.batches or BATCHES[choose_device(arguments.device).type]:
         (unknowns, lift), (_, without) = (grasp(arguments, batch, contact) for contact in (True, False))
-        (own, free), _ = take_turns(f"{batch} grippers", [lift, without], arguments.repeats)
-        ms = own.pop("ms")
+        (touching, free), _ = take_turns(f"{batch} grippers", [lift, without], arguments.repeats)
+        ms = touching.pop("ms")
         head = {"grippers": batch, "unknowns": unknowns, "grasp_ms": ms, "steps_per_s": 1e3 * batch / ms}
-        rows.append({**head, **own, "without_contact_ms": free["ms"], "iterations_without": free["iterations"]})
+        rows.append({**head, **touching, "without_contact_ms": free["ms"], "iterations_without": free["iterations"]})
     return {f"a step of {1e3 * TIME_STEP:g} ms of all grippers": rows}

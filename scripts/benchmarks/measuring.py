@@ -50,12 +50,12 @@ def take_turns(
     yardsticks = []
     with Progress(title, repeats * len(tasks), "runs") as progress:
         for _ in range(repeats):
-            for task, own in zip(tasks, figures, strict=True):
-                own.append(task())
+            for task, timed in zip(tasks, figures, strict=True):
+                timed.append(task())
                 progress.advance()
             with threadpool_limits(1):
                 yardsticks.append(median_ms(lambda: np.linalg.cholesky(random @ random.T + _SIZE * np.eye(_SIZE)), 5))
-    return [{name: median(row[name] for row in own) for name in own[0]} for own in figures], median(yardsticks)
+    return [{name: median(row[name] for row in timed) for name in timed[0]} for timed in figures], median(yardsticks)
 
 
 def solves(path: Motion) -> dict[str, float]:

@@ -147,14 +147,14 @@ def measure_peers(arguments: argparse.Namespace) -> dict[str, Any]:
                 run, clearance = MAKERS[program](scene, device, h, *values), values[0] if program == OURS else 0.0
                 tasks.append(partial(scene.compare, run, h, clearance, expected))
         figures, _ = take_turns(name, tasks, arguments.repeats)
-        rows = [{**head, **own} for head, own in zip(heads, figures, strict=True)]
+        rows = [{**head, **measured} for head, measured in zip(heads, figures, strict=True)]
         tables[name] = [{**row, "our_load_at_that_error": at_equal_error(row, rows)} for row in rows]
     return tables
 
 
 def at_equal_error(row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
     """Returns our least load at no more than the error of a peer's row, as text; a dash if no row reaches it."""
-    loads = [own["load"] for own in rows if own["program"] == OURS and own["error_mm"] <= row["error_mm"]]
+    loads = [other["load"] for other in rows if other["program"] == OURS and other["error_mm"] <= row["error_mm"]]
     return "" if row["program"] == OURS else f"{min(loads):.3g}" if loads else "-"
 
 

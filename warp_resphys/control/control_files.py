@@ -71,14 +71,14 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
     try:
         orders, arrays = values.pop("orders"), {name: tensor.numpy() for name, tensor in tensors.items()}
         values |= arrays | {name: _KINDS.get(name, Polynomial)(arrays[name], order) for name, order in orders.items()}
-        own = {field.name: values[field.name] for field in fields(ReducedModel) if field.name != "force"}
-        own |= {key: tuple(own[key]) for key in ("labels", "filters", "times")}
+        arguments = {field.name: values[field.name] for field in fields(ReducedModel) if field.name != "force"}
+        arguments |= {key: tuple(arguments[key]) for key in ("labels", "filters", "times")}
         if "push" not in orders:
-            return ReducedModel(**own)
+            return ReducedModel(**arguments)
         if learned is None:
             raise InputError("the reduced model has a learned force: pass `robot.description.learned`.")
         force = ReducedForce(learned.network, learned.range_, **{name: values[name] for name in _FORCE})
-        return ReducedModel(**own, force=force)
+        return ReducedModel(**arguments, force=force)
     except KeyError as error:
         raise DataFileError(f"{path} is of an earlier version: delete it and run the same command again.") from error
 

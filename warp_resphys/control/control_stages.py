@@ -201,8 +201,8 @@ def _driven(settings: StageSettings, folder: Path, name: str, steps: int, report
     planner = task.planner(linear, path, control.horizon, *_RECEDING)
     controllers.append(LinearRecedingHorizon(planner, linear, rest[len(plans) + len(controllers)]))
     for gain in control.feedback.gains:
-        own = rest[len(plans) + len(controllers)]
-        controllers.append(JacobianFeedback(jacobian, control.limits, gain, task.time_step, task.tracked, path, own))
+        start = rest[len(plans) + len(controllers)]
+        controllers.append(JacobianFeedback(jacobian, control.limits, gain, task.time_step, task.tracked, path, start))
     inputs, seconds = list[FloatArray](), list[FloatArray]()
 
     def step(state: State, number: int) -> State:

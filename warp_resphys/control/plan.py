@@ -206,8 +206,8 @@ def follow(
         inputs = kept + shares[:, None, None] * (wanted - kept)
     rows = zip(paths, kept, kept_markers, np.array(errors).T, strict=True)
     return [
-        {"path": path, "inputs": own, "points": markers[1:] @ tracked.T, "markers": markers, "errors_mm": mm}
-        for path, own, markers, mm in rows
+        {"path": path, "inputs": commands, "points": markers[1:] @ tracked.T, "markers": markers, "errors_mm": mm}
+        for path, commands, markers, mm in rows
     ]
 
 

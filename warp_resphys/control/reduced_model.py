@@ -82,15 +82,15 @@ class ReducedState:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays of the state by name."""
-        own = {key: array for key, array in vars(self).items() if key != "memory"}
-        return own | {f"memory.{key}": array for key, array in self.memory.items()}
+        known = {key: array for key, array in vars(self).items() if key != "memory"}
+        return known | {f"memory.{key}": array for key, array in self.memory.items()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ReducedState":
         """Restores the state from its `arrays`."""
-        own = {key: array for key, array in arrays.items() if not key.startswith("memory.")}
-        memory = {key.removeprefix("memory."): arrays[key] for key in arrays.keys() - own.keys()}
-        return cls(memory=memory, **own)
+        arguments = {key: array for key, array in arrays.items() if not key.startswith("memory.")}
+        memory = {key.removeprefix("memory."): arrays[key] for key in arrays.keys() - arguments.keys()}
+        return cls(memory=memory, **arguments)
 
 
 @dataclass(frozen=True)

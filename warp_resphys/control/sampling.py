@@ -289,14 +289,14 @@ class Source:
         order = np.argsort(values)[:modes]
         shapes = torch.zeros(q[0].numel(), modes, dtype=torch.float64, device=q.device)
         shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(vectors[:, order], device=q.device)
-        own = np.diag(values[order])
+        modal_stiffness = np.diag(values[order])
         damped, inertia = self._viscous.linearised(state, **given)[:2]
         # The Hessian of a step of length s is M / s^2 + D / s + K.
         step = float(np.sqrt(mass.diagonal()[0] / inertia.diagonal()[0]))
         kept = vectors[:, order]
         damping = step * (kept.T @ ((damped - hessian) @ kept))
         branches, gamma = (
-            np.zeros((len(self.times), *own.shape)),
+            np.zeros((len(self.times), *modal_stiffness.shape)),
             relaxation(torch.tensor(self.times), robot.time_step)[1],
         )
         for number, branch in enumerate(self._branches):
@@ -308,16 +308,16 @@ class Source:
 
         shown = torch.func.jacfwd(seen)(zero).double().cpu().numpy()
         if outputs is None:
-            return Tangent(shapes, own, damping, shown, branches, None)
+            return Tangent(shapes, modal_stiffness, damping, shown, branches, None)
         outputs, width = outputs[None], len(outputs)
-        by_q = np.zeros_like(own)
+        by_q = np.zeros_like(modal_stiffness)
         if robot.frames is not None:  # The force turns with the body after the step, so that it contributes to A.
             pull = torch.func.jacfwd(lambda by: self._pull(State(q + _moved(by, columns), still), outputs).flatten())
             by_q = (shapes.mT @ pull(zero).double()).cpu().numpy()
         unit = self._pull(State(q.expand(width, -1, -1), still.expand(width, -1, -1)), np.eye(width))
         zero_force = self._pull(State(q, still), np.zeros((1, width)))
         push = (shapes.mT @ (unit - zero_force).flatten(1).mT.double()).cpu().numpy()
-        return Tangent(shapes, own - by_q, damping, shown, branches, push)
+        return Tangent(shapes, modal_stiffness - by_q, damping, shown, branches, push)
 
 
 def _moved(amounts: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:

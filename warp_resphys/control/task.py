@@ -172,8 +172,10 @@ class Task:
     @property
     def paths(self) -> list[Path]:
         """The curves, one for each shape."""
-        own = self.figures
-        return [Path(name, size=own.size, centre=own.centre, right=own.right, up=own.up) for name in own.shapes]
+        shown = self.figures
+        return [
+            Path(name, size=shown.size, centre=shown.centre, right=shown.right, up=shown.up) for name in shown.shapes
+        ]
 
     def steps(self, seconds: float) -> int:
         """Number T of steps of a motion whose curve takes so long."""

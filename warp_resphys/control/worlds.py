@@ -221,7 +221,7 @@ class Laboratory(RobotWorld):
         self._seeds = (settings.seed, _STREAM, seed)
         trials, reference = read_json(run_dir / REGISTRATION).values(), make_setup(settings).reference
         seen = [trial["positions"] for trial in trials if "positions" in trial]
-        places = np.mean([[own[label] for label in settings.binding.reference] for own in seen], axis=0)
+        places = np.mean([[places_of[label] for label in settings.binding.reference] for places_of in seen], axis=0)
         self._frame = kabsch(reference, places)  # from the frame of the body to that of the experiment
 
     @override

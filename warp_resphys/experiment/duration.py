@@ -45,8 +45,8 @@ def announcement(
         times: factor of the duration, as of several folds.
     """
     folder.mkdir(parents=True, exist_ok=True)  # The dataset of a fold lies beside it.
-    own = {one.name: one.settings for one in stages if isinstance(one.settings, StageSettings)}
-    experiments = {name: Experiment(settings, folder, "count") for name, settings in own.items()}
+    known = {one.name: one.settings for one in stages if isinstance(one.settings, StageSettings)}
+    experiments = {name: Experiment(settings, folder, "count") for name, settings in known.items()}
     works = {name: work for name, one in experiments.items() if (work := work_of(name, one)) is not None}
     amount = times * sum(steps + _RECONSTRUCTION * forces for steps, forces, _ in works.values())
     vertices = next(iter(experiments.values())).body.n_vertices if works else 0
@@ -57,7 +57,7 @@ def announcement(
         for reconstructed, number in ((False, steps), (True, forces)):
             if number and reconstructed not in paces:
                 paces[reconstructed] = pace_of(experiments[name], reconstructed)
-        one = own[name]  # workers share trials that are reconstructed, and test trials
+        one = known[name]  # workers share trials that are reconstructed, and test trials
         names = one.groups["1"] if name == "evaluate" else one.reconstructed
         shared = min(workers.count, max(math.ceil(len(names) / (one.batch or len(names) or 1)), 1))
         seconds[name] = times * (steps * paces.get(False, 0.0) + forces * paces.get(True, 0.0) + training) / shared
@@ -65,10 +65,10 @@ def announcement(
         return ""
     longest = sorted(seconds, key=lambda name: -seconds[name])[:3]
     parts = ", ".join(f"{name} {duration_text(seconds[name])}" for name in longest)
-    others = [name for name in own if name not in seconds]
+    others = [name for name in known if name not in seconds]
     without = f", without {', '.join(others)}" if others else ""
     shorter = ["a coarser mesh", "fewer or shorter trials"]
-    most = len(own["identify"].identify.parameters) if "identify" in own else 0
+    most = len(known["identify"].identify.parameters) if "identify" in known else 0
     shorter += [f"fewer of the {number_of(most, 'parameter')} of identify.parameters"] if most > 1 else []
     shorter += [] if quick else ["or at first budget=quick"]
     took = f"about {duration_text(sum(seconds.values()))} more for {vertices:,} vertices"
@@ -104,7 +104,7 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
         names = train if wanted.trials is None else tuple(evenly(train, wanted.trials))
         evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
         searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-        each = {model: evaluations * (1.0 + _VARIED * len(own)) for model, own in searches.items() if own}
+        each = {model: evaluations * (1.0 + _VARIED * len(ranges)) for model, ranges in searches.items() if ranges}
         return sum(number * steps_of(experiment, m, names, wanted.seconds) for m, number in each.items()), 0.0, 0.0
     return None
 

@@ -100,15 +100,15 @@ class Experiment:
     def settings_of(self, kind: str) -> SimulatorSettings:
         """Settings of a simulator of some kind, see `simulator`."""
         settings, identified = self.settings, self.settings.identify
-        own: dict[str, Any] = {"gravity": tuple(self.trials.gravity.tolist())}
+        changes: dict[str, Any] = {"gravity": tuple(self.trials.gravity.tolist())}
         if kind == "published":
             published = settings.published
             assert published is not None
-            own |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
+            changes |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
         elif kind in ("identified", LAW) and identified is not None and identified.integrator is not None:
-            own |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
+            changes |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
         chosen = target_settings(settings, settings.target) if kind == "target" else SimulatorSettings.of(settings)
-        return chosen.model_copy(update=own)
+        return chosen.model_copy(update=changes)
 
     def material_of(self, kind: str) -> MaterialSettings:
         """Material of a simulator of some kind, see `simulator`."""

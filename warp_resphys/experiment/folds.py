@@ -115,8 +115,8 @@ def intervals_of_folds(folder: Path, folders: Mapping[str, Path]) -> IntervalTab
     data, names, models = Trials.read(folder / DATASET), list(folders), dict[str, ModelIntervals]()
     for model in (*BASELINES, *INTERVAL_MODELS) if data.bound is not None and len(names) > 2 else ():
         series: dict[str, list[FloatArray]] = {"observed": [], "spread": []}
-        for own in folders.values():
-            with read_hdf5(own / ROLLOUTS, "rollouts") as file:
+        for fold in folders.values():
+            with read_hdf5(fold / ROLLOUTS, "rollouts") as file:
                 for key, rows in series.items():
                     rows += [read_array(file, f"{model}_{key}")[0]] if f"{model}_{key}" in file else []
         if len(series["observed"]) == len(names):

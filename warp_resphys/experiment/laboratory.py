@@ -143,10 +143,10 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     poses = still if base is None else base[0]
     positions = setup.recorded(series, poses)
     noise = laboratory.noise * draw.standard_normal(positions.shape)
-    for own in corners_of(settings.binding.observed).values():
+    for corners in corners_of(settings.binding.observed).values():
         turns = np.radians(laboratory.orientation_noise) * draw.standard_normal((len(positions), 3))
-        spoke = positions[:, own] - positions[:, own].mean(axis=1, keepdims=True)
-        noise[:, own] = noise[:, own][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
+        spoke = positions[:, corners] - positions[:, corners].mean(axis=1, keepdims=True)
+        noise[:, corners] = noise[:, corners][:, :1] + spoke @ Rotation.from_rotvec(-turns).as_matrix() - spoke
     labels = [*settings.binding.observed, *settings.binding.reference]
     for name in [name for name, motion in data.obstacle_motion.items() if motion == "recorded"]:
         way = pushing[name][0] if name in pushing else still
@@ -216,10 +216,10 @@ def make_setup(settings: StageSettings) -> Setup:
     count, observed = len(binding.tracked), nominal_places(binding, body.mesh)
     nominal = np.array([*observed[:count], *binding.reference.values()], dtype=np.float64)
     places = nominal + laboratory.placement_noise * draw.standard_normal(nominal.shape)
-    for own in corners_of(binding.observed).values():
-        mounting, centre = Rotation.random(random_state=draw), observed[own].mean(axis=0)
+    for corners in corners_of(binding.observed).values():
+        mounting, centre = Rotation.random(random_state=draw), observed[corners].mean(axis=0)
         moved = centre + draw.uniform(-_LARGEST_MOUNTING, _LARGEST_MOUNTING, 3)
-        observed[own] = moved + mounting.apply(observed[own] - centre)
+        observed[corners] = moved + mounting.apply(observed[corners] - centre)
     observed[:count] = places[:count]
     return Setup(gravity, RigidTransform(rotation.as_matrix(), translation), observed, places[count:])
 
@@ -329,8 +329,8 @@ def _played(settings: StageSettings, names: Sequence[str], frames: int, report: 
         if driven is None or quantity is None:
             return weights
         number, share = (number, share) if begins in RESTING else (0, 0.0)
-        own = torch.lerp(driven[:, number], driven[:, number + (share > 0.0)], share)
-        return weights.replace(**{quantity.name: own})
+        values = torch.lerp(driven[:, number], driven[:, number + (share > 0.0)], share)
+        return weights.replace(**{quantity.name: values})
 
     if not released:
         begin = simulator.static_equilibrium(inputs_at(0, 0.0), simulator.prepare(), batch=len(trials))

@@ -73,7 +73,7 @@ def _accuracy(settings: StageSettings, trials: Trials) -> Accuracy | None:
         return None
     turn, mounting = (None if x is None else math.radians(x) for x in (wanted.turn, wanted.mounting))
     centre = np.mean([*markers.reference.values()] or [*markers.tracked.values()], axis=0).tolist()
-    bodies = tuple((own.start, bound[own] - bound[own].mean(axis=0)) for own in corners_of(trials.labels).values())
+    bodies = tuple((rows.start, bound[rows] - bound[rows].mean(axis=0)) for rows in corners_of(trials.labels).values())
     return Accuracy(wanted.markers, wanted.shift, turn, wanted.between_sessions, mounting, bodies, centre)
 
 

@@ -112,10 +112,10 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
 def _target(settings: StageSettings, shape: ShapeSettings) -> Simulator:
     """Returns the simulator of the target of a shape."""
     target, body = settings.target, shape.target_body
-    own = {key: getattr(body, key) for key in BodySettings.model_fields} | {"physics": target.physics}
+    keys = {key: getattr(body, key) for key in BodySettings.model_fields} | {"physics": target.physics}
     if shape.muscles is None and target.muscles is not None and target.muscles.commanded is None:
-        own["muscles"] = target.muscles
-    made_of = target_settings(SimulatorSettings.of(settings), target).model_copy(update=own)
+        keys["muscles"] = target.muscles
+    made_of = target_settings(SimulatorSettings.of(settings), target).model_copy(update=keys)
     return build_simulator(made_of, target.material)
 
 

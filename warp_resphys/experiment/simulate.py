@@ -172,7 +172,7 @@ def true_motions(
         for motion, scale in zip(given, scales, strict=True)
     ]
     pushed = [prescribed_all(data.obstacle_motion, trial.obstacle_motion, times) for trial in trials]
-    obstacles = {name: np.stack([own.get(name, still) for own in pushed]) for own in pushed for name in own}
+    obstacles = {name: np.stack([poses.get(name, still) for poses in pushed]) for poses in pushed for name in poses}
     return np.stack(base) if any(given) else None, obstacles
 
 
@@ -211,7 +211,7 @@ def played(
         frame, i = divmod(number, substeps)
         # Inputs are taken at the end of a step, or in its middle.
         share = (i + 1 - 0.5 * (simulator.integrator == "midpoint")) / substeps
-        now = inputs_at(frame, share).replace(**{name: own[number + 1] for name, own in moving.items()})
+        now = inputs_at(frame, share).replace(**{name: values[number + 1] for name, values in moving.items()})
         return simulator.step(state, now, constants)
 
     if substeps:

@@ -212,7 +212,7 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
         return linear(trials.select(seen[:, wanted.argmax()]), asked)
     begun = np.isfinite(np.concatenate([trials.first, asked.first])).all(0)
     shown = common & begun if trials.displaced.any() and (common & begun).any() else common
-    moved = [_without_gaps(own) for own in trials.moved[..., shown]]
+    moved = [_without_gaps(path) for path in trials.moved[..., shown]]
     everything = np.concatenate(moved)
     size = float(np.sqrt(np.square(everything).sum(1).mean())) or 1.0
     count = everything.shape[1]
@@ -223,13 +223,13 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
         vectors = scipy.linalg.eigh(everything.T @ everything, subset_by_index=largest)[1][:, ::-1]
     basis = vectors / size
     starts, most = trials.displaced[:, shown] @ basis, basis.shape[1]
-    z = [np.concatenate([start[None], own @ basis]) for start, own in zip(starts, moved, strict=True)]
-    squares = [np.square(own / size).sum() for own in moved]
+    z = [np.concatenate([start[None], path @ basis]) for start, path in zip(starts, moved, strict=True)]
+    squares = [np.square(path / size).sum() for path in moved]
     sizes, folds = sorted({min(m, most) for m in _MODES}), min(_FOLDS, len(moved))
     best, chosen = np.inf, (1, 1, _LINEAR_RIDGES[-1])
     for degree in _degrees(trials):
         driving = _driving(trials, trials, degree)
-        sums = [_sums(own, acting) for own, acting in zip(z, driving, strict=True)]
+        sums = [_sums(path, acting) for path, acting in zip(z, driving, strict=True)]
         for modes, ridge in product(sizes, _LINEAR_RIDGES):
             error = 0.0
             for fold in range(folds):
@@ -245,15 +245,15 @@ def linear(trials: PlainTrials, asked: PlainTrials) -> Prediction:
                 best, chosen = error, (degree, modes, ridge)
     degree, modes, ridge = chosen
     driving = _driving(trials, trials, degree)
-    matrix = _fitted([_sums(own, acting) for own, acting in zip(z, driving, strict=True)], most, modes, ridge)
+    matrix = _fitted([_sums(path, acting) for path, acting in zip(z, driving, strict=True)], most, modes, ridge)
     rolled = _rolled(matrix, (asked.displaced[:, shown] @ basis)[:, :modes], _driving(asked, trials, degree))
     values = np.full(asked.values.shape, np.nan)
     values[..., shown] = asked.origin[:, None, shown] + rolled @ basis[:, :modes].T * size**2
     for column in np.flatnonzero(seen.any(0) & ~shown):
-        there = [np.isfinite(own[: len(of) - 1, column]) for own, of in zip(trials.moved, z, strict=True)]
+        there = [np.isfinite(path[: len(of) - 1, column]) for path, of in zip(trials.moved, z, strict=True)]
         known = np.concatenate([of[1:, :modes][where] for of, where in zip(z, there, strict=True)])
         wanted = np.concatenate(
-            [own[: len(where), column][where] for own, where in zip(trials.moved, there, strict=True)]
+            [path[: len(where), column][where] for path, where in zip(trials.moved, there, strict=True)]
         )
         values[..., column] = asked.origin[:, None, column] + rolled @ np.linalg.lstsq(known, wanted, rcond=_EXACT)[0]
     powers = f"degree {degree}, " if degree > 1 else ""
@@ -289,7 +289,7 @@ def _driving(motions: PlainTrials, trials: PlainTrials, degree: int) -> FloatArr
     known = np.broadcast_to(motions.known[:, None], (len(motions.known), frames, motions.known.shape[1]))
     inputs = np.concatenate([motions.inputs, known], 2)
     chosen = (c for d in range(1, degree + 1) for c in combinations_with_replacement(_acting(trials).tolist(), d))
-    columns = [inputs[..., list(own)].prod(-1) for own in chosen]
+    columns = [inputs[..., list(term)].prod(-1) for term in chosen]
     return np.stack([*columns, np.ones(inputs.shape[:2])], 2)
 
 

@@ -85,7 +85,7 @@ class Predicted:
         count = _QUARTERS if len(self.since) >= _QUARTERS else 1
         spreads = [None] * count if self.spread is None else np.array_split(self.spread, count)
         series = (np.array_split(values, count) for values in (self.simulated, self.observed, self.since))
-        return [Predicted(*own) for own in zip(*series, spreads, strict=True)]
+        return [Predicted(*parts) for parts in zip(*series, spreads, strict=True)]
 
     @property
     def errors(self) -> FloatArray:
@@ -206,8 +206,8 @@ def _parts(moved: FloatArray, since: FloatArray, spread: FloatArray | None) -> F
         spread: (..., M) due to the parameters [m^2]; None for none.
     """
     just, soon = (np.exp(-since / time)[..., None] for time in TIMES)
-    squares, own = moved**2, np.zeros_like(moved) if spread is None else spread
-    return np.stack([np.ones_like(moved), just * squares, (soon - just) * squares, (1.0 - soon) * squares, own], -1)
+    squares, known = moved**2, np.zeros_like(moved) if spread is None else spread
+    return np.stack([np.ones_like(moved), just * squares, (soon - just) * squares, (1.0 - soon) * squares, known], -1)
 
 
 def _variance(parts: Sequence[FloatArray], errors: Sequence[FloatArray]) -> FloatArray:
@@ -228,11 +228,11 @@ def _variance(parts: Sequence[FloatArray], errors: Sequence[FloatArray]) -> Floa
     columns, relative, least = rows[:, used] / sizes[used], squares / mean, rows[:, -1] / mean + _LEAST
 
     def loss(logarithms: FloatArray) -> tuple[float, FloatArray]:
-        own = np.exp(logarithms)
-        variance = columns @ own + least
+        variances = np.exp(logarithms)
+        variance = columns @ variances + least
         slope = weights * (1.0 / variance - relative / variance**2)
-        value = weights @ (np.log(variance) + relative / variance) + _PENALTY * own.sum()
-        return float(value), (slope @ columns + _PENALTY) * own
+        value = weights @ (np.log(variance) + relative / variance) + _PENALTY * variances.sum()
+        return float(value), (slope @ columns + _PENALTY) * variances
 
     starts = (np.full(len(used), value) for value in (-np.log(len(used)), -3.0))
     bounds = [(_SMALLEST, 3.0)] * len(used)

@@ -163,7 +163,7 @@ def errors_per_marker(
     means: dict[str, float | None] = {}
     for m, label in enumerate(labels):
         errors = [marker_errors(x[:, m : m + 1], y[:, m : m + 1]) for x, y in zip(simulated, observed, strict=True)]
-        if of_trials := [own.mean() for own in errors if len(own)]:
+        if of_trials := [of_trial.mean() for of_trial in errors if len(of_trial)]:
             means[label] = _finite_mean(np.array(of_trials))
     return means
 

@@ -123,7 +123,7 @@ class ObservedMotions(Brief):
             kind = "vertices of the body" if isinstance(observation, WholeState) else "points of the observation"
             raise InputError(f"{observed.shape[2]} points were observed, but there are {seen} {kind}.")
         points = _array(observed.transpose(0, 1))
-        acting, before = (_fitted(simulator, own or Inputs(), count) for own in (inputs, resting))
+        acting, before = (_fitted(simulator, fields or Inputs(), count) for fields in (inputs, resting))
         acting.check_steps(frames - 1)
         if start is not None and len(start.q) != count:
             raise InputError(f"start has {len(start.q)} states, but {count} motions were observed: give as many.")

@@ -323,7 +323,7 @@ class Replay:
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        first, others = ({name: value[own] for name, value in parameters.items()} for own in (_FIRST, _OTHERS))
+        first, others = ({name: value[chosen] for name, value in parameters.items()} for chosen in (_FIRST, _OTHERS))
         states = self.states(start, first) if states is None else states
         return self._observed(self._varied_positions(start, first, others, states, record))
 
@@ -331,22 +331,22 @@ class Replay:
         self, start: Start, first: Parameters, others: Parameters, states: Sequence[State], record: Record | None
     ) -> Iterator[torch.Tensor]:
         """Yields the positions (E R, N, 3) of `varied_series` [m], from the release on."""
-        (own, inputs, resting), (their, their_inputs, their_resting) = self.prepare(first), self.prepare(others)
+        (constants, inputs, resting), (their, their_inputs, their_resting) = self.prepare(first), self.prepare(others)
         sets, state = _count(others), states[0]
         if not start.at_rest:
-            whole = self.initial_state(start, own, resting, 1 + sets)
+            whole = self.initial_state(start, constants, resting, 1 + sets)
             varied = whole.map(lambda t: t[state.batch :])
         elif self.simulator.energies.follow_pose:
             varied = self.initial_state(start.near(state.q), their, their_resting, sets)
         else:
-            here = self._beside[0].linearise_equilibrium(resting, own, state.batch)
+            here = self._beside[0].linearise_equilibrium(resting, constants, state.batch)
             there = self._beside[1].linearise_equilibrium(their_resting, their, sets * state.batch)
             varied = self._varied(state.q, here, there)
         if record is not None:
             record(state.q, varied.q)
         yield torch.cat([state.q, varied.q])
         for k, (state, solved) in enumerate(itertools.pairwise(states)):
-            here = self._beside[0].linearise(state, inputs.at(k), own)
+            here = self._beside[0].linearise(state, inputs.at(k), constants)
             try:
                 there = self._beside[1].linearise(varied, their_inputs.at(k), their)
             except InputError as error:

@@ -56,16 +56,16 @@ def without_physics(
         plain = plain.select(np.asarray(np.isfinite(plain.values).any((1, 2))))
         made = predictions(plain, asked) if len(plain.values) else {REST: at_rest(asked)}
         rows = [names.index(name) for name in batch]
-        for model, own in made.items():
-            seen = np.isfinite(own.values).any(1, keepdims=True)
-            known = np.where(seen, own.values, made[REST].values).reshape(len(batch), -1, *shape[2:])
+        for model, prediction in made.items():
+            seen = np.isfinite(prediction.values).any(1, keepdims=True)
+            known = np.where(seen, prediction.values, made[REST].values).reshape(len(batch), -1, *shape[2:])
             if begins == "released":
                 times = torch.from_numpy(trials.times[trials.rows(batch)])
                 known = sample(torch.from_numpy(known), times, trials.time_step).numpy()
             elif begins == RESTING[0] and motions.release.delay > 0.0:
                 known = _on_time(motions, batch, known)
             values.setdefault(model, np.full(shape, np.nan))[rows] = known
-            settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), own.settings))))
+            settings[model] = "; ".join(dict.fromkeys(filter(None, (settings.get(model), prediction.settings))))
         for model in (model for model in BASELINES if model not in made):
             reason = _LACKING[model] if len(plain.values) else f"no other training trial begins like {batch[0]}"
             missing.setdefault(model, reason)
@@ -132,8 +132,8 @@ def _motions(
         acting, loads = driving(trials, names), trials.payload[rows][:, None]
         if not made:
             values[:, motions.learned_steps(values.shape[1] - 1) + 1 :] = np.nan
-            sizes, load = {name: _size(own) for name, own in acting.items()}, _size(loads)
-            ends = np.array([_end(own) for own in values]).reshape(-1, first.shape[1])
+            sizes, load = {name: _size(series) for name, series in acting.items()}, _size(loads)
+            ends = np.array([_end(series) for series in values]).reshape(-1, first.shape[1])
             rest = np.array([_mean(column) for column in ends.T])
         settles = trials.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
         frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
@@ -145,7 +145,7 @@ def _motions(
 def _end(values: FloatArray) -> FloatArray:
     """(P,) means of the last part of the frames (T, P) in which a coordinate was seen; NaN where it never was."""
     seen = (column[np.isfinite(column)] for column in values.T)
-    return np.array([_mean(own[-max(round(_SETTLED * len(own)), 1) :]) for own in seen])
+    return np.array([_mean(series[-max(round(_SETTLED * len(series)), 1) :]) for series in seen])
 
 
 def _mean(values: FloatArray) -> float:

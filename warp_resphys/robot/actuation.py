@@ -205,7 +205,7 @@ class Commands:
         h, filters = simulator.time_step, description.filters if description.learned is not None else ()
         taken = [name for name, declared in inputs.items() if declared.is_taken]
         responses = {name: response_of(simulator.inputs[name], parameters) for name in taken}
-        self._responses = {name: InputResponse(h, **own, filters=filters) for name, own in responses.items()}
+        self._responses = {name: InputResponse(h, **values, filters=filters) for name, values in responses.items()}
 
     def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> State:
         """Returns the state after constant inputs (B, C), zero if omitted, have acted for a long time."""

@@ -170,7 +170,7 @@ def _commands(
     for key, given in inputs.items():
         zero, factor = (values.get(f"{key}_{word}") for word in ("zero", "factor"))
         own_zero, own_factor = (
-            next((values[own] for owner in owners if (own := own_name(f"{key}_{word}", owner)) in values), common)
+            next((values[full] for owner in owners if (full := own_name(f"{key}_{word}", owner)) in values), common)
             for word, common in (("zero", zero), ("factor", factor))
         )
         if own_zero is not None and zero is not None:

@@ -135,7 +135,7 @@ class Robot:
             MeshError: the mesh cannot be simulated, or has no vertex where the body is fixed.
         """
         materials = self.simulator.materials.items()
-        material = {f"{region}_{name}" if region else name for region, own in materials for name in own.parameters}
+        material = {f"{region}_{name}" if region else name for region, used in materials for name in used.parameters}
         names = material & self.parameters.keys() - {MASS_DAMPING}
         parameters = {name: float(self.parameters[name][0]) for name in names}
         return Robot(self.description.on(mesh, parameters, body), self.simulator.device)
@@ -393,6 +393,6 @@ class Robot:
 def _since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> NDArray[np.float64]:
     """(T + 1, B) time since the last change of commands (T, B, ...) at T + 1 times [s]."""
     values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
-    acting = [np.concatenate([own, own[-1:]]).reshape(times, batch, -1) for own in values]
+    acting = [np.concatenate([series, series[-1:]]).reshape(times, batch, -1) for series in values]
     at = time_step * np.arange(times, dtype=np.float64)
     return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

@@ -72,14 +72,14 @@ class RobotScene:
         if len(set(others.values())) > 1:
             raise InputError(
                 "robots of a scene have one time step and integrator, these have "
-                f"{', '.join(f'{name} {1e3 * h:g} ms and {own}' for name, (h, own) in others.items())}."
+                f"{', '.join(f'{name} {1e3 * h:g} ms and {integrator}' for name, (h, integrator) in others.items())}."
             )
         bodies, materials = dict[str, Body](), dict[str, Any]()
         for name, robot in self.robots.items():
             self._check_fibres(name)
             body = robot.simulator.body.moved(*self._poses[name])
-            own = [energy for energy in body.energies if contact is None or not isinstance(energy, SurfaceContact)]
-            bodies[name], materials[name] = replace(body, energies=own), robot.simulator.material
+            energies = [energy for energy in body.energies if contact is None or not isinstance(energy, SurfaceContact)]
+            bodies[name], materials[name] = replace(body, energies=energies), robot.simulator.material
         for name, thing in (objects or {}).items():
             if isinstance(thing, Body):
                 bodies[name] = thing
@@ -106,8 +106,8 @@ class RobotScene:
         """Gravity (3,) of the scene [m/s^2], with the identified tilt of the robots' gravity."""
         pulls = {}
         for name, robot in self.robots.items():
-            own = constants_of(robot.simulator, robot.parameters).get("gravity")
-            pull = np.asarray(robot.simulator.gravity) if own is None else own[0].detach().double().cpu().numpy()
+            known = constants_of(robot.simulator, robot.parameters).get("gravity")
+            pull = np.asarray(robot.simulator.gravity) if known is None else known[0].detach().double().cpu().numpy()
             pulls[name] = self._poses[name][0] @ pull
         first, pull = next(iter(pulls.items()))
         for name, other in pulls.items():
@@ -121,7 +121,7 @@ class RobotScene:
     def _check_fibres(self, name: str) -> None:
         """Raises InputError for a turned robot whose material has fibres."""
         turned = not np.allclose(self._poses[name][0], np.eye(3))
-        if turned and any(getattr(own, "fibres", ()) for own in self.robots[name].simulator.materials.values()):
+        if turned and any(getattr(one, "fibres", ()) for one in self.robots[name].simulator.materials.values()):
             raise InputError(
                 f"the material of {name} has fibres, whose directions would have to turn with it: give it a pose "
                 "without rotation."
@@ -139,16 +139,16 @@ class RobotScene:
             ConvergenceError: a robot has no equilibrium.
         """
         given = self._checked(inputs)
-        rest, own = self.simulator.rest_state(batch), dict[str, State]()
+        rest, states = self.simulator.rest_state(batch), dict[str, State]()
         parts = []
         for name, _, _ in self.scene.members:
             at = self.scene.vertex_slice(name)
             if name in self.robots:
-                own[name] = self.robots[name].begin(batch, **given.get(name, {}))
-                parts.append(self._placed(name, own[name].q))
+                states[name] = self.robots[name].begin(batch, **given.get(name, {}))
+                parts.append(self._placed(name, states[name].q))
             else:
                 parts.append(rest.q[:, at])
-        return self._with_robots(self.simulator.state(torch.cat(parts, 1)), own)
+        return self._with_robots(self.simulator.state(torch.cat(parts, 1)), states)
 
     def step(self, state: State, inputs: Mapping[str, Mapping[str, Given]] | None = None) -> State:
         """Returns the state after one time step; differentiable.
@@ -166,12 +166,12 @@ class RobotScene:
         for name, robot in self.robots.items():
             acting, after[name] = robot.drive(self.state_of(state, name), **given.get(name, {}))
             by_body[name] = self._inputs_in_scene(name, acting)
-        if any(own.fixed_positions is not None for own in by_body.values()):
+        if any(acting_on.fixed_positions is not None for acting_on in by_body.values()):
             for name, body, first in self.scene.members:
-                own = by_body.get(name, Inputs())
-                if own.fixed_positions is None and len(body.fixed_vertices):
+                acting_on = by_body.get(name, Inputs())
+                if acting_on.fixed_positions is None and len(body.fixed_vertices):
                     places = self.simulator.rest_positions[first + body.fixed_vertices]
-                    by_body[name] = own.replace(fixed_positions=places.expand(state.batch, -1, -1))
+                    by_body[name] = acting_on.replace(fixed_positions=places.expand(state.batch, -1, -1))
         new = self.simulator.step(state, self.scene.inputs(by_body), self.constants)
         lost = state.lost | ~new.converged
         if bool(lost.any()):
@@ -209,18 +209,18 @@ class RobotScene:
     @staticmethod
     def _with_robots(state: State, robots: Mapping[str, State]) -> State:
         """Adds the memory of the robots' actuators and networks to a state."""
-        for name, own in robots.items():
-            state = state.with_memory({**own.memory_of(), "lost": state.lost}, _OWNER.format(name))
-        left = torch.stack([own.left for own in robots.values()]).any(0)
+        for name, of_robot in robots.items():
+            state = state.with_memory({**of_robot.memory_of(), "lost": state.lost}, _OWNER.format(name))
+        left = torch.stack([of_robot.left for of_robot in robots.values()]).any(0)
         return state.with_memory({"lost": state.lost, "left": left})
 
-    def _inputs_in_scene(self, name: str, own: Inputs) -> Inputs:
+    def _inputs_in_scene(self, name: str, inputs: Inputs) -> Inputs:
         fields: dict[str, torch.Tensor | None] = {}
-        if own.external_force is not None:
-            fields["external_force"] = own.external_force @ self._frames[name][0].mT
-        if own.fixed_positions is not None:
-            fields["fixed_positions"] = self._placed(name, own.fixed_positions)
-        return own.replace(**fields)
+        if inputs.external_force is not None:
+            fields["external_force"] = inputs.external_force @ self._frames[name][0].mT
+        if inputs.fixed_positions is not None:
+            fields["fixed_positions"] = self._placed(name, inputs.fixed_positions)
+        return inputs.replace(**fields)
 
 
 def _pose(name: str, pose: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -125,10 +125,10 @@ class Inputs:
         """Returns the inputs with an external force (B, N, 3) added [N]."""
         if force is None:
             return self
-        own = self.external_force
-        if own is not None and "external_force" in self.plain:
-            own = own.to(force)
-        return self.replace(external_force=force if own is None else own + force)
+        before = self.external_force
+        if before is not None and "external_force" in self.plain:
+            before = before.to(force)
+        return self.replace(external_force=force if before is None else before + force)
 
     def _has_time_axis(self) -> Mapping[str, bool]:
         """Whether each field has a time axis, by name."""

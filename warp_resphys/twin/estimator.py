@@ -270,8 +270,8 @@ class TwinEstimator(ABC, Generic[B]):
             return squares, False
         now = np.array([np.mean(x[seen] ** 2) for x in (off, apart)])
         squares = now + np.exp(-passed / _JUDGED) * (squares - now)
-        own, other = squares
-        return squares, bool(own > _WORSE**2 * (other + 3.0 * self.noise**2))
+        twin, simulator = squares
+        return squares, bool(twin > _WORSE**2 * (simulator + 3.0 * self.noise**2))
 
     def _conditioned(self, belief: B, slopes: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
         """`conditioned` for markers, with more noise where the shape would change by too much at once."""

@@ -199,10 +199,10 @@ class FullEstimator(TwinEstimator[FullBelief]):
         if len(self._prior):
             share = state.q.new_tensor((parameters - belief.parameters) / self._apart)
             state = state.map(lambda value: _along(value, share))
-        own = state.q.new_ones(self._count, 1, 1)
-        own[-1] = 0.0
+        scale = state.q.new_ones(self._count, 1, 1)
+        scale[-1] = 0.0
         shapes = (torch.einsum("r,rni->ni", state.q.new_tensor(x), tangent.shapes) for x in (z, w))
-        moved, faster = (own * field for field in shapes)
+        moved, faster = (scale * field for field in shapes)
         return replace(belief, state=shifted(self._at(parameters, {})[0], state, moved, faster))
 
     @override

@@ -95,7 +95,7 @@ def recorded_packets(robot: Robot, path: str | Path) -> Iterator[Packet]:
     markers, recording = robot.description.markers, read_recording(Path(path).expanduser())
     if markers is not None:
         bodies = markers.rigid_bodies.items()
-        recording = with_corners(recording, {name: own.length for name, own in bodies if name in recording.labels})
+        recording = with_corners(recording, {name: body.length for name, body in bodies if name in recording.labels})
     driven = [name for name in robot.inputs if name in robot.description.seen]
     commands: Iterator[Mapping[str, ArrayLike]] = iter([{}] * len(recording.positions))
     if recording.actuation is not None and driven:

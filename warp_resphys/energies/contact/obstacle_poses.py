@@ -118,13 +118,13 @@ class _Distances(AdjointFunction):
 
     @override
     @staticmethod
-    def forward(ctx: Any, own: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        with own.lock:
-            for buffer, value in zip(own.inputs, given, strict=True):
+    def forward(ctx: Any, measurement: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        with measurement.lock:
+            for buffer, value in zip(measurement.inputs, given, strict=True):
                 buffer.copy_(value.detach())
-            own.launch(own.measure)
-            d, n = (value.to(given[0].dtype, copy=True) for value in own.results)
-        ctx.own = own
+            measurement.launch(measurement.measure)
+            d, n = (value.to(given[0].dtype, copy=True) for value in measurement.results)
+        ctx.measurement = measurement
         ctx.save_for_backward(*given)
         return d, n
 
@@ -132,12 +132,12 @@ class _Distances(AdjointFunction):
     @staticmethod
     @first_derivatives
     def backward(ctx: Any, *by_results: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        own = ctx.own
-        with own.lock:
-            buffers, position, turn, command = own.adjoint
-            for buffer, value in zip((*own.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
+        measurement = ctx.measurement
+        with measurement.lock:
+            buffers, position, turn, command = measurement.adjoint
+            for buffer, value in zip((*measurement.inputs, *buffers), (*ctx.saved_tensors, *by_results), strict=True):
                 buffer.copy_(value)
-            own.launch(command)
+            measurement.launch(command)
             sums = (lambda: position.sum(2), lambda: -position.sum(1), lambda: turn.sum(1), lambda: -buffers[0].sum(1))
             needed = zip(sums, ctx.needs_input_grad[1:], strict=True)
             return None, *(slope().to(by_results[0].dtype) if used else None for slope, used in needed)

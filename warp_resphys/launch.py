@@ -81,7 +81,7 @@ class _Job:
     def run(self, command: str, arguments: Sequence[str]) -> None:
         """Composes the configuration and runs the command with it."""
         parser = get_args_parser()
-        parsed = parser.parse_intermixed_args([*_own_options(), *arguments])
+        parsed = parser.parse_intermixed_args([*_user_options(), *arguments])
         if parsed.experimental_rerun is not None:
             raise HydraException("--experimental-rerun reads a pickle, which can run code: use overrides instead")
         if command in TYPED and parsed.cfg == "job":
@@ -175,7 +175,7 @@ def _sentence_of_warning(
     return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 
-def _own_options() -> list[str]:
+def _user_options() -> list[str]:
     """Arguments that add the folder of the user's own options, if it exists; a later --config-dir replaces it."""
     folder = Path.cwd() / OWN_OPTIONS
     if not folder.is_dir():

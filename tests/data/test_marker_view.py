@@ -12,9 +12,9 @@ NOMINAL = np.array([[0.0, 0.01, -0.07], [0.002, -0.02, -0.04], [0.0, 0.015, 0.03
 PLACES = torch.as_tensor(NOMINAL)
 VIEWS = {
     "plane": MarkerView(PLACES, "xz"),
-    "own": MarkerView(PLACES, own=True),
-    "own plane": MarkerView(PLACES, "xz", own=True),
-    "own plane, turned": MarkerView(PLACES, "zy", own=True),
+    "own": MarkerView(PLACES, shape_alone=True),
+    "own plane": MarkerView(PLACES, "xz", shape_alone=True),
+    "own plane, turned": MarkerView(PLACES, "zy", shape_alone=True),
 }
 
 
@@ -65,7 +65,7 @@ def test_a_body_is_carried_with_its_markers(name):
     points, view = torch.as_tensor(moved(shaken(), 1.2, [0.0, 1.0, 0.0], 0.2)), VIEWS[name]
     body = torch.cat([points, points.flip(-2) + 0.01], -2)
     carried, context = view.carried(body, points), view(points)
-    if not view.own:
+    if not view.shape_alone:
         assert carried is body
         return
     seen = [axis for axis in range(3) if axis != view.unseen]
@@ -90,7 +90,7 @@ def test_seen_markers_of_a_body_that_is_carried_away_are_where_they_were():
     mesh = box_hexahedra(divisions=(5, 2, 2))
     places = np.array([[0.01, 0.0, 0.033], [0.05, 0.002, 0.033], [0.09, 0.03, 0.033]])
     markers = bind_markers(mesh, places, ["a", "b", "c"], kind="frame")
-    seen = ViewedMarkers.of(markers, MarkerView(torch.as_tensor(places), own=True))
+    seen = ViewedMarkers.of(markers, MarkerView(torch.as_tensor(places), shape_alone=True))
     at = torch.as_tensor(moved(mesh.vertices, 1.0, [0.0, 0.6, 0.8], 0.5))[None]
     np.testing.assert_allclose(seen(at)[0], places, atol=1e-12)
     bent = at.clone()

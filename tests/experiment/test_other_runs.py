@@ -207,13 +207,13 @@ def test_inputs_with_a_zero_that_differs_from_trial_to_trial(folder):
         *(f"++identify.parameters={parameters}", "identify.elastic=null", "identify.max_evaluations=12"),
     )
     _, found, truth = results(run_folder, "identification", "truth")
-    zeros = {name.split("@")[1]: value for name, value in found["sysid"]["own"].items()}
+    zeros = {name.split("@")[1]: value for name, value in found["sysid"]["of_trials"].items()}
     assert zeros.keys() == truth["zeros"].keys()
     errors = {name: abs(zeros[name] - value) for name, value in truth["zeros"].items()}
     assert max(errors.values()) < 0.4 * deviation
     later = [name for name in errors if name not in ("t000", "t001")]  # of which the first frames show it
     assert max(errors[name] for name in later) < 0.1 * deviation
-    deviations = found["sysid"]["own_deviation"]
+    deviations = found["sysid"]["of_trials_deviation"]
     ratios = [error / deviations[f"tendon_tension_zero@{name}"] for name, error in errors.items()]
     assert np.sqrt(np.mean(np.square(ratios))) < 3.0  # the largest of four depends on where the search stops
     page = (run_folder / "report.html").read_text()
@@ -309,7 +309,7 @@ def test_limbs_that_swim_are_identified_by_their_shape(folder):
         pulled = dataset.inputs["tendon_contraction"][row, :, 0]
         np.testing.assert_allclose(pulled, commanded[1 : STEPS + 1], atol=1e-6)
         nominal = torch.tensor([*tracked[name].values()], dtype=torch.float64)
-        shapes = MarkerView(nominal, "xz", own=True).of_arrays(markers[: STEPS + 1])
+        shapes = MarkerView(nominal, "xz", shape_alone=True).of_arrays(markers[: STEPS + 1])
         columns = [dataset.labels.index(label) for label in tracked[name]]
         shapes[HIDDEN[name]] = np.nan
         np.testing.assert_allclose(dataset.observed[row][:, columns], shapes, atol=3e-4)

@@ -107,8 +107,8 @@ def test_sessions_have_their_markers_and_trials_their_gains(poses, tmp_path):
     )
     assert dict(zip((data := Trials.read(folder / "dataset.h5")).names, data.sessions, strict=True)) == sessions
     found = read_json(folder / "identification.json")["sysid"]
-    own = {name.removeprefix("tendon_tension_factor@"): value for name, value in found["own"].items()}
-    assert own.keys() == {"weak", "strong", "second"} == {name.split("@")[1] for name in found["own_deviation"]}
+    own = {name.removeprefix("tendon_tension_factor@"): value for name, value in found["of_trials"].items()}
+    assert own.keys() == {"weak", "strong", "second"} == {name.split("@")[1] for name in found["of_trials_deviation"]}
     assert own["strong"] - 0.5 * (own["weak"] + own["second"]) > 0.03
     assert found["parameters"]["tendon_tension_factor"] == 1.0
     assert found["uncertainty"]["deviation"]["tendon_tension_factor"] == 0.05

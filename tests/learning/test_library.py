@@ -88,8 +88,8 @@ def test_trials_have_their_values_sessions_their_places_and_finished_searches_ar
 
     found = identified()
     assert found.parameters["tendon_tension_factor"] == 1.0
-    assert found.own_deviation.keys() == found.own.keys()
-    ratios = [found.own[f"tendon_tension_factor@{name}"] / factor for name, factor in factors.items()]
+    assert found.of_trials_deviation.keys() == found.of_trials.keys()
+    ratios = [found.of_trials[f"tendon_tension_factor@{name}"] / factor for name, factor in factors.items()]
     scale = found.parameters["youngs_modulus"] / 264e3  # of all forces, which places hide
     assert scale == pytest.approx(1.0, rel=0.1)
     assert ratios == pytest.approx([scale] * 3, rel=0.02)
@@ -101,7 +101,7 @@ def test_trials_have_their_values_sessions_their_places_and_finished_searches_ar
         identified()
     monkeypatch.undo()
     capsys.readouterr()
-    assert identified().own == found.own
+    assert identified().of_trials == found.of_trials
     assert f"evaluation {sum(map(len, found.history))} (limit 30)" in capsys.readouterr().err  # those of the file
     monkeypatch.setattr(Misfit, "linearise", None)
     with pytest.raises(TypeError):  # Searches of other arguments are not used.

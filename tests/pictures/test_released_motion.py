@@ -12,7 +12,7 @@ from support.refusals import refuses
 from support.slopes import differences
 from warp_resphys.experiment.pictures.camera_laboratory import noisy_mask
 from warp_resphys.pictures import ClosedSurface, Cloud, Lens, Outline, Photo, PictureMisfit, PlacedCamera, SeenPose
-from warp_resphys.pictures.released_force import ReleasedForce, at_own_times
+from warp_resphys.pictures.released_force import ReleasedForce, at_row_times
 from warp_resphys.settings.learning import Bounds, Prior
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1), nodes=20)
@@ -82,7 +82,7 @@ def test_rows_are_exposed_at_their_own_times():
     def pixels(points):
         return CAMERA.pixels(points, neutral)
 
-    places, velocities = at_own_times(series, begin, ROW_TIME, step, pixels)
+    places, velocities = at_row_times(series, begin, ROW_TIME, step, pixels)
     rows = pixels(places[0])[:, 1].numpy()
     r = ROW_TIME
     for row, velocity, z0, v in zip(rows, velocities.numpy(), heights, speeds, strict=True):
@@ -91,9 +91,9 @@ def test_rows_are_exposed_at_their_own_times():
         exact = min(np.roots(equation), key=lambda root: abs(root - row))
         assert row == pytest.approx(exact, abs=1e-4)
         assert velocity == pytest.approx([0.0, 0.0, v + fall * (begin + r * exact)], abs=1e-6)
-    at_once = pixels(at_own_times(series, begin, 0.0, step, pixels)[0][0])[:, 1].numpy()
+    at_once = pixels(at_row_times(series, begin, 0.0, step, pixels)[0][0])[:, 1].numpy()
     assert (np.abs(at_once - rows) > 3.0).all()
-    resting, still = at_own_times(series, -0.05, ROW_TIME, step, pixels)  # before the release
+    resting, still = at_row_times(series, -0.05, ROW_TIME, step, pixels)  # before the release
     assert torch.equal(resting[0], series[0, 0])
     assert not still.any()
 

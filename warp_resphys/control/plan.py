@@ -225,7 +225,7 @@ def _planned(model: ReducedModel, planner: Planner, offset: FloatArray) -> Float
 @torch.no_grad()
 def _played(robot: Robot, name: str, low: FloatArray, inputs: FloatArray, on_progress: OnProgress) -> FloatArray:
     """Markers (B, T + 1, 3 M) of the robot under inputs (B, T, n) [m]."""
-    start, given = robot.begin(len(inputs), **{name: low}), robot.simulator.tensor(inputs.swapaxes(0, 1))
-    series: dict[str, Any] = {name: given}
+    start, commands = robot.begin(len(inputs), **{name: low}), robot.simulator.tensor(inputs.swapaxes(0, 1))
+    series: dict[str, Any] = {name: commands}
     motion = robot.rollout(start, on_step=lambda number: on_progress(1), **series)
     return np.asarray(motion.markers.flatten(2).swapaxes(0, 1).double().cpu().numpy())

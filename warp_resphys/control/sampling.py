@@ -185,7 +185,7 @@ class Source:
         """Moving inputs (..., n') under constant commands (..., n), in units of the scale."""
         return np.asarray((self.response.scaled(commands) / self.scale)[..., self.moving])
 
-    def given(self, commands: FloatArray) -> dict[str, Any]:
+    def keywords(self, commands: FloatArray) -> dict[str, Any]:
         """Keyword argument of the robot's methods for commands (B, n) in the unit of the input."""
         return {self.input.name: self.robot.simulator.tensor(commands)}
 
@@ -198,7 +198,7 @@ class Source:
         network = None if self.learned is None else self.learned.network
         if network is None or network.actuation is None:
             return np.zeros(0), np.zeros((0, 0))
-        nothing = self.given(np.zeros((1, self.parts)))
+        nothing = self.keywords(np.zeros((1, self.parts)))
         still = self.robot.state(self.rest, **nothing)
         conditions = self.robot.conditions(still, **nothing)
         assert conditions is not None
@@ -232,7 +232,7 @@ class Source:
                 on_progress(1)
 
         with torch.no_grad():
-            motion = robot.rollout(robot.begin(batch), on_step=on_step, **self.given(commands))
+            motion = robot.rollout(robot.begin(batch), on_step=on_step, **self.keywords(commands))
         on_progress(max(samples.tenths - steps // every, 0))
         y = motion.markers.flatten(2).double().cpu().numpy()
         return Motions(
@@ -243,10 +243,10 @@ class Source:
             (self.response.from_rest(commands)[0] / self.scale)[..., self.moving],
         )
 
-    def _outputs(self, state: State, given: dict[str, torch.Tensor]) -> FloatArray:
+    def _outputs(self, state: State, commands: dict[str, torch.Tensor]) -> FloatArray:
         """Outputs (B, c) of the network in a step from a state."""
         assert self.learned is not None
-        network, conditions = self.learned.network, self.robot.conditions(state, **given)
+        network, conditions = self.learned.network, self.robot.conditions(state, **commands)
         like = network.rest
         conditions = None if conditions is None or network.actuation is None else conditions.to(like)
         inputs = network.encode(state.q.to(like), state.v.to(like), conditions)
@@ -260,14 +260,14 @@ class Source:
         Returns:
             Positions (S, N, 3) [m], their commands (S, n), and the network's outputs (S, c) there, if there is one.
         """
-        q, rests = self.robot.settle_some(len(commands), **self.given(commands))
+        q, rests = self.robot.settle_some(len(commands), **self.keywords(commands))
         q, commands = q[rests], commands[rests.cpu().numpy()]
         if self.learned is None:
             return q, commands, None
         if not len(commands):
             return q, commands, np.zeros((0, self.learned.network.linear.shape[1]))
-        given = self.given(commands)
-        return q, commands, self._outputs(self.robot.state(q, **given), given)
+        keywords = self.keywords(commands)
+        return q, commands, self._outputs(self.robot.state(q, **keywords), keywords)
 
     def _pull(self, state: State, outputs: FloatArray) -> torch.Tensor:
         """Learned force (B, N, 3) of network outputs (B, c) on a body in a state [N]."""
@@ -278,9 +278,9 @@ class Source:
 
     def tangent(self, q: torch.Tensor, commands: FloatArray, modes: int, outputs: FloatArray | None) -> Tangent:
         """Linearises about an equilibrium (1, N, 3) under commands (n,) and the force of network outputs (c,)."""
-        robot, still, given = self.robot, torch.zeros_like(q), self.given(commands[None])
-        state = robot.state(q, **given)
-        hessian, inertia, free = self._elastic.linearised(state, **given)
+        robot, still, keywords = self.robot, torch.zeros_like(q), self.keywords(commands[None])
+        state = robot.state(q, **keywords)
+        hessian, inertia, free = self._elastic.linearised(state, **keywords)
         stiffness = (hessian - inertia).tocsc()
         coordinates = (3 * free[:, None] + np.arange(3)).ravel()
         mass = scipy.sparse.diags_array(self.mass.cpu().numpy()[coordinates]).tocsc()
@@ -290,7 +290,7 @@ class Source:
         shapes = torch.zeros(q[0].numel(), modes, dtype=torch.float64, device=q.device)
         shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(vectors[:, order], device=q.device)
         modal_stiffness = np.diag(values[order])
-        damped, inertia = self._viscous.linearised(state, **given)[:2]
+        damped, inertia = self._viscous.linearised(state, **keywords)[:2]
         # The Hessian of a step of length s is M / s^2 + D / s + K.
         step = float(np.sqrt(mass.diagonal()[0] / inertia.diagonal()[0]))
         kept = vectors[:, order]
@@ -300,7 +300,9 @@ class Source:
             relaxation(torch.tensor(self.times), robot.time_step)[1],
         )
         for number, branch in enumerate(self._branches):
-            branches[number] = kept.T @ ((branch.linearised(state, **given)[0] - hessian) @ kept) / float(gamma[number])
+            branches[number] = (
+                kept.T @ ((branch.linearised(state, **keywords)[0] - hessian) @ kept) / float(gamma[number])
+            )
         columns, zero = shapes.mT.reshape(-1, *q.shape[1:]).to(q), q.new_zeros(modes)
 
         def seen(by: torch.Tensor) -> torch.Tensor:

@@ -84,7 +84,7 @@ class RobotWorld(World[State]):
 
     Args:
         robot: loaded with ``on_failure="count"``.
-        given: name of the commanded input.
+        command: name of the commanded input.
         count: B.
         spread: variation of the parameters, in standard deviations of their identification; 0 for none.
         mixed: (k, n) from k commands to the n values of the input; the identity if omitted.
@@ -98,24 +98,24 @@ class RobotWorld(World[State]):
     def __init__(
         self,
         robot: Robot,
-        given: str,
+        command: str,
         count: int,
         spread: float = 0.0,
         mixed: FloatArray | None = None,
         shown: Sequence[int] | None = None,
         time_step: float | None = None,
     ) -> None:
-        if given not in robot.inputs:
-            raise InputError(f"there is no input {given!r}: the robot has {', '.join(robot.inputs) or 'none'}.")
+        if command not in robot.inputs:
+            raise InputError(f"there is no input {command!r}: the robot has {', '.join(robot.inputs) or 'none'}.")
         if spread > 0.0 and robot.description.uncertainty is None:
             raise InputError(
                 f"{robot.description.name} has no standard deviations of its parameters, which spread needs: set "
                 "spread=0, or choose a run that identifies parameters."
             )
         self._nominal = self.robot = robot
-        self.count, self.time_step, self.input = count, time_step or robot.time_step, given
+        self.count, self.time_step, self.input = count, time_step or robot.time_step, command
         self._substeps = round(self.time_step / robot.time_step)
-        self._mixed = np.eye(len(robot.inputs[given].parts)) if mixed is None else mixed
+        self._mixed = np.eye(len(robot.inputs[command].parts)) if mixed is None else mixed
         self.parts, self._spread, self._shown = len(self._mixed), spread, shown
         self.rest = self._begun()
 

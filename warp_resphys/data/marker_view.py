@@ -31,7 +31,7 @@ class MarkerView:
     Attributes:
         nominal: (m, 3) places on the undeformed body [m].
         plane: the two axes of the body that span the recorded plane, such as ("x", "z"); None for all coordinates.
-        own: whether markers are recorded in their own frame (shape alone) rather than in that of the body.
+        shape_alone: whether markers are recorded in their own frame (shape alone) rather than in that of the body.
         sets: indices of markers that are seen together and share an own frame; all if left out. Markers in no set are
             never seen.
 
@@ -41,14 +41,14 @@ class MarkerView:
 
     nominal: torch.Tensor
     plane: Sequence[str] | None = None
-    own: bool = False
+    shape_alone: bool = False
     sets: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         """Checks the plane and the frame."""
         if self.plane is not None and (len(self.plane) != 2 or len({*self.plane} & {*_AXES}) != 2):
             raise InputError(f"markers.plane is {list(self.plane)}: name two of the body's axes x, y and z.")
-        if not self.own:
+        if not self.shape_alone:
             return
         if self.sets:
             if len({marker for members in self.sets for marker in members}) < sum(map(len, self.sets)):
@@ -67,7 +67,7 @@ class MarkerView:
     @property
     def is_whole(self) -> bool:
         """Whether recordings contain all coordinates in the frame of the body."""
-        return self.plane is None and not self.own
+        return self.plane is None and not self.shape_alone
 
     @cached_property
     def _parts(self) -> "list[tuple[torch.Tensor, MarkerView]]":
@@ -93,8 +93,8 @@ class MarkerView:
         if self.unseen is not None:
             hidden = torch.arange(3, device=points.device) == self.unseen
             points = torch.where(hidden, self.nominal, points)
-        if not self.own or not self.sets:
-            return self._in_own_frame(points, points) if self.own else points
+        if not self.shape_alone or not self.sets:
+            return self._in_own_frame(points, points) if self.shape_alone else points
         viewed = points
         for members, part in self._parts:
             viewed = viewed.index_copy(-2, members, part(points.index_select(-2, members)))
@@ -110,14 +110,14 @@ class MarkerView:
         assert not self.sets, "A trial has the markers of one set."
         positions = torch.as_tensor(np.asarray(points, dtype=np.float64))
         lost = ~positions.isfinite().all(-1, keepdim=True)
-        if self.own:
+        if self.shape_alone:
             lost = lost.any(-2, keepdim=True)
             lost = lost | self._is_degenerate(torch.where(lost, self.nominal, positions))[..., None, None]
         return torch.where(lost, torch.nan, self(torch.where(lost, self.nominal, positions))).numpy()
 
     def carried(self, others: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Moves points (..., N, 3) of a body into the own frame of its markers (..., m, 3), if they have one [m]."""
-        return self._in_own_frame(replace(self, own=False)(points), others) if self.own else others
+        return self._in_own_frame(replace(self, shape_alone=False)(points), others) if self.shape_alone else others
 
     def _in_own_frame(self, markers: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Moves points (..., N, 3) by the best rigid fit of markers (..., m, 3) to their nominal places."""

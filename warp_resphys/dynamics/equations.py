@@ -119,8 +119,8 @@ class EquationsOfMotion:
             if name not in self.parameters:
                 raise InputError(f"{name!r} is not a parameter of this simulator: it has {', '.join(self.parameters)}.")
             self.parameters[name].check(value)
-        given = {**self.defaults, **parameters}
-        tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in given.items()}
+        whole = {**self.defaults, **parameters}
+        tensors = {name: self.parameters[name].shaped(self.tensor(value)) for name, value in whole.items()}
         values, mass = self.energies.prepare(tensors)
         inertia, weight = mass.inertia + self._attached_mass, mass.weight + self._attached_mass
         return Constants(inertia, weight, tensors["gravity"], mass.damping, values)

@@ -42,22 +42,22 @@ from .term import LawTerm, PartPoints, PointSet
 class _OnOwnPoints(Energy):
     """An energy on one set of points that is given and does not depend on the mesh."""
 
-    own_points: Points
+    part_points: Points
 
     @override
     def points(self, mesh: Mesh) -> tuple[Points, ...]:
-        return (self.own_points,)
+        return (self.part_points,)
 
 
 @dataclass(frozen=True)
 class PointInertia(_OnOwnPoints):
     """Inertia of points; values of a step are ``inertia`` (B, P) [N/m] and ``target`` (B, P, 3) [m]."""
 
-    own_points: PartPoints  # a part each
+    part_points: PartPoints  # a part each
 
     @override
     def term(self, launcher: Launcher, sets: Sequence[PointSet]) -> LawTerm:
-        count = self.own_points.n_points
+        count = self.part_points.n_points
         shapes = {"target": (count, 3), "inertia": (count,)}
         return LawTerm(launcher, sets, INERTIA, shapes, count, stiffness=lambda v: v["inertia"])
 
@@ -95,7 +95,7 @@ class BoundRigidInertia(BoundInertia):
         super().__init__(part, site)
         like = site.rest_positions
         self._controls = torch.as_tensor(site.points[0].nodes[0], device=like.device)
-        self._factor = site.tensor(part.own_points.gradients[0, :, :, 0])  # (P, 4) L^T
+        self._factor = site.tensor(part.part_points.gradients[0, :, :, 0])  # (P, 4) L^T
         volume = site.load_volume[:, part.cells].sum(axis=1)
         self._volume = site.tensor(volume)  # (N,) volume whose weight acts at each vertex [m^3]
 
@@ -115,7 +115,7 @@ class BoundRigidInertia(BoundInertia):
 class Rigidity(_OnOwnPoints):
     """The energy kappa V |F - R(F)|^2 that keeps a part's deformation gradient close to a rotation."""
 
-    own_points: SolidPoints  # a single point with the volume of the part
+    part_points: SolidPoints  # a single point with the volume of the part
     stiffness: float  # kappa [Pa]
     centre: NDArray[np.float64]  # (4,) weights of the control vertices in the centre of mass
 
@@ -136,10 +136,10 @@ class RigidityTerm(SolidTerm):
     """
 
     def __init__(self, launcher: Launcher, sets: Sequence[PointSet], energy: Rigidity) -> None:
-        volume = float(energy.own_points.shape_volume.sum())
+        volume = float(energy.part_points.shape_volume.sum())
         super().__init__(launcher, sets, Corotated(), np.array([[volume, 0.0]]))
         # Places (4, 3) of which the deformation gradient is the identity, about the centre of mass.
-        corners = np.linalg.pinv(energy.own_points.gradients[0, 0]).T
+        corners = np.linalg.pinv(energy.part_points.gradients[0, 0]).T
         arms = corners - energy.centre @ corners
         self._centre = launcher.upload(energy.centre[None], wp.float64)
         self._arms = launcher.upload(arms[None], wp.vec3d)
@@ -159,7 +159,7 @@ class BoundRigidity(BoundEnergy):
         del parameters
         rigidity = self.energy
         assert isinstance(rigidity, Rigidity)
-        scale = rigidity.stiffness * float(rigidity.own_points.shape_volume.sum())
+        scale = rigidity.stiffness * float(rigidity.part_points.shape_volume.sum())
         return {"stiffness": self.site.tensor([[[scale, 0.0]]])}
 
     @override

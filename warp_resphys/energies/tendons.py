@@ -213,11 +213,11 @@ class Tendons(Energy):
                 shape[..., 1 + k] = step
             weights[in_world] = 0.0
             for first in range(len(route) - 1):
-                own_nodes, own_operators = _difference(
+                tendon_nodes, tendon_operators = _difference(
                     mesh, places.cells[first : first + 2], weights[first : first + 2]
                 )
-                nodes.append(own_nodes)
-                operators.append(own_operators)
+                nodes.append(tendon_nodes)
+                operators.append(tendon_operators)
             tendon += [number] * (len(route) - 1)
             rest.append(np.diff(shape, axis=0))
             anchors.append(np.diff(np.where(in_world[:, None, None], shape, 0.0), axis=0))

@@ -223,16 +223,16 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         """
         if self._random is None:
             raise InputError("the environment was not reset: call env.reset(seed=...) before env.step(...).")
-        given, mapping = np.asarray(actions, dtype=np.float64), self._mapping
-        if given.shape != (self.num_envs, self.world.parts) or not np.isfinite(given).all():
+        chosen, mapping = np.asarray(actions, dtype=np.float64), self._mapping
+        if chosen.shape != (self.num_envs, self.world.parts) or not np.isfinite(chosen).all():
             raise InputError(
-                f"actions have shape {given.shape}: give finite values of shape {(self.num_envs, self.world.parts)}, "
+                f"actions have shape {chosen.shape}: give finite values of shape {(self.num_envs, self.world.parts)}, "
                 "from -1 to 1."
             )
         beginning = self._over.copy() if self._mode is AutoresetMode.NEXT_STEP else np.zeros_like(self._over)
         if self._mode is AutoresetMode.DISABLED and self._over.any():
             raise InputError("an episode is over: reset it with options={'reset_mask': ...} before the next step.")
-        wanted = mapping.low + 0.5 * (np.clip(given, -1.0, 1.0) + 1.0) * (mapping.high - mapping.low)
+        wanted = mapping.low + 0.5 * (np.clip(chosen, -1.0, 1.0) + 1.0) * (mapping.high - mapping.low)
         last, frames = self._commands.copy(), np.arange(1, mapping.frames + 1)[:, None, None]
         most = mapping.rate * self.world.time_step * frames
         commands = last + np.clip(wanted - last, -most, most)  # (F, B, n)

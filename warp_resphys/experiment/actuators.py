@@ -70,10 +70,10 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None
         energies.append(build_contact(settings))
     if settings.self_contact is not None:
         energies.append(SurfaceContact(**dict(settings.self_contact)))
-    return energies + list(own_energies(settings).values())
+    return energies + list(energies_of_packages(settings).values())
 
 
-def own_energies(settings: BodySettings) -> dict[str, Energy]:
+def energies_of_packages(settings: BodySettings) -> dict[str, Energy]:
     """Builds the ``energies`` of other packages, by name.
 
     Raises:
@@ -125,7 +125,7 @@ def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
         driving["tendons"] = _COMMANDED["tendons"][settings.tendons.commanded], len(settings.tendons.routes)
     if settings.muscles is not None and settings.muscles.commanded is not None:
         driving["muscles"] = _COMMANDED["muscles"][settings.muscles.commanded], len(settings.muscles.bundles)
-    for name, energy in own_energies(settings).items():
+    for name, energy in energies_of_packages(settings).items():
         if energy.inputs:
             driving[f"energies.{name}"] = energy.inputs[0], energy.count
     if len(driving) > 1:

@@ -135,9 +135,9 @@ class Experiment:
             assert markers is not None
             bound = bound_markers(markers, self.body.mesh, trials.bound, trials.labels)
             observe = ViewedMarkers.of(bound, marker_view_of(markers, trials.labels, trials.sets)).to(self.like)
-        given = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
+        more = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
         return ObservedMotions(
-            trials, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **given
+            trials, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **more
         )
 
     def identified(self, model: str) -> Identification:
@@ -149,7 +149,7 @@ class Experiment:
         if key != LAW:
             return identified[key]
         sysid, parameters = identified.get("sysid", Identification()), read_json(self.folder / LAW_FILE)["others"]
-        of_trials = {name: value for name, value in sysid.own.items() if split_name(name)[0] in parameters}
+        of_trials = {name: value for name, value in sysid.of_trials.items() if split_name(name)[0] in parameters}
         return Identification(parameters, of_trials, sysid.placement)
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:

@@ -290,7 +290,7 @@ class RunReader:
             trial, times = str(read_attribute(file, "film_trial")), float(read_attribute(file, "time_step")) * steps
         if trials.bound is not None and run.markers is not None:
             view = marker_view_of(run.markers, trials.labels, trials.sets)
-            if view.own:
+            if view.shape_alone:
                 has = np.flatnonzero(trials.present[trials.names.index(trial)]).tolist()
                 markers = bound_markers(run.markers, self.body.mesh, trials.bound, trials.labels)
                 view, at = view.select(has), {model: torch.from_numpy(q) for model, q in bodies.items()}

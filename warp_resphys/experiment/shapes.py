@@ -70,13 +70,13 @@ def check_shape(shape: ShapeSettings) -> None:
     body, target = build_body(BodySettings.of(shape)), build_body(shape.target_body)
     vertices_in(target.mesh, body.mesh)
     if shape.held is None:
-        quantity, given = driving_quantity(shape), len(shape.inputs or ())
+        quantity, count = driving_quantity(shape), len(shape.inputs or ())
         if quantity is None:
             raise InputError(
                 "inputs are given, but it has neither chambers nor tendons nor commanded muscles: leave them out."
             )
-        if given != driven_parts(shape):
-            raise InputError(f"inputs has {given} values for {driven_parts(shape)} parts: give one for each.")
+        if count != driven_parts(shape):
+            raise InputError(f"inputs has {count} values for {driven_parts(shape)} parts: give one for each.")
     elif shape.held.at is not None:
         face = vertices_at(target.mesh, shape.held.at)
         if np.isin(face, target.fixed_vertices).all():

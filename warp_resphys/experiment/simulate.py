@@ -165,15 +165,15 @@ def true_motions(
         they stand still.
     """
     common, still = data.base_motion, np.zeros((len(times), 6))
-    given = [trial.base_motion or (common if isinstance(common, MotionSettings) else None) for trial in trials]
+    motions = [trial.base_motion or (common if isinstance(common, MotionSettings) else None) for trial in trials]
     scales = [trial.amount if isinstance(data, MovingBase) else 1.0 for trial in trials]
     base = [
         still if motion is None else prescribed(motion, times, scale=scale)
-        for motion, scale in zip(given, scales, strict=True)
+        for motion, scale in zip(motions, scales, strict=True)
     ]
     pushed = [prescribed_all(data.obstacle_motion, trial.obstacle_motion, times) for trial in trials]
     obstacles = {name: np.stack([poses.get(name, still) for poses in pushed]) for poses in pushed for name in poses}
-    return np.stack(base) if any(given) else None, obstacles
+    return np.stack(base) if any(motions) else None, obstacles
 
 
 def played(

@@ -182,7 +182,7 @@ class Body:
         """Mesh, number of fixed vertices, rigid parts, energies, and numbers of glued regions and symmetry planes."""
         parts = [repr(self.mesh), f"{len(self.fixed_vertices)} fixed vertices"]
         parts += [f"rigid {name}" for name in self.rigid] + [type(energy).__name__ for energy in self.energies]
-        parts += [f"{len(given)} {name}" for name in ("glued", "symmetry") if (given := getattr(self, name))]
+        parts += [f"{len(parts_of)} {name}" for name in ("glued", "symmetry") if (parts_of := getattr(self, name))]
         return f"Body({', '.join(parts)})"
 
     def plot(

@@ -115,23 +115,25 @@ class Scene(Body):
             self.vertex_slice(name)
         fields: dict[str, torch.Tensor | ArrayLike] = {}
         for key in _FIELDS:
-            given = {name: value for name, inputs in by_body.items() if (value := inputs.fields.get(key)) is not None}
-            if not given:
+            tensors_of = {
+                name: value for name, inputs in by_body.items() if (value := inputs.fields.get(key)) is not None
+            }
+            if not tensors_of:
                 continue
             axis = -1 if key == "attached_mass" else -2
-            tensors = [value for name, value in given.items() if key not in by_body[name].plain]
-            sample = (tensors or [*given.values()])[0]
-            given = {name: value.to(sample) for name, value in given.items()}
+            tensors = [value for name, value in tensors_of.items() if key not in by_body[name].plain]
+            sample = (tensors or [*tensors_of.values()])[0]
+            tensors_of = {name: value.to(sample) for name, value in tensors_of.items()}
             for name, body in self.bodies.items():
-                if name in given:
+                if name in tensors_of:
                     continue
                 size = len(body.fixed_vertices) if key == "fixed_positions" else body.n_vertices
                 if key == "fixed_positions" and size:
                     raise InputError(f"fixed_positions of {name} are missing: give those of every body that has any.")
                 shape = [*sample.shape]
                 shape[axis] = size
-                given[name] = sample.new_zeros(shape)
-            whole = torch.cat([given[name] for name in self.bodies], axis)
+                tensors_of[name] = sample.new_zeros(shape)
+            whole = torch.cat([tensors_of[name] for name in self.bodies], axis)
             fields[key] = whole if tensors else whole.numpy()
         named = {f"{name}_{key}": value for name, inputs in by_body.items() for key, value in inputs.actuation.items()}
         out = Inputs(**named)

@@ -32,13 +32,13 @@ class ClassSettings(Settings):
     def packages(self) -> dict[str, str]:
         return package_of(self.target)
 
-    def factory(self, base: type[Any], where: str, given: int = 0, method: str = "") -> Callable[..., Any]:
+    def factory(self, base: type[Any], where: str, leading: int = 0, method: str = "") -> Callable[..., Any]:
         """Returns the class, or a class method of it, with the arguments of the configuration.
 
         Args:
             base: class that it must be derived from.
             where: dotted key of the group, for messages.
-            given: number of positional arguments that the caller adds.
+            leading: number of positional arguments that the caller adds.
             method: name of the class method; empty for the class itself.
 
         Raises:
@@ -49,7 +49,7 @@ class ClassSettings(Settings):
             raise InputError(f"{where}: {self.target} has no method {' and no '.join(missing)}: add it.")
         make = getattr(kind, method) if method else kind
         values = {name: value for name, value in (self.model_extra or {}).items() if value is not None}
-        checked = parse(_arguments(make, given, where), values, where)
+        checked = parse(_arguments(make, leading, where), values, where)
         return partial(make, **{name: getattr(checked, name) for name in checked.model_fields_set})
 
 
@@ -59,7 +59,7 @@ class _Arguments(Settings):
     model_config = ConfigDict(strict=False, validate_default=False)
 
 
-def _arguments(make: Callable[..., Any], given: int, where: str) -> type[_Arguments]:
+def _arguments(make: Callable[..., Any], leading: int, where: str) -> type[_Arguments]:
     """Returns a class of settings with the arguments after the first ones."""
     try:
         fields: dict[str, Any] = {
@@ -67,7 +67,7 @@ def _arguments(make: Callable[..., Any], given: int, where: str) -> type[_Argume
                 Any if parameter.annotation is Parameter.empty else parameter.annotation,
                 ... if parameter.default is Parameter.empty else parameter.default,
             )
-            for parameter in [*signature(make, eval_str=True).parameters.values()][given:]
+            for parameter in [*signature(make, eval_str=True).parameters.values()][leading:]
         }
         return create_model(make.__qualname__, __base__=_Arguments, **fields)
     except (NameError, PydanticUserError) as error:

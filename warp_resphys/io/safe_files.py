@@ -221,12 +221,12 @@ def read_array(
         dataset = group.get(name)
         if not isinstance(dataset, h5py.Dataset):
             raise DataFileError(f"{path} has no dataset '{name}': check the path")
-        given = dataset.shape
+        stored = dataset.shape
         if shape is not None and (
-            len(given) != len(shape) or any(b not in (a, None) for a, b in zip(given, shape, strict=True))
+            len(stored) != len(shape) or any(b not in (a, None) for a, b in zip(stored, shape, strict=True))
         ):
             wanted = " x ".join("any" if length is None else str(length) for length in shape)
-            raise DataFileError(f"'{name}' of {path} has the shape {given} where {wanted} is needed: check the path")
+            raise DataFileError(f"'{name}' of {path} has the shape {stored} where {wanted} is needed: check the path")
         return np.asarray(dataset[index])
     except OSError as error:
         raise hdf5_error(Path(path), error) from error

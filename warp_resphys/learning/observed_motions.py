@@ -39,12 +39,12 @@ class Identified(Brief):
 
     Attributes:
         parameters: values that all trials share, by name.
-        own: values of single trials and sessions, by `parameters.own_name`.
+        of_trials: values of single trials and sessions, by `parameters.value_name`.
         placement: of the markers, see `placement.placement_of`; None if it is exact.
     """
 
     parameters: Mapping[str, float] = field(default_factory=dict)
-    own: Mapping[str, float] = field(default_factory=dict)
+    of_trials: Mapping[str, float] = field(default_factory=dict)
     placement: PlainPlacements | None = None
 
     @classmethod
@@ -59,7 +59,7 @@ class Identified(Brief):
 
     def values(self, simulator: Simulator) -> dict[str, torch.Tensor]:
         """Returns (1,) values of all parameters, on the device of a simulator."""
-        return {name: simulator.tensor([value]) for name, value in {**self.parameters, **self.own}.items()}
+        return {name: simulator.tensor([value]) for name, value in {**self.parameters, **self.of_trials}.items()}
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def bounds_of(limits: Limits) -> Bounds:
     return Bounds(lower=limits[0], upper=limits[1], logarithmic=min(limits) > 0.0)
 
 
-def own_name(name: str, owner: str) -> str:
+def value_name(name: str, owner: str) -> str:
     """Name of a parameter's value for one trial, or for those of one session, such as ``tension_factor@bend_1``."""
     return f"{name}{_OWN}{owner}"
 

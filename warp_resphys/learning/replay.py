@@ -132,7 +132,7 @@ class Replay:
 
         Args:
             parameters: (E,) values, by any of `parameter_names`, or (E, W) of a constant with W values; values of
-                single trials or sessions by `parameters.own_name`, beside the common value.
+                single trials or sessions by `parameters.value_name`, beside the common value.
 
         Returns:
             The constants, the inputs of the trials, and those before time zero.

@@ -159,8 +159,8 @@ class BorderedSolver(LinearSolver):
     @override
     def _lay_out(self, rows: Indices, cols: Indices, n_nodes: int) -> None:
         border = hubs(rows, cols, n_nodes)
-        own_rows, own_cols, number = banded_rest(rows, cols, n_nodes, border)
-        self.band = BandedSolver(own_rows, own_cols, n_nodes - len(border), self.block, self.device, self.dtype)
+        band_rows, band_cols, number = banded_rest(rows, cols, n_nodes, border)
+        self.band = BandedSolver(band_rows, band_cols, n_nodes - len(border), self.block, self.device, self.dtype)
         k, n = self.block, self.n
         place = np.full(n_nodes, -1)
         place[border] = np.arange(len(border))

@@ -30,8 +30,8 @@ def select_vertices(
         InputError: an invalid coordinate.
         MeshError: No coordinate, or no vertex lies there.
     """
-    given = {"x": x, "y": y, "z": z}
-    values = {axis: np.asarray(at, dtype=np.float64).tolist() for axis, at in given.items() if at is not None}
+    coordinates = {"x": x, "y": y, "z": z}
+    values = {axis: np.asarray(at, dtype=np.float64).tolist() for axis, at in coordinates.items() if at is not None}
     return vertices_at(mesh, parse(Place, {**values, "tolerance": tolerance}, "select_vertices"))
 
 

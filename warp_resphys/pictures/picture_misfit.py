@@ -6,8 +6,8 @@ weight, and within it outlines, points and cloud. A distance r counts as s sqrt(
 where it is well below s = 4, and less beyond, as a cable or a hand before the body moves its outline by any number of
 pixels (Charbonnier et al. 1997).
 
-A name with an owner (`learning.parameters.own_name`) is the value of one pose, of the poses of one material, or of the
-pictures by one lens; a name without, that of all. Shapes follow the physical parameters by differences of equilibria,
+A name with an owner (`learning.parameters.value_name`) is the value of one pose, of the poses of one material, or of
+the pictures by one lens; a name without, that of all. Shapes follow the physical parameters by differences of equilibria,
 and pixels and clouds follow shapes and cameras exactly.
 
 `tests/pictures/test_picture_misfit.py` and `test_clouds.py` compare the derivatives with differences.

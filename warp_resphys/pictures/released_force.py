@@ -108,7 +108,7 @@ class ReleasedForce:
         return series.double().cpu()
 
 
-def at_own_times(
+def at_row_times(
     series: torch.Tensor, begin: float, row_time: float, step: float, pixels: Callable[[torch.Tensor], torch.Tensor]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns the vertices of motions where a picture shows those of the first, and their velocities in that.

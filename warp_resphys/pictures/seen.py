@@ -19,7 +19,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.rotations import rotations
 from .clouds import Cloud
 from .outlines import ClosedSurface, Outline, Silhouette, visibility, within
-from .released_force import OF_RELEASE, ReleasedForce, at_own_times
+from .released_force import OF_RELEASE, ReleasedForce, at_row_times
 
 CLAMP_TURN: Final = "clamp_turn"  # rad
 CLAMP_SHIFT: Final = "clamp_shift"  # m
@@ -203,7 +203,7 @@ class SeenPose:
         def pixels(q: torch.Tensor) -> torch.Tensor:
             return photo.camera.pixels(q, corrections)
 
-        return at_own_times(shapes, begin, photo.row_time, step, pixels)
+        return at_row_times(shapes, begin, photo.row_time, step, pixels)
 
     def vertices(self, photo: Photo, shape: torch.Tensor, values: Mapping[str, float]) -> torch.Tensor:
         """Returns the vertices (N, 3) that a picture shows of a shape; see `seen` [m]."""

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ..data.registration import root_mean_square
 from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.identification.search import Identification
-from ..learning.parameters import own_name, split_name
+from ..learning.parameters import split_name, value_name
 from ..learning.placement import PlainPlacement
 from ..settings.learning import Bounds
 from . import figures
@@ -121,7 +121,7 @@ def parameter_rows(identified: Identification, start: Mapping[str, float], truth
 
 def trials_table(identified: Identification) -> PageTable | None:
     """Returns the values of single trials and sessions, with their standard deviations; None if there are none."""
-    values, deviations = identified.own, identified.own_deviation
+    values, deviations = identified.of_trials, identified.of_trials_deviation
     if not values:
         return None
     parameters = list(dict.fromkeys(split_name(name)[0] for name in values))
@@ -129,7 +129,7 @@ def trials_table(identified: Identification) -> PageTable | None:
     wording = {parameter: parameter_wording(parameter) for parameter in parameters}
     rows = []
     for owner in owners:
-        names = {own_name(parameter, owner): factor for parameter, (_, _, factor) in wording.items()}
+        names = {value_name(parameter, owner): factor for parameter, (_, _, factor) in wording.items()}
         cells = [identified_cell(values.get(name), factor, deviations.get(name)) for name, factor in names.items()]
         rows.append(Row(owner, cells))
     columns = [f"{words} [{unit}]" if unit else words for words, unit, _ in wording.values()]

@@ -207,39 +207,39 @@ class Commands:
         responses = {name: response_of(simulator.inputs[name], parameters) for name in taken}
         self._responses = {name: InputResponse(h, **values, filters=filters) for name, values in responses.items()}
 
-    def begin(self, body: State, given: Mapping[str, torch.Tensor]) -> State:
+    def begin(self, body: State, inputs: Mapping[str, torch.Tensor]) -> State:
         """Returns the state after constant inputs (B, C), zero if omitted, have acted for a long time."""
         memory = {"lost": body.lost, "left": body.left}
         for name, response in self._responses.items():
-            still = response.steady(self._value(name, given, body))
+            still = response.steady(self._value(name, inputs, body))
             memory |= {f"{name}.{key}": values.movedim(-2, 0) for key, values in still.items()}
-        if self._description.told_of_base is not None or BASE in given:
-            memory[BASE] = torch.stack([self._value(BASE, given, body)] * 2, 1)
+        if self._description.told_of_base is not None or BASE in inputs:
+            memory[BASE] = torch.stack([self._value(BASE, inputs, body)] * 2, 1)
         return body.with_memory(memory)
 
-    def act(self, state: State, given: Mapping[str, torch.Tensor]) -> Acting:
+    def act(self, state: State, inputs: Mapping[str, torch.Tensor]) -> Acting:
         """Returns what acts during a step with inputs (B, C) by name; omitted ones are zero, an omitted base stays."""
         description = self._description
-        fields: dict[str, torch.Tensor | None] = {FORCE: given.get(FORCE)}
+        fields: dict[str, torch.Tensor | None] = {FORCE: inputs.get(FORCE)}
         conditions, memory, before = list[torch.Tensor](), dict[str, torch.Tensor](), state.memory_of()
-        payload = given.get(PAYLOAD.name)
+        payload = inputs.get(PAYLOAD.name)
         if description.payload_at is not None and description.sees_payload:
-            conditions.append(self._value(PAYLOAD.name, given, state))
+            conditions.append(self._value(PAYLOAD.name, inputs, state))
         for name, response in self._responses.items():
             remembered = {key: x.movedim(0, -2) for key, x in state.memory_of(f"{ROBOT}.{name}").items()}
-            acting, means, later = response(remembered, self._value(name, given, state)[None])
+            acting, means, later = response(remembered, self._value(name, inputs, state)[None])
             fields[name] = acting[0]
             conditions += [with_means(acting[0], means[:, 0])] if name in description.seen else []
             memory |= {f"{name}.{key}": values.movedim(-2, 0) for key, values in later.items()}
         if payload is not None:
             fields |= self._hung(payload)
         base = None
-        if BASE in given or BASE in before:
-            moved = before[BASE].unbind(1) if BASE in before else [torch.zeros_like(given[BASE])] * 2
-            base = torch.stack([*moved, given.get(BASE, moved[1])])
+        if BASE in inputs or BASE in before:
+            moved = before[BASE].unbind(1) if BASE in before else [torch.zeros_like(inputs[BASE])] * 2
+            base = torch.stack([*moved, inputs.get(BASE, moved[1])])
             memory[BASE] = base[1:].movedim(1, 0)
             fields["fixed_positions"] = self._fixed(base[2])
-            if BASE in given:
+            if BASE in inputs:
                 self._check_base(base)
             if description.told_of_base is not None:
                 gravity = self._simulator.tensor(self._simulator.gravity)
@@ -247,9 +247,9 @@ class Commands:
                 conditions.append(movement[:, torch.tensor(description.told_of_base, device=movement.device)])
         return Acting(Inputs(**fields), torch.cat(conditions, -1) if conditions else None, memory, base)
 
-    def _value(self, name: str, given: Mapping[str, torch.Tensor], body: State) -> torch.Tensor:
+    def _value(self, name: str, inputs: Mapping[str, torch.Tensor], body: State) -> torch.Tensor:
         """Returns the values (B, C) of an input, zero if omitted."""
-        value = given.get(name)
+        value = inputs.get(name)
         return body.q.new_zeros(body.batch, len(self._inputs[name].parts)) if value is None else value
 
     @cached_property

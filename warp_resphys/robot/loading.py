@@ -16,7 +16,7 @@ from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
 from ..io.errors import DataFileError, InputError, listed
-from ..learning.parameters import own_name
+from ..learning.parameters import value_name
 from ..stepping.state import State
 from .actuation import BASE
 from .description import SUFFIX, Description, describe, finished_experiment
@@ -167,18 +167,18 @@ def _commands(
     """Commands under which the robot does what it did under those of a trial with a zero or factor of its own."""
     values, commands = experiment.parameters(robot.description.model), dict(inputs)
     owners = (name, experiment.trials.session(name))
-    for key, given in inputs.items():
+    for key, series in inputs.items():
         zero, factor = (values.get(f"{key}_{word}") for word in ("zero", "factor"))
-        own_zero, own_factor = (
-            next((values[full] for owner in owners if (full := own_name(f"{key}_{word}", owner)) in values), common)
+        trial_zero, trial_factor = (
+            next((values[full] for owner in owners if (full := value_name(f"{key}_{word}", owner)) in values), common)
             for word, common in (("zero", zero), ("factor", factor))
         )
-        if own_zero is not None and zero is not None:
-            commands[key] = (given - own_zero + zero).clamp_min(robot.simulator.inputs[key].lower)
-        if own_factor is not None and factor is not None:
+        if trial_zero is not None and zero is not None:
+            commands[key] = (series - trial_zero + zero).clamp_min(robot.simulator.inputs[key].lower)
+        if trial_factor is not None and factor is not None:
             origin = sum(x for x in (zero, values.get(f"{key}_dead_band")) if x is not None)
             beyond = (commands[key] - origin).clamp_min(0.0) if f"{key}_dead_band" in values else commands[key] - origin
-            commands[key] = commands[key] + beyond * (own_factor / factor - 1.0)
+            commands[key] = commands[key] + beyond * (trial_factor / factor - 1.0)
     return commands
 
 

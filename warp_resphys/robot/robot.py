@@ -85,8 +85,8 @@ class Robot:
 
     def _set_parameters(self, parameters: Mapping[str, torch.Tensor | float]) -> None:
         check_names(parameters, identifiable_parameters(self.simulator))
-        given = {**self.description.parameters, **parameters}
-        values = {name: self.simulator.tensor(value).reshape(-1) for name, value in given.items()}
+        known = {**self.description.parameters, **parameters}
+        values = {name: self.simulator.tensor(value).reshape(-1) for name, value in known.items()}
         count = max((len(value) for value in values.values()), default=1)
         for name, value in values.items():
             if len(value) not in (1, count):
@@ -152,7 +152,7 @@ class Robot:
 
     def __repr__(self) -> str:
         """Returns a short description: vertices, markers, time step, inputs, parameters, error."""
-        inputs = [f"  input {name} [{given.unit}]: {', '.join(given.parts)}" for name, given in self.inputs.items()]
+        inputs = [f"  input {name} [{one.unit}]: {', '.join(one.parts)}" for name, one in self.inputs.items()]
         return self.description.summary(self.time_step, inputs)
 
     def save(self, path: str | Path) -> Path:
@@ -208,9 +208,9 @@ class Robot:
             InputError: an invalid input, as for `step`.
             ConvergenceError: there is no equilibrium.
         """
-        given = self._read(inputs, batch)
-        state = self._commands.begin(self.simulator.rest_state(batch), given)
-        acting = self._commands.act(state, given).inputs
+        values = self._read(inputs, batch)
+        state = self._commands.begin(self.simulator.rest_state(batch), values)
+        acting = self._commands.act(state, values).inputs
         if not self.simulator.is_held(state, acting, self.constants):
             return state
         body = self.simulator.static_equilibrium(acting, self.constants, batch=batch)

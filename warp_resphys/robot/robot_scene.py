@@ -59,11 +59,11 @@ class RobotScene:
         if not robots:
             raise InputError("a scene of robots has no robot: give them by name, with their poses.")
         self.robots, self._poses = dict[str, Robot](), dict[str, tuple[FloatArray, FloatArray]]()
-        for name, given in robots.items():
-            if not (isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], Robot)):
-                raise InputError(f"{name} is {given!r}: give a robot and its pose, as in (robot, (x, y, z, 0, 0, 0)).")
-            self.robots[name], self._poses[name] = given[0], _pose(name, given[1])
-            if given[0].is_data_driven:
+        for name, placed in robots.items():
+            if not (isinstance(placed, tuple) and len(placed) == 2 and isinstance(placed[0], Robot)):
+                raise InputError(f"{name} is {placed!r}: give a robot and its pose, as in (robot, (x, y, z, 0, 0, 0)).")
+            self.robots[name], self._poses[name] = placed[0], _pose(name, placed[1])
+            if placed[0].is_data_driven:
                 raise InputError(f"{name} has no simulator, only a network for its mesh: load another model.")
             if name in (objects or {}):
                 raise InputError(f"{name} is a robot and an object: give them different names.")
@@ -98,8 +98,8 @@ class RobotScene:
         self._frames = {name: (tensor(rotation), tensor(shift)) for name, (rotation, shift) in self._poses.items()}
         parameters = dict[str, torch.Tensor]()
         for name, robot in self.robots.items():
-            own_constants = constants_of(robot.simulator, robot.parameters)
-            parameters |= {f"{name}_{key}": value for key, value in own_constants.items() if key != "gravity"}
+            identified = constants_of(robot.simulator, robot.parameters)
+            parameters |= {f"{name}_{key}": value for key, value in identified.items() if key != "gravity"}
         self.constants = self.simulator.prepare(parameters)
 
     def _gravity(self) -> tuple[float, ...]:
@@ -138,13 +138,13 @@ class RobotScene:
             InputError: an unknown robot, or an invalid input.
             ConvergenceError: a robot has no equilibrium.
         """
-        given = self._checked(inputs)
+        by_robot = self._checked(inputs)
         rest, states = self.simulator.rest_state(batch), dict[str, State]()
         parts = []
         for name, _, _ in self.scene.members:
             at = self.scene.vertex_slice(name)
             if name in self.robots:
-                states[name] = self.robots[name].begin(batch, **given.get(name, {}))
+                states[name] = self.robots[name].begin(batch, **by_robot.get(name, {}))
                 parts.append(self._placed(name, states[name].q))
             else:
                 parts.append(rest.q[:, at])
@@ -161,10 +161,10 @@ class RobotScene:
             InputError: an unknown robot, an invalid input, or surfaces that cross.
             ConvergenceError: the step failed.
         """
-        given, by_body = self._checked(inputs), dict[str, Inputs]()
+        by_robot, by_body = self._checked(inputs), dict[str, Inputs]()
         after = dict[str, Callable[[State], State]]()
         for name, robot in self.robots.items():
-            acting, after[name] = robot.drive(self.state_of(state, name), **given.get(name, {}))
+            acting, after[name] = robot.drive(self.state_of(state, name), **by_robot.get(name, {}))
             by_body[name] = self._inputs_in_scene(name, acting)
         if any(acting_on.fixed_positions is not None for acting_on in by_body.values()):
             for name, body, first in self.scene.members:
@@ -190,11 +190,11 @@ class RobotScene:
         }
 
     def _checked(self, inputs: Mapping[str, Mapping[str, Given]] | None) -> Mapping[str, Mapping[str, Given]]:
-        given = inputs or {}
-        for name in given:
+        by_robot = inputs or {}
+        for name in by_robot:
             if name not in self.robots:
                 raise InputError(f"there is no robot {name!r} in the scene: it has {', '.join(self.robots)}.")
-        return given
+        return by_robot
 
     def _placed(self, name: str, points: torch.Tensor) -> torch.Tensor:
         """Positions (..., 3) in the scene, from those in a robot's own frame [m]."""

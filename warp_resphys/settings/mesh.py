@@ -43,8 +43,8 @@ class Place(Settings):
     @property
     def spans(self) -> dict[str, tuple[float, float]]:
         """Lowest and highest coordinate along the axes that are given [m]."""
-        given = {"x": self.x, "y": self.y, "z": self.z}
-        return {axis: at if isinstance(at, tuple) else (at, at) for axis, at in given.items() if at is not None}
+        coordinates = {"x": self.x, "y": self.y, "z": self.z}
+        return {axis: at if isinstance(at, tuple) else (at, at) for axis, at in coordinates.items() if at is not None}
 
     @property
     def nearness(self) -> float:
@@ -197,9 +197,9 @@ class ArmMesh(Settings):
         count = len(self.chamber_lengths)
         needed = {"caps": count + 1, "radii": count + 1, "rotations": count if self.rotations else 0}
         for name, number in needed.items():
-            given = len(getattr(self, name))
-            if given != number:
-                raise ValueError(f"{name} has {given} numbers, but {count} chamber_lengths need {number}.")
+            found = len(getattr(self, name))
+            if found != number:
+                raise ValueError(f"{name} has {found} numbers, but {count} chamber_lengths need {number}.")
         if self.outline == "lobed" and (self.profile == "sector" or any(self.rotations)):
             what = "sectors" if self.profile == "sector" else "rotations"
             raise ValueError(f"outline is lobed, which does not go with {what}: set it to round.")

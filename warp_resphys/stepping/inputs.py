@@ -46,11 +46,11 @@ class Inputs:
         attached_mass: torch.Tensor | ArrayLike | None = None,
         **actuation: torch.Tensor | ArrayLike | None,
     ) -> None:
-        given = {"external_force": external_force, "fixed_positions": fixed_positions, "attached_mass": attached_mass}
-        plain = {n for n, x in (given | actuation).items() if not (x is None or isinstance(x, torch.Tensor))}
+        loads = {"external_force": external_force, "fixed_positions": fixed_positions, "attached_mass": attached_mass}
+        plain = {n for n, x in (loads | actuation).items() if not (x is None or isinstance(x, torch.Tensor))}
         self.plain = frozenset(plain)
         self.external_force, self.fixed_positions, self.attached_mass = (
-            _batched(name, value, axes) for (name, value), axes in zip(given.items(), (2, 2, 1), strict=True)
+            _batched(name, value, axes) for (name, value), axes in zip(loads.items(), (2, 2, 1), strict=True)
         )
         self.actuation: dict[str, torch.Tensor] = {}
         for name, value in actuation.items():

@@ -151,9 +151,9 @@ def positions(simulator: Simulator, environments: slice = slice(None)) -> torch.
     moving = State(rest.q, (speed * torch.ones_like(rest.v)).index_fill(1, simulator.fixed, 0.0))
     start = moving if simulator.inputs or isinstance(simulator.body, Scene) else pose(simulator, "bent", BATCH)
     rise = simulator.tensor(np.arange(1, 1 + STEPS) / STEPS)[:, None, None] * (0.3 + share[environments, None])
-    given = {name: rise * simulator.tensor(level) for name, level in LEVELS.items() if name in simulator.inputs}
+    levels = {name: rise * simulator.tensor(level) for name, level in LEVELS.items() if name in simulator.inputs}
     state = State(start.q[environments], start.v[environments])
-    return simulator.rollout(state, STEPS, Inputs(**given)).q.cpu().double()
+    return simulator.rollout(state, STEPS, Inputs(**levels)).q.cpu().double()
 
 
 def gradient_error(name: str, device: torch.device) -> float:

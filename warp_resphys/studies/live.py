@@ -266,7 +266,11 @@ class LiveRobot:
 def _markers_on_body(robot: Robot) -> Markers | None:
     """Markers in the frame of the body, where recordings have their own frame; None where these are the same."""
     about = robot.description
-    if about.markers is None or about.bound is None or not marker_view_of(about.markers, about.labels, about.sets).own:
+    if (
+        about.markers is None
+        or about.bound is None
+        or not marker_view_of(about.markers, about.labels, about.sets).shape_alone
+    ):
         return None
     markers = bound_markers(about.markers, about.mesh, about.bound.numpy(), about.labels)
     return markers.to(robot.simulator.rest_positions)

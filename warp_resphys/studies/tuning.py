@@ -177,8 +177,8 @@ def _print(study: optuna.Study, search: Tune) -> None:
         [str(trial.number), number_text(trial.value), *map(_text, trial.params.values())] for trial in done[:_SHOWN]
     ]
     table = PageTable.plain("Best trials: roll-out error on the validation split", headings, rows)
-    given = [override.lstrip("+") for override in HydraConfig.get().overrides.task]
-    kept = [override for override in given if not override.lstrip("~").startswith("tune.")]
+    overrides = [override.lstrip("+") for override in HydraConfig.get().overrides.task]
+    kept = [override for override in overrides if not override.lstrip("~").startswith("tune.")]
     prefix = "simfree." if search.model == "simfree" else ""
     found = [f"{prefix}{key}={value}" for key, value in (_dotted(search.settings) | done[0].params).items()]
     show(table, f"A run with the best settings: {shlex.join(['warp-resphys', *kept, *found])}")

@@ -112,8 +112,8 @@ class FullEstimator(TwinEstimator[FullBelief]):
     def begin(self, inputs: Mapping[str, Given], refined: FloatArray | None = None) -> FullBelief:
         self._known = self._values(inputs)
         values = self._known if refined is None else refined
-        robot, given = self._at(values, inputs)
-        state = at_rest(robot, self._count, given).detach()
+        robot, acting = self._at(values, inputs)
+        state = at_rest(robot, self._count, acting).detach()
         return FullBelief(**vars(self._first(values)), state=state, transition=self.tangent.transition)
 
     @property
@@ -126,11 +126,11 @@ class FullEstimator(TwinEstimator[FullBelief]):
         table[1 : self._count - 1] += np.diag(self._apart)
         table[self._count - 1] = self._known
         columns = dict(zip(self._refined, table.T, strict=True))
-        given = dict(inputs)
+        acting = dict(inputs)
         if PAYLOAD.name in columns:
-            given[PAYLOAD.name] = columns.pop(PAYLOAD.name)[:, None]
+            acting[PAYLOAD.name] = columns.pop(PAYLOAD.name)[:, None]
         changed = {name: self.robot.simulator.tensor(column) for name, column in columns.items()}
-        return self.robot.with_parameters(**changed) if changed else self.robot, given
+        return self.robot.with_parameters(**changed) if changed else self.robot, acting
 
     @override
     def advance(self, belief: FullBelief, inputs: Mapping[str, Given], renew: bool = True) -> FullBelief:
@@ -142,7 +142,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
     def _advanced(self, belief: FullBelief, inputs: Mapping[str, Given], renew: bool) -> FullBelief:
         """A step; a column of the transition may be renewed, by two environments beside."""
         tangent, more = self.tangent, 2 if renew else 0
-        robot, given = self._at(belief.parameters, inputs, more)
+        robot, acting = self._at(belief.parameters, inputs, more)
         state = belief.state
         pull = torch.einsum("r,rni->ni", self.robot.simulator.tensor(belief.bias), tangent.pull)
         forces = pull.repeat(self._count + more, 1, 1)
@@ -152,7 +152,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
             moved, faster, pulled = (F.pad(change, (0, 0, 0, 0, self._count, 0)) for change in changes)
             state = shifted(robot, state.select([*range(self._count), 0, 0]), moved, faster)
             forces += pulled
-        state = robot.step(state, **pulled_by(robot, given, forces)).detach()
+        state = robot.step(state, **pulled_by(robot, acting, forces)).detach()
         belief = replace(belief, wait=max(belief.wait - 1, 0))
         if renew:
             belief = self._renewed(belief, state)

@@ -65,9 +65,9 @@ class ReducedEstimator(TwinEstimator[ReducedBelief]):
 
     def _commands(self, inputs: Mapping[str, Given]) -> FloatArray:
         """Values (n,) of the model's input."""
-        given = {name: self._reader.read(name, value, 1)[0] for name, value in inputs.items()}
-        values = given.pop(self.model.name, torch.zeros(self.model.parts))
-        for name, value in given.items():
+        read = {name: self._reader.read(name, value, 1)[0] for name, value in inputs.items()}
+        values = read.pop(self.model.name, torch.zeros(self.model.parts))
+        for name, value in read.items():
             if bool((value != 0.0).any()):
                 raise InputError(
                     f"the reduced model has no input but {self.model.name}, and {name} is given: leave it out, or use "

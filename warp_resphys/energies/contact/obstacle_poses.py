@@ -118,14 +118,14 @@ class _Distances(AdjointFunction):
 
     @override
     @staticmethod
-    def forward(ctx: Any, measurement: _Measurement, *given: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Any, measurement: _Measurement, *tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         with measurement.lock:
-            for buffer, value in zip(measurement.inputs, given, strict=True):
+            for buffer, value in zip(measurement.inputs, tensors, strict=True):
                 buffer.copy_(value.detach())
             measurement.launch(measurement.measure)
-            d, n = (value.to(given[0].dtype, copy=True) for value in measurement.results)
+            d, n = (value.to(tensors[0].dtype, copy=True) for value in measurement.results)
         ctx.measurement = measurement
-        ctx.save_for_backward(*given)
+        ctx.save_for_backward(*tensors)
         return d, n
 
     @override

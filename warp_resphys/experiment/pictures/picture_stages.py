@@ -23,7 +23,7 @@ from ...io.progress import Progress, show
 from ...io.resuming import Stage, StageContext, package_versions, resources_used
 from ...io.safe_files import atomic_hdf5, create, read_json, write_json
 from ...learning.identification.search import Identification, first_points, refined_searches, search_parameters
-from ...learning.parameters import TILTS, configured_parameters, own_name, split_name
+from ...learning.parameters import TILTS, configured_parameters, split_name, value_name
 from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
@@ -174,7 +174,7 @@ class _Plan:
             for owner in dict.fromkeys(owners[limits.per]) if chosen(name, limits.per) else ():
                 mine = [pose for pose in poses if owner in (*pose.owners, *pose.lenses)]
                 if any(name in pose.parameter_names and (pose.deforms or name in CORRECTIONS) for pose in mine):
-                    result[own_name(name, owner) if owner else name] = limits
+                    result[value_name(name, owner) if owner else name] = limits
         return result
 
     def guess(self, names: Iterable[str], poses: Sequence[SeenPose]) -> Values:
@@ -201,7 +201,7 @@ class _Plan:
         turns = {pose.name: math.radians(self.data.poses[pose.name].clamp_turn) for pose in poses}
         if CLAMP_TURN in self.settings.identify.parameters:
             return {}
-        return {own_name(CLAMP_TURN, name): turn for name, turn in turns.items() if turn}
+        return {value_name(CLAMP_TURN, name): turn for name, turn in turns.items() if turn}
 
     def pose(self, name: str, known: Values, deforms: bool = True, near: Shape | None = None) -> SeenPose:
         """A pose; a standing camera is the one of its frames' from which the body is seen best at first.
@@ -361,7 +361,7 @@ def report_pictures(context: StageContext) -> None:
     start = dict(run.simulation.values)
     for name in data.train:
         material, parameters = data.poses[name].material or "", poses.material(name).values
-        start |= {own_name(key, material): value for key, value in parameters.items()} if material else {}
+        start |= {value_name(key, material): value for key, value in parameters.items()} if material else {}
     write_pictures_report(
         context.run_dir / REPORT,
         picture_metrics(context.run_dir, run),

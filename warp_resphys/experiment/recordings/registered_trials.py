@@ -240,7 +240,7 @@ class RegisteredTrials(Reader):
         chosen, view, rotation = self.markers.register_with, self.view(trial), self.rotation
         use = [*self.markers.reference] if only_reference else [*self.markers.tracked, *self.markers.reference]
         use = [label for label in use if label in recording.labels and (chosen is None or label in chosen)]
-        if view.own and rotation is not None:
+        if view.shape_alone and rotation is not None:
             count = len(view.nominal)
             places = np.concatenate([view.of_arrays(places[:count] @ rotation.T) @ rotation, places[count:]])
         return register_markers(

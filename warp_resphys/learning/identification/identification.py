@@ -26,8 +26,8 @@ from ..parameters import (
     check_ranges,
     configured_parameters,
     identifiable_parameters,
-    own_name,
     split_name,
+    value_name,
 )
 from ..placement import Accuracy, PlainPlacements
 from ..replay import Replay, Start
@@ -135,7 +135,7 @@ def _bounds_of_owners(ranges: Mapping[str, Bounds], trials: Trials, names: Seque
     return {
         full: limits
         for name, limits in ranges.items()
-        for full in ([own_name(name, owner) for owner in owners[limits.per]] if limits.per in owners else [name])
+        for full in ([value_name(name, owner) for owner in owners[limits.per]] if limits.per in owners else [name])
     }
 
 
@@ -162,7 +162,7 @@ def _joined(rounds: Sequence[Identification], guess: Mapping[str, float], accura
 
 
 def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identification:
-    """An identification with the values of trials and sessions in `own`, apart from those of all trials.
+    """An identification with the values of trials and sessions in `of_trials`, apart from those of all trials.
 
     Other trials have the mean of the prior, and its deviation as their uncertainty, before `_with_first_frames`.
     """
@@ -173,7 +173,7 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
     common = [name for name in names if not split_name(name)[1]]
     of_trials = {name: value for name, value in found.parameters.items() if split_name(name)[1]}
     parameters = {name: found.parameters[name] for name in common} | {name: p.mean for name, p in priors.items()}
-    found = replace(found, parameters=parameters, own=of_trials)
+    found = replace(found, parameters=parameters, of_trials=of_trials)
     if (uncertainty := found.uncertainty) is None:
         return found
     rows = [names.index(name) for name in common]
@@ -187,7 +187,9 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
         ranges={n: uncertainty.ranges[n] for n in common} | {n: ranges[n].upper - ranges[n].lower for n in priors},
         left_out={},  # A trial that is left out has no values of its own.
     )
-    return replace(found, uncertainty=changed, own_deviation={name: uncertainty.deviation[name] for name in of_trials})
+    return replace(
+        found, uncertainty=changed, of_trials_deviation={name: uncertainty.deviation[name] for name in of_trials}
+    )
 
 
 def _with_first_frames(
@@ -202,10 +204,14 @@ def _with_first_frames(
 
     Everything else is as identified. Values that these frames do not show stay near the mean of their prior.
     """
-    known, values, deviations = {**found.parameters, **found.own}, dict(found.own), dict(found.own_deviation)
+    known, values, deviations = (
+        {**found.parameters, **found.of_trials},
+        dict(found.of_trials),
+        dict(found.of_trials_deviation),
+    )
     wanted = {name: limits for name, limits in ranges.items() if limits.per == "trial"}
     for name in (name for name in names if wanted and motions.trials.begin_of(name) in RESTING):
-        bounds = {own_name(parameter, name): limits for parameter, limits in wanted.items()}
+        bounds = {value_name(parameter, name): limits for parameter, limits in wanted.items()}
         guess = {full: _guess(full, limits, known) for full, limits in bounds.items()}
         try:
             replays = motions.replays(simulator, [name], found)
@@ -216,4 +222,4 @@ def _with_first_frames(
             continue
         values |= result.parameters
         deviations |= result.deviation
-    return replace(found, own=values, own_deviation=deviations)
+    return replace(found, of_trials=values, of_trials_deviation=deviations)

@@ -5,7 +5,7 @@ all motions at once. Prior knowledge is that of the parameters (`parameters.Prio
 It adds its squares, weighted as much as one independent residual of the data: by their mean square, times the number of
 residuals that are correlated. That weight is computed at the start of a search and again at the minimum.
 
-A parameter may have a value for each trial or session (`parameters.own_name`), held by its prior; all others have the
+A parameter may have a value for each trial or session (`parameters.value_name`), held by its prior; all others have the
 mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
 """
 

@@ -42,13 +42,13 @@ class Identification(Identified):
     """Result of an identification.
 
     Attributes:
-        parameters, own, placement: see `Identified`.
+        parameters, of_trials, placement: see `Identified`.
         loss: smallest loss, relative to the motions' amplitudes.
         history: records of every start, one a step that did not fail: ``loss`` and the parameters. The loss of the last
             step may be that of the linearisation.
         at_bounds: parameters that ended on a bound.
         uncertainty: of the shared parameters; None if the simulation fails beside the minimum.
-        own_deviation: standard deviations of the values of single trials and sessions.
+        of_trials_deviation: standard deviations of the values of single trials and sessions.
         first_guess: start of the search.
     """
 
@@ -56,7 +56,7 @@ class Identification(Identified):
     history: Sequence[Sequence[Mapping[str, float]]] = ()
     at_bounds: tuple[str, ...] = ()
     uncertainty: Uncertainty | None = None
-    own_deviation: Mapping[str, float] = field(default_factory=dict)
+    of_trials_deviation: Mapping[str, float] = field(default_factory=dict)
     first_guess: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -66,7 +66,7 @@ class Identification(Identified):
 
     def plain(self) -> dict[str, Any]:
         """Returns the identification as JSON data."""
-        of_trials = ("own", "own_deviation")
+        of_trials = ("of_trials", "of_trials_deviation")
         return {key: value for key, value in asdict(self).items() if value or key not in of_trials}
 
     @staticmethod

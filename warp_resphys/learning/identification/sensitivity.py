@@ -26,7 +26,7 @@ from ...io.parts import cut
 from ...io.progress import Progress
 from ..metrics import mean_distance
 from ..observed_motions import ObservedMotions
-from ..parameters import HUNG, configured_parameters, own_name, split_name
+from ..parameters import HUNG, configured_parameters, split_name, value_name
 from ..placement import DisplacedMarkers, Placement, by_placement, placement_of
 from ..replay import exact
 from .search import Identification
@@ -164,7 +164,7 @@ def parameter_spread(
         deviation, correlation = np.array([*posterior.deviation.values()]), np.array(posterior.correlation)
         session = trials.session(name)
         for at, parameter in enumerate(posterior.deviation):
-            of_trial = (identified.own_deviation.get(own_name(parameter, owner)) for owner in (name, session))
+            of_trial = (identified.of_trials_deviation.get(value_name(parameter, owner)) for owner in (name, session))
             if (known := next((value for value in of_trial if value is not None), None)) is not None:
                 deviation[at], correlation[at], correlation[:, at] = known, 0.0, 0.0
                 correlation[at, at] = 1.0

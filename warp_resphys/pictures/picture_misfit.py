@@ -7,8 +7,8 @@ where it is well below s = 4, and less beyond, as a cable or a hand before the b
 pixels (Charbonnier et al. 1997).
 
 A name with an owner (`learning.parameters.value_name`) is the value of one pose, of the poses of one material, or of
-the pictures by one lens; a name without, that of all. Shapes follow the physical parameters by differences of equilibria,
-and pixels and clouds follow shapes and cameras exactly.
+the pictures by one lens; a name without, that of all. Shapes follow the physical parameters by differences of
+equilibria, and pixels and clouds follow shapes and cameras exactly.
 
 `tests/pictures/test_picture_misfit.py` and `test_clouds.py` compare the derivatives with differences.
 """

@@ -11,7 +11,7 @@ from support.clamped import noise
 from support.refusals import refuses
 from support.slopes import check_slopes
 from warp_resphys import Body, Contact, Corotated, HalfSpace, Mesh, Simulator, State, box_hexahedra
-from warp_resphys.energies import DistanceGrid
+from warp_resphys.energies import DistanceGrid, SurfaceFile
 from warp_resphys.energies.contact.obstacle_poses import ObstacleSet, Pose
 from warp_resphys.io.errors import InputError, MeshError
 
@@ -83,14 +83,14 @@ def test_a_surface_gives_the_distances_of_its_shape(tmp_path):
     box = trimesh.creation.box((0.04, 0.03, 0.02))
     box.apply_scale(1e3)
     box.export(tmp_path / "box.stl")
-    grid = DistanceGrid.from_file(tmp_path / "box.stl", spacing=1e-3)
+    file = SurfaceFile(path=str(tmp_path / "box.stl"))
+    grid = Contact({"box": file}).obstacles["box"]
     d, n = measured(grid, torch.tensor([[[0.0, 0.0, 0.011], [0.0, 0.0157, 0.0], [0.0, 0.0, 0.0]]]).double())
     np.testing.assert_allclose(d[0], [1e-3, 0.7e-3, -1e-2], atol=2e-5)
     np.testing.assert_allclose(n[0, :2], [[0, 0, 1], [0, 1, 0]], atol=3e-3)
     (tmp_path / "open.stl").write_bytes(trimesh.Trimesh(box.vertices, box.faces[1:]).export(file_type="stl"))
-    refuses(MeshError, "close the surface", DistanceGrid.from_file, tmp_path / "open.stl", spacing=1e-3)
-    with pytest.raises(MeshError, match="one of m, cm, mm, not inch"):
-        DistanceGrid.from_file(tmp_path / "box.stl", spacing=1e-3, units="inch")
+    refuses(MeshError, "close the surface", lambda: Contact({"box": file.changed(path=str(tmp_path / "open.stl"))}))
+    refuses(InputError, r"SurfaceFile\.units is 'inch': it must be one of m, cm, mm", file.changed, units="inch")
     for faces in (box.faces[:, ::-1], np.concatenate([box.faces[:1, ::-1], box.faces[1:]])):
         refuses(InputError, "counter-clockwise", DistanceGrid.of_surface, 1e-3 * box.vertices, faces, 1e-3)
 

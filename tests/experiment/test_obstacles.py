@@ -17,7 +17,6 @@ from warp_resphys.data.recordings.recording import ARM, Recording
 from warp_resphys.data.trials import Trials
 from warp_resphys.energies import Box, FrictionPair, Sphere
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
-from warp_resphys.experiment.actuators import build_contact
 from warp_resphys.experiment.build import build_body, build_simulator
 from warp_resphys.experiment.report import true_contact
 from warp_resphys.experiment.simulate import target_settings
@@ -69,7 +68,8 @@ def test_the_real_body_touches_the_same_obstacles_unless_it_has_its_own():
     (played,) = build_body(target_settings(run, run.target)).energies
     assert isinstance(played, Contact)
     assert played.obstacles == {"floor": HalfSpace(position=(0.0, 0.0, -0.005))}
-    assert (played.friction, build_contact(run).friction) == (0.6, 0.3)
+    (touching,) = build_body(run).energies
+    assert (played.friction, touching.friction) == (0.6, 0.3)
     truth = true_contact(settings("experiment=beam_obstacle"))
     assert truth["contact_friction"] == 0.5
     assert truth["obstacle_z"] == pytest.approx(-1.5e-3)
@@ -92,7 +92,8 @@ def test_a_robot_rests_and_falls_on_its_obstacle_and_keeps_it_in_its_file(robot,
     robot.description.write(path)
     loaded = Robot(Description.read(path))
     (contact,) = loaded.simulator.body.energies
-    assert contact == build_contact(robot.description.settings)
+    configured = robot.description.settings
+    assert contact == Contact(configured.obstacles, **dict(configured.contact))
     assert -4e-3 < float(robot.settle().q[0, :, 2].min()) < -3e-3
     assert float(robot.with_parameters(obstacle_z=-0.1).settle().q[0, :, 2].min()) < -6e-3
     state, again = robot.begin(), loaded.begin()

@@ -5,6 +5,7 @@ from ..settings.contact import Box as Box
 from ..settings.contact import Capsule as Capsule
 from ..settings.contact import FrictionPair as FrictionPair
 from ..settings.contact import Sphere as Sphere
+from ..settings.contact import SurfaceFile as SurfaceFile
 from ..stepping.quantity import Quantity as Quantity
 from ..stepping.quantity import parameter as parameter
 from .base import Energy as Energy

@@ -6,7 +6,6 @@ from typing import Final, cast
 
 from ..energies.base import Energy
 from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacles import DistanceGrid
 from ..energies.contact.surface_contact import SurfaceContact
 from ..energies.fibres import Fibres
 from ..energies.medium import Medium
@@ -22,7 +21,6 @@ from ..mesh.chambers import Chamber, find_chambers
 from ..mesh.selection import select_cells, vertices_at
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings
-from ..settings.contact import SurfaceFile
 from ..settings.mesh import Place
 from ..stepping.quantity import Quantity
 
@@ -67,7 +65,7 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None
             raise InputError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
         energies.append(Strings([vertices_at(mesh, payload_at)], **dict(settings.payload_string)))
     if settings.obstacles:
-        energies.append(build_contact(settings))
+        energies.append(Contact(settings.obstacles, **dict(settings.contact)))
     if settings.self_contact is not None:
         energies.append(SurfaceContact(**dict(settings.self_contact)))
     return energies + list(energies_of_packages(settings).values())
@@ -168,15 +166,6 @@ def build_muscles(settings: MuscleSettings, mesh: Mesh) -> Muscles:
         for name, bundle in settings.bundles.items()
     ]
     return Muscles(muscles, settings.stiffness, toe=settings.toe)
-
-
-def build_contact(settings: BodySettings) -> Contact:
-    """Builds the contact of a body with its ``obstacles``."""
-    obstacles = {
-        name: DistanceGrid.from_file(**obstacle.arguments()) if isinstance(obstacle, SurfaceFile) else obstacle
-        for name, obstacle in settings.obstacles.items()
-    }
-    return Contact(obstacles, **dict(settings.contact))
 
 
 def routes_of(body: Body) -> dict[str, FloatArray]:

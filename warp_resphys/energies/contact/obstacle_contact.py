@@ -36,7 +36,7 @@ from typing_extensions import override
 from ...fem.integration_points import Points
 from ...io.errors import InputError, listed
 from ...mesh.volume_mesh import Mesh
-from ...settings.contact import Obstacle
+from ...settings.contact import Obstacle, SurfaceFile
 from ...stepping.quantity import Parameter, Quantity
 from ...stepping.rotations import rotations
 from ...stepping.state import State
@@ -89,6 +89,8 @@ class Contact(Energy):
         """Checks the values."""
         if not self.obstacles:
             raise InputError("contact needs an obstacle or more: give them by name.")
+        grids = {name: DistanceGrid.of_file(o) for name, o in self.obstacles.items() if isinstance(o, SurfaceFile)}
+        object.__setattr__(self, "obstacles", {**self.obstacles, **grids})
         for name in ("distance", "slip_speed"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise InputError(f"contact.{name} is {getattr(self, name):g}: it must be positive.")

@@ -1,7 +1,6 @@
 """Obstacles by distances on a grid, and surfaces of obstacles as triangles."""
 
 import itertools
-import os
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -15,14 +14,14 @@ from pydantic import BeforeValidator, model_validator
 from typing_extensions import override
 
 from ...io.arrays import FloatArray, IntArray
-from ...io.errors import InputError, MeshError
+from ...io.errors import InputError
 from ...io.kernel_cache import start_quietly
 from ...io.settings import Positive, Vector, setting
 from ...kernels.contact import signed_distances as kernels
 from ...kernels.modules import shareable
 from ...mesh.readers import METRES
 from ...mesh.tetrahedra import read_shells
-from ...settings.contact import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere
+from ...settings.contact import Box, Capsule, Cylinder, HalfSpace, Obstacle, Sphere, SurfaceFile
 
 # Bezier points of a cubic B-spline, and of its slope raised to the same degree, a third of a spacing below a node, at
 # it, and a third above, from the coefficients of the node before, itself and the one behind.
@@ -134,25 +133,15 @@ class DistanceGrid(Obstacle):
         return cls(distances=distances, spacing=spacing, low=(low[0], low[1], low[2]), **pose)
 
     @classmethod
-    def from_file(
-        cls, path: str | os.PathLike[str], spacing: float, units: str = "mm", margin: float | None = None, **pose: Any
-    ) -> "DistanceGrid":
-        """Returns the grid of a closed surface in a file.
-
-        Args:
-            path: an STL, OBJ or PLY file.
-            spacing: as for `of_surface` [m].
-            units: of the file: ``m``, ``cm`` or ``mm``.
-            margin: as for `of_surface` [m].
-            pose: position, axis and ``moves``.
+    def of_file(cls, file: SurfaceFile, margin: float | None = None) -> "DistanceGrid":
+        """Returns the grid of a closed surface in a file; ``margin`` as for `of_surface`.
 
         Raises:
-            MeshError: other units, or a file that is missing or damaged, or whose surface is not closed.
+            MeshError: a file that is missing or damaged, or whose surface is not closed.
         """
-        if units not in METRES:
-            raise MeshError(f"the units of an obstacle's surface must be one of {', '.join(METRES)}, not {units}")
-        vertices, shells = read_shells(Path(path).expanduser())
-        return cls.of_surface(METRES[units] * vertices, np.concatenate(shells), spacing, margin, **pose)
+        vertices, shells = read_shells(Path(file.path).expanduser())
+        pose = {"position": file.position, "axis": file.axis, "moves": file.moves}
+        return cls.of_surface(METRES[file.units] * vertices, np.concatenate(shells), file.spacing, margin, **pose)
 
 
 # Kinds of the kernels.

@@ -1,5 +1,6 @@
 from typing import Annotated, Literal, Self
 
+import numpy as np
 import pytest
 from pydantic import Field, model_validator
 
@@ -96,6 +97,19 @@ def test_a_whole_number_stands_for_a_number_and_a_list_becomes_a_tuple():
     assert (world.shape.size, world.shape.divisions) == ((1.0, 2.0, 3.0), (4, 5))
     with pytest.raises(ValueError, match="frozen"):
         world.count = 4  # type: ignore[misc]
+
+
+def test_objects_made_in_python_are_checked_and_take_arrays():
+    brick = Brick(kind="brick", size=np.array([1.0, 2.0, 3.0]), divisions=np.array([4, 5]))
+    assert brick == parse(Brick, {"kind": "brick", "size": [1, 2, 3], "divisions": [4, 5]})
+    assert Ball(kind="ball", radius=np.float32(0.5)).radius == 0.5
+    refuses(
+        InputError, r"^Ball\.radius is -1\.0: it must be a positive number, in m\.$", Ball, kind="ball", radius=-1.0
+    )
+    refuses(
+        InputError, r"^unknown key 'Ball\.raduis', did you mean 'radius'", Ball, kind="ball", radius=1.0, raduis=1.0
+    )
+    refuses(InputError, r"^World\.shape\.radius is 0\.0: it must be", World, shape={"kind": "ball", "radius": 0.0})
 
 
 class TestContent:

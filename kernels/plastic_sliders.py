@@ -60,7 +60,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 6)
 ):
-    """Derivative of F S by F."""
+    """Computes the derivative of F S by F."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -93,7 +93,7 @@ def adjoint(
     sliders_out: wp.array3d[wp.vec2d],  # (B, K, P) this point's part of dL/d sliders
     plastic_out: wp.array3d[wp.mat33d],  # (B, K, P) dL/d plastic
 ):
-    """dL/dtheta = -dP/dtheta : grad z = -dS/dtheta : R with R = sym(F^T grad z) and S = 2 m phi'(A : A) A.
+    """Computes dL/dtheta = -dP/dtheta : grad z = -dS/dtheta : R, R = sym(F^T grad z), S = 2 m phi'(A : A) A.
 
     With a = A : R: by g, -2 mu V phi' a; by e, -2 m a / |A| where the slider slides; by the plastic strain
     A = E - E_p has, 2 m (phi' R + 2 phi'' a A).

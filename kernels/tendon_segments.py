@@ -109,7 +109,7 @@ def local_step(
     stress_out: wp.array2d[wp.mat33d],
     energy_out: wp.array2d[wp.float64],
 ):
-    """T L of the commanded tension and friction; the spring's energy is added to the first segment."""
+    """Computes T L of the commanded tension and friction; the first segment also has the spring's energy."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -135,7 +135,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],
 ):
-    """Block (i, j) is c_i c_j T / l (1 - u u^T) at constant tension; its change, coupling segments, is low rank.
+    """Computes blocks (i, j), c_i c_j T / l (1 - u u^T), at constant tension; its change couples segments at low rank.
 
     Friction makes a tension negative only where that at the first guide fell by more than itself within the step.
     """

@@ -31,7 +31,7 @@ class Friction:
 
 @wp.func
 def barrier(s: wp.float64) -> wp.vec3d:
-    """B = -(s - 1)^2 ln s, B' and B''; zero from s = 1 on."""
+    """Returns B = -(s - 1)^2 ln s, B' and B''; zero from s = 1 on."""
     if s >= ONE:
         return wp.vec3d(ZERO, ZERO, ZERO)
     t, log = s - ONE, wp.log(s)
@@ -40,7 +40,7 @@ def barrier(s: wp.float64) -> wp.vec3d:
 
 @wp.func
 def smoothed(y: wp.float64, slip: wp.float64) -> wp.vec3d:
-    """f(y), f'(y) / y and (f'(y) / y)' / y of the smoothed absolute value (Li et al. 2020), zero at zero."""
+    """Returns f(y), f'(y) / y and (f'(y) / y)' / y of the smoothed absolute value (Li et al. 2020), zero at zero."""
     if y >= slip:
         return wp.vec3d(y - THIRD * slip, ONE / y, -ONE / (y * y * y))
     q = y / slip
@@ -52,7 +52,7 @@ def smoothed(y: wp.float64, slip: wp.float64) -> wp.vec3d:
 
 @wp.func
 def slide(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.vec3d:
-    """u, the way of a point since the start of the step in the tangential plane of an obstacle."""
+    """Returns u, the way of a point since the start of the step in the tangential plane of an obstacle."""
     m, way = f.normal[b, p, k], x - f.reference[b, p, k]
     return way - wp.dot(way, m) * m
 
@@ -69,7 +69,7 @@ def local_step(
     stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
 ):
-    """Force and energy of each point; not a number and infinite within an obstacle."""
+    """Computes force and energy of each point; not a number and infinite within an obstacle."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -96,7 +96,7 @@ def local_step(
 
 @wp.func
 def slide_tangent(m: wp.vec3d, u: wp.vec3d, slip: wp.float64) -> wp.mat33d:
-    """Second derivative of f(|u|) by the position, with the normal m."""
+    """Returns the second derivative of f(|u|) by the position, with the normal m."""
     v = smoothed(wp.length(u), slip)
     flat = -wp.outer(m, m)
     for i in range(3):
@@ -106,7 +106,7 @@ def slide_tangent(m: wp.vec3d, u: wp.vec3d, slip: wp.float64) -> wp.mat33d:
 
 @wp.func
 def friction_tangent(f: Friction, b: int, p: int, k: int, x: wp.vec3d) -> wp.mat33d:
-    """Second derivative of the friction's energy, for mu = 1 and a normal force of one newton."""
+    """Returns the second derivative of the friction's energy, for mu = 1 and a normal force of one newton."""
     return slide_tangent(f.normal[b, p, k], slide(f, b, p, k, x), f.slip[b, 0])
 
 
@@ -122,7 +122,7 @@ def tangent(
     positions: wp.array2d[wp.vec3d],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Second derivative; a clamped one leaves out that by the curvature of obstacles."""
+    """Computes the second derivative; a clamped one leaves out that by the curvature of obstacles."""
     b, p = wp.tid()
     if active[b] == 0:
         return
@@ -166,7 +166,7 @@ def adjoint(
     direction: wp.array2d[wp.vec3d],  # (B, N) z = H^-1 dL/dx [m]
     slopes_out: Slopes,
 ):
-    """-z . d force / d value, at fixed positions."""
+    """Computes -z . d force / d value, at fixed positions."""
     b, p, k = wp.tid()
     x = vector_at(points, positions, b, p)
     z = vector_at(points, direction, b, p)

@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def mollifier(c: wp.float64, width: wp.float64) -> wp.vec3d:
-    """m(c), m'(c) and m''(c) of a factor that is zero for parallel edges, c = 0, and one from `width` on."""
+    """Returns m(c), m'(c) and m''(c) of a factor that is zero for parallel edges, c = 0, and one from `width` on."""
     if c >= width:
         return wp.vec3d(ONE, ZERO, ZERO)
     q = c / width
@@ -48,7 +48,7 @@ class Barrier:
 
 @wp.func
 def pair_barrier(pairs: Pairs, c: int, x: Corners, stiffness: wp.float64, reach: wp.float64) -> Barrier:
-    """Energy of a pair without the factor for almost parallel edges."""
+    """Returns the energy of a pair without the factor for almost parallel edges."""
     kind = pairs.kind[c]
     factor = stiffness * pairs.area[c]
     out = Barrier()
@@ -73,7 +73,7 @@ def pair_forces(
     energy_out: wp.array[wp.float64],  # (C)
     near_out: wp.array[int],  # (C) whether a pair is nearer than D
 ):
-    """Gradient and energy of every pair; not a number and infinite at no distance, but finite for what has crossed."""
+    """Computes gradient and energy of pairs: not a number and infinite at no distance, finite for what has crossed."""
     c = wp.tid()
     b = pairs.environment[c]
     if active[b] == 0:
@@ -141,7 +141,7 @@ def pair_tangents(
     positions: wp.array2d[wp.vec3d],
     blocks_out: wp.array3d[wp.float64],  # (A, 12, 12), zero before
 ):
-    """Second derivatives of the energies of chosen pairs."""
+    """Computes the second derivatives of the energies of chosen pairs."""
     a = wp.tid()
     c = chosen[a]
     b, kind = pairs.environment[c], pairs.kind[c]
@@ -195,7 +195,7 @@ def pair_springs(
     positions: wp.array2d[wp.vec3d],
     blocks_out: wp.array3d[wp.float64],  # (A, 12, 12), zero before
 ):
-    """The positive part of `pair_tangents` along the shortest distance, and by the angle of almost parallel edges."""
+    """Computes the positive part of `pair_tangents` along the distance, and by the angle of almost parallel edges."""
     a = wp.tid()
     c = chosen[a]
     b, kind = pairs.environment[c], pairs.kind[c]
@@ -237,7 +237,7 @@ class FrictionPairs:
 def grip_slide(
     grips: FrictionPairs, g: int, positions: wp.array2d[wp.vec3d], reference: wp.array2d[wp.vec3d]
 ) -> wp.vec3d:
-    """u, the relative way of the two parts of a pair since the start of the step, in its tangential plane."""
+    """Returns u, the relative way of the two parts of a pair since the step began, in its tangential plane."""
     b, v, w, n = grips.environment[g], grips.nodes[g], grips.weights[g], grips.normal[g]
     way = w * (corners(positions, b, v) - corners(reference, b, v))
     return way - wp.dot(way, n) * n
@@ -254,7 +254,7 @@ def grip_forces(
     force_out: wp.array[Corners],
     energy_out: wp.array[wp.float64],
 ):
-    """Gradient and energy of friction."""
+    """Computes gradient and energy of friction."""
     g = wp.tid()
     b = grips.environment[g]
     if active[b] == 0:
@@ -274,7 +274,7 @@ def grip_tangents(
     positions: wp.array2d[wp.vec3d],
     blocks_out: wp.array3d[wp.float64],  # (G, 12, 12), zero before
 ):
-    """Second derivatives of the energies of friction."""
+    """Computes the second derivatives of the energies of friction."""
     g = wp.tid()
     b, w = grips.environment[g], grips.weights[g]
     u = grip_slide(grips, g, positions, reference)
@@ -332,7 +332,7 @@ def local_step(
     stress_out: wp.array2d[wp.vec3d],
     energy_out: wp.array2d[wp.float64],
 ):
-    """Force and energy of the vertices of a surface."""
+    """Copies force and energy of the vertices of a surface, as `gather` sums them."""
     b, p = wp.tid()
     if active[b] != 0:
         stress_out[b, p] = force[b, p]
@@ -347,6 +347,6 @@ def tangent(
     energy: wp.array2d[wp.float64],
     tangent_out: wp.array3d[wp.mat33d],  # (B, P, 1)
 ):
-    """Second derivatives of single vertices: none, as all are of pairs (`pair_tangents`)."""
+    """Sets the second derivatives of single vertices to zero, as all are of pairs (`pair_tangents`)."""
     b, p = wp.tid()
     tangent_out[b, p, 0] = wp.mat33d()

@@ -36,7 +36,7 @@ class Pose:
         return torch.einsum("boji,bpoj->bpoi", self.turn, x - self.place[:, None])
 
     def world(self, y: torch.Tensor) -> torch.Tensor:
-        """Inverse of `local`."""
+        """Returns the inverse of `local`."""
         return torch.einsum("boij,bpoj->bpoi", self.turn, y) + self.place[:, None]
 
 

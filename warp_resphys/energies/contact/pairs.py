@@ -177,7 +177,7 @@ class PairList:
         self._outer = self._inner = launcher.zeros(n)
 
     def covers(self, positions: torch.Tensor) -> bool:
-        """Whether the list holds all pairs of positions (B, N, 3) that are within reach."""
+        """Returns whether the list holds all pairs of positions (B, N, 3) that are within reach."""
         if self._origin is None:
             return False
         way, relative = self._ways(positions - self._origin)

@@ -121,7 +121,7 @@ def within_rounding(
 def decreases_enough(
     before: wp.float64, energy: wp.float64, rounding: wp.float64, step: wp.float64, slope: wp.float64, after: wp.float64
 ) -> bool:
-    """Armijo's condition or, where the decrease is within rounding, the approximate Wolfe condition.
+    """Returns whether Armijo's condition holds or, within rounding, the approximate Wolfe condition.
 
     Hager and Zhang (2005). ``slope`` and ``after`` are slopes of the energy along the direction, before and after.
     """

@@ -67,13 +67,13 @@ def best_order(points: FloatArray, values: FloatArray, least: int) -> int:
         values: (S, ...).
         least: that is taken where samples are too few to tell.
     """
-    held = np.arange(len(points)) % _HELD_OUT == _HELD_OUT - 1
-    errors, count = dict[int, float](), np.count_nonzero(~held)
+    left_out = np.arange(len(points)) % _HELD_OUT == _HELD_OUT - 1
+    errors, count = dict[int, float](), np.count_nonzero(~left_out)
     for order in range(least, _MOST + 1):
         if len(powers(points.shape[1], order)) > _SHARE_OF_POINTS * count:
             break
-        fitted = Polynomial.fitted(points[~held], values[~held], order)
-        errors[order] = float(np.square(fitted(points[held]) - values[held]).sum())
+        fitted = Polynomial.fitted(points[~left_out], values[~left_out], order)
+        errors[order] = float(np.square(fitted(points[left_out]) - values[left_out]).sum())
     return min(errors, key=lambda order: errors[order], default=least)
 
 

@@ -42,16 +42,16 @@ class Evaluator:
 
     def __call__(self, inputs: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Returns standardised outputs (S, c) for inputs (S, i), and which of these (S,) are outside of the range."""
-        held: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
-        left = (held != inputs).any(1)
+        x: Array = inputs if self._edges is None else np.minimum(np.maximum(inputs, self._edges[0]), self._edges[1])
+        left = (x != inputs).any(1)
         fades = self._fades if left.any() else None
-        hidden = held = held.astype(self._linear.dtype)
+        hidden = x = x.astype(self._linear.dtype)
         for number, layers in enumerate(self._blocks):
             after = hidden
             for layer in layers:
                 after = layer(after)
             hidden = hidden + after if number else after
-        outputs = held @ self._linear + self._remainder * hidden
+        outputs = x @ self._linear + self._remainder * hidden
         if fades is not None:
             weight = fades.weight(torch.as_tensor(inputs).to(fades.low)).numpy(force=True)
             outputs = self._nothing + weight[:, None] * (outputs - self._nothing)

@@ -255,8 +255,8 @@ class ReducedModel:
         base, a, damping = self.static(u), self.stiffness(u), self.damping(u)
         inertia = np.eye(r) / step[..., None] ** 2 + damping / step[..., None]
         branches, (decay, gamma) = self.branches(u), self.relaxation
-        held, carried = np.einsum("k,skrq->srq", gamma, branches), decay[:, None, None] * branches
-        inverse = np.linalg.inv(inertia + a + held)
+        relaxed, carried = np.einsum("k,skrq->srq", gamma, branches), decay[:, None, None] * branches
+        inverse = np.linalg.inv(inertia + a + relaxed)
         shifted = base if bias is None else (base.reshape(steps, batch, r) + bias).reshape(-1, r)
         pull = (a @ shifted[..., None])[..., 0]
         force = self._force(u, means.reshape(len(means), len(u.points), n))
@@ -266,7 +266,7 @@ class ReducedModel:
             rows = slice(k * batch, (k + 1) * batch)
             at, rate = (1.0 + share[rows]) * now - share[rows] * before
             right = (inertia[rows] @ at[..., None])[..., 0] + rate / step[rows] + pull[rows]
-            right += (held[rows] @ now[0, ..., None])[..., 0] - np.einsum("bkrq,kbq->br", carried[rows], strain)
+            right += (relaxed[rows] @ now[0, ..., None])[..., 0] - np.einsum("bkrq,kbq->br", carried[rows], strain)
             if force is not None:
                 right += force(rows, now)
                 left = left | force.left

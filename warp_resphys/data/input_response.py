@@ -298,12 +298,12 @@ def _lagged(behind: Array, series: Array, kept: Array, reach: Array = None) -> A
     return _library(series).stack(lagged)
 
 
-def _geared(held: Array, series: Array, width: Array) -> Array:
+def _geared(output: Array, series: Array, width: Array) -> Array:
     """The play (T, ..., C) of gears whose output rises with a series (T, ..., C) and falls by the backlash later."""
     geared, like = list[Array](), _library(series)
     for now in series:
-        held = like.where(held < now, now, like.where(held > now + width, now + width, held))
-        geared.append(held)
+        output = like.where(output < now, now, like.where(output > now + width, now + width, output))
+        geared.append(output)
     return like.stack(geared)
 
 

@@ -244,10 +244,10 @@ def divided(route: Route) -> tuple[FloatArray, BoolArray, list[FloatArray]]:
         Guides (G, 3) [m], whether they stay in the world (G,), and D directions of offsets (G, 3).
     """
     guides = np.asarray(route.guides, dtype=np.float64)
-    held = np.isin(np.arange(len(guides)), route.fixed_guides)
-    pieces = np.where(held[1:] | held[:-1], 1, route.pieces)
+    fixed = np.isin(np.arange(len(guides)), route.fixed_guides)
+    pieces = np.where(fixed[1:] | fixed[:-1], 1, route.pieces)
     in_world = np.zeros(pieces.sum() + 1, dtype=bool)
-    in_world[np.concatenate([[0], np.cumsum(pieces)])[held]] = True
+    in_world[np.concatenate([[0], np.cumsum(pieces)])[fixed]] = True
 
     def between(values: FloatArray) -> FloatArray:
         parts = [

@@ -67,9 +67,9 @@ class ScriptedPolicy:
             slope = ((moved[1:] - moved[0]) / _CHANGE).swapaxes(0, 1)  # (B, n, 3)
             matrix = slope @ slope.swapaxes(1, 2) + _EFFORT * np.eye(self._parts)
             force = (slope @ (goals - moved[0])[..., None])[..., 0] - _EFFORT * actions
-            held = (np.abs(actions) >= 1.0) & (actions * force > 0.0)  # at a bound, and pushed beyond it
-            matrix = np.where(held[:, :, None] | held[:, None, :], np.eye(self._parts), matrix)
-            change = np.linalg.solve(matrix, np.where(held, 0.0, force)[..., None])[..., 0]
+            at_bound = (np.abs(actions) >= 1.0) & (actions * force > 0.0)  # at a bound, and pushed beyond it
+            matrix = np.where(at_bound[:, :, None] | at_bound[:, None, :], np.eye(self._parts), matrix)
+            change = np.linalg.solve(matrix, np.where(at_bound, 0.0, force)[..., None])[..., 0]
             actions = np.clip(actions + np.clip(change, -_STRIDE, _STRIDE), -1.0, 1.0)
         return actions
 

@@ -80,7 +80,7 @@ def _check_target(run: RunSettings, body: Body, drive: Drive | None) -> None:
             vertices_in(simulator.body.mesh, body.mesh)
         if isinstance(run.data, ReleaseFromLoad):
             others = run.data.others.items()
-            places = {f"data.others.{name}.at": one.at for name, held in others for one in held if one.at}
+            places = {f"data.others.{name}.at": one.at for name, loads in others for one in loads if one.at}
             for place, at in {"data.load": run.data.load, **places}.items():
                 with naming(f"{place}: "):
                     vertices_at(simulator.body.mesh, at)

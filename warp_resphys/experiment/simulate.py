@@ -252,15 +252,15 @@ def initial_state(simulator: Simulator, data: SimulatedData, trials: Sequence[Tr
         hanging = [row for row in range(len(trials)) if row not in twists]
         if hanging:
             q[hanging] = simulator.static_equilibrium(Inputs(forces[hanging])).q
-        for row, held in twists.items():
-            q[row] = twist(simulator, held)
+        for row, load in twists.items():
+            q[row] = twist(simulator, load)
     return State(q, torch.zeros_like(q))
 
 
-def twist(simulator: Simulator, held: HeldSettings) -> torch.Tensor:
+def twist(simulator: Simulator, load: HeldSettings) -> torch.Tensor:
     """Positions (1, N, 3) of a twisted body [m]."""
-    angle = simulator.tensor([math.radians(held.twist_deg)])
-    return twisted(simulator.rest_positions, angle, "xyz".index(held.twist_axis))
+    angle = simulator.tensor([math.radians(load.twist_deg)])
+    return twisted(simulator.rest_positions, angle, "xyz".index(load.twist_axis))
 
 
 def loads(simulator: Simulator, held: Sequence[HeldSettings], load: Place, key: str) -> torch.Tensor:

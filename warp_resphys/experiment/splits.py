@@ -40,7 +40,7 @@ def all_trials(run: RunSettings) -> dict[str, Trial]:
             name = f"{value:g}{unit}"
             trials[name] = Trial(name=name, begins="given", amount=factor * value)
         others = data.others.items() if isinstance(data, ReleaseFromLoad) else ()
-        return trials | {name: Trial(name=name, begins="given", load=held) for name, held in others}
+        return trials | {name: Trial(name=name, begins="given", load=load) for name, load in others}
 
     trials = _recorded(data) if data.folder is not None else _played(run, data)
     if run.markers is not None:

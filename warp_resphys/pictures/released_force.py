@@ -94,16 +94,16 @@ class ReleasedForce:
         parameters = {MASS_FACTOR: simulator.tensor([1.0] * len(values))}
         parameters |= {name: simulator.tensor([row[name] for row in values]) for name in values[0] if name in names}
         added = [[row.get(name, 0.0) for name in RELEASE_FORCES] for row in values]
-        held = simulator.tensor(np.zeros((len(values), len(near), 3)))
-        held[:, self.vertices] = (simulator.tensor(self.force) + simulator.tensor(added))[:, None] / len(self.vertices)
+        pull = simulator.tensor(np.zeros((len(values), len(near), 3)))
+        pull[:, self.vertices] = (simulator.tensor(self.force) + simulator.tensor(added))[:, None] / len(self.vertices)
         seconds = simulator.tensor([[max(last - self.at(values[0]), 0.0)]])
-        trials = TrialBatch(("",), seconds, held.new_zeros(1, 1, 1, 1), held.new_zeros(1, 1, 1))
+        trials = TrialBatch(("",), seconds, pull.new_zeros(1, 1, 1, 1), pull.new_zeros(1, 1, 1))
         replay = Replay(simulator, WHOLE_STATE, trials)
         constants = replay.prepare(parameters)[0]
-        state = simulator.static_equilibrium(Inputs(held), constants, start=near.to(held).expand_as(held))
+        state = simulator.static_equilibrium(Inputs(pull), constants, start=near.to(pull).expand_as(pull))
         if state.memory:
             raise InputError("a material with friction remembers its motion: pictures identify none that moves.")
-        start = Start(state, held.new_zeros(1))
+        start = Start(state, pull.new_zeros(1))
         series = replay.varied_series(start, parameters) if len(values) > 1 else replay.series(start, parameters)
         return series.double().cpu()
 

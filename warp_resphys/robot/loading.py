@@ -149,8 +149,8 @@ def recorded_trial(robot: Robot, name: str) -> RecordedTrial:
             q = replay.initial_state(start, constants, resting).q
             before = {key: 0.0 * value[0] for key, value in inputs.items() if key in robot.driven}
             before |= {key: value.to(q) for key, value in replay.trials.resting.actuation.items()}
-            held: dict[str, Any] = _commands(experiment, robot, name, before)
-            begun, steps = robot.state(q, start.state.v, **held), replay.steps(start)
+            commands: dict[str, Any] = _commands(experiment, robot, name, before)
+            begun, steps = robot.state(q, start.state.v, **commands), replay.steps(start)
             if base is not None:
                 poses = base.to(simulator.rest_positions)
                 inputs[BASE] = poses[1:]

@@ -149,10 +149,10 @@ def _listed(value: Any) -> Any:
     return [value] if isinstance(value, (Mapping, HeldSettings)) else value
 
 
-def _weights(held: tuple[HeldSettings, ...]) -> tuple[HeldSettings, ...]:
-    if len(held) > 1 and any(one.twist_deg for one in held):
+def _weights(loads: tuple[HeldSettings, ...]) -> tuple[HeldSettings, ...]:
+    if len(loads) > 1 and any(one.twist_deg for one in loads):
         raise ValueError("it must be one twist, or a list of weights.")
-    return held
+    return loads
 
 
 # One load, or a list of weights that act at the same time.

@@ -154,17 +154,17 @@ def _quadratic_cells(mesh: Mesh, fixed: Place | None) -> str:
     """
     along, *across = np.argsort(-np.ptp(mesh.vertices, axis=0))
     end = mesh.vertices[:, along].min() + _HELD * np.ptp(mesh.vertices[:, along])
-    held = mesh.vertices[:, along] <= end if fixed is None else fixed.holds(mesh.vertices)
+    base = mesh.vertices[:, along] <= end if fixed is None else fixed.holds(mesh.vertices)
     finer, work = quadratic(mesh), []
     if finer.vertices.size > _MOST_UNKNOWNS:
         return f"not compared: they have {finer.vertices.size:,} degrees of freedom"
     connected = connected_parts(mesh.cells)
     pieces = [np.unique(mesh.cells[connected == number]) for number in np.unique(connected)]
-    if held.all() or not all(_spans_area(mesh.vertices[piece[held[piece]]]) for piece in pieces):
+    if base.all() or not all(_spans_area(mesh.vertices[piece[base[piece]]]) for piece in pieces):
         return "not compared: a piece is not held, or all of it"
     # Nodes between held vertices are held, too.
-    between = quadratic(Mesh(np.repeat(held[:, None], 3, axis=1).astype(np.float64), mesh.cells)).vertices[:, 0] == 1.0
-    for compared, still in ((mesh, held), (finer, between)):
+    between = quadratic(Mesh(np.repeat(base[:, None], 3, axis=1).astype(np.float64), mesh.cells)).vertices[:, 0] == 1.0
+    for compared, still in ((mesh, base), (finer, between)):
         simulator = Simulator(Body(compared, fixed=np.flatnonzero(still)), _SILICONE)
         step = simulator.linearise_equilibrium()
         step.factorise(simulator.rest_positions[None])

@@ -160,8 +160,8 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     seconds = result.frames / result.rate_hz
     lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate_hz:g} Hz")
     if release is not None:
-        held = release.rest
-        lines.append(f"Released in frame {release.frame:.2f}; held still in frames {held[0]} to {held[1] - 1}.")
+        rest = release.rest
+        lines.append(f"Released in frame {release.frame:.2f}; held still in frames {rest[0]} to {rest[1] - 1}.")
     lines += result.warnings
     lines += [
         f"{source}: the base is shifted by up to {shift.max():.2f} mm; its markers moved by up to "

@@ -151,17 +151,17 @@ class CommandSeries:
 
     def at(self, time: float, after: float | None = None) -> dict[str, Given]:
         """Returns the commands that hold at a time [s], of those that were given after another one."""
-        held = dict[str, Given]()
+        known = dict[str, Given]()
         for since, commands in self._entries:
             if since <= time + self._rounding and (after is None or since > after):
-                held |= commands
-        return held
+                known |= commands
+        return known
 
     def drop_last(self, time: float) -> bool:
         """Removes the commands that were given last before a time; returns whether there were any."""
-        held = sum(since <= time + self._rounding for since, _ in self._entries)
-        del self._entries[max(held - 1, 0) : held]
-        return bool(held)
+        count = sum(since <= time + self._rounding for since, _ in self._entries)
+        del self._entries[max(count - 1, 0) : count]
+        return bool(count)
 
     def forget(self, oldest: float) -> None:
         """Removes commands that others had followed before a time [s]."""

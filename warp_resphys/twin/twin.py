@@ -350,13 +350,13 @@ class Twin:
         if seconds is not None and not 0.0 < seconds < np.inf:
             raise InputError(f"seconds is {seconds}: give the length of the prediction, more than zero.")
         belief = self._belief_at(self._update())
-        held, now = self._commands.at(np.inf), self._origin + self._newest * self._h
+        commands, now = self._commands.at(np.inf), self._origin + self._newest * self._h
         steps = max(int(np.ceil((self.horizon if seconds is None else seconds) / self._h - ROUNDING)), 1)
 
         def advance(before: Belief, number: int) -> Belief:
             planned = self._planned.at(now + number * self._h, after=self._latest)
             try:
-                return self.estimator.advance(before, {**held, **planned, **inputs}, renew=False)
+                return self.estimator.advance(before, {**commands, **planned, **inputs}, renew=False)
             except (ConvergenceError, InputError):
                 self._counts.add("predictions that failed")
                 raise

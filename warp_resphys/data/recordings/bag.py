@@ -81,17 +81,17 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     late = float(np.nanmedian(clocks)) if np.isfinite(clocks).any() else 0.0
     times, rate = _frames(path, [source.series(late)[0] for source in markers], bag.rate)
     moved = np.stack([_at_frames(*source.series(late), times, rate) for source in markers], 1)
-    held = []
+    columns = []
     for source in inputs:
         stamps, values = source.series(late)
-        held.append(values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0])
+        columns.append(values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0])
     poses = None if base is None else _at_frames(*base.series(late), times, rate)
     return Recording(
         (*bag.markers,),
         moved[..., :3],
         rate,
         path,
-        np.stack(held, 1) * factors if held else None,
+        np.stack(columns, 1) * factors if columns else None,
         base=None if poses is None else since_first(poses[:, :3], poses[:, 3:], path),
         turns=moved[..., 3:] if np.isfinite(moved[..., 3:]).any() else None,
     )

@@ -160,8 +160,8 @@ def find_release(path: FloatArray, rate: float, source: str | Path = "the record
 
 def _onset(path: FloatArray, rest: tuple[int, int], fast: int, drop: float) -> float:
     """The release in frames, by a line through sqrt(s) of the first three frames of motion."""
-    held = path[slice(*rest)]
-    centre = np.median(held, axis=0)
+    resting = path[slice(*rest)]
+    centre = np.median(resting, axis=0)
     direction = (path[fast] - centre) / np.linalg.norm(path[fast] - centre)
     travelled = (path - centre) @ direction  # (T,) [m]
     noise = float(np.std(travelled[slice(*rest)]))

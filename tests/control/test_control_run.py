@@ -74,43 +74,41 @@ def control_of(folder):
     return driven_settings(folder).control
 
 
-class TestLaboratory:
-    def test_a_body_that_fails_or_begins_again_rests_and_the_other_goes_on(self, folder):
-        laboratory = Laboratory(driven_settings(folder), folder, "tendon_tension", 2, seed=0, on_failure="count")
-        rest, commands = laboratory.markers(laboratory.rest), np.tile([1.0, 0.0, 0.0], (2, 1))
-        state = laboratory.step(laboratory.rest, commands)
-        assert not laboratory.lost(state).any()
-        state = laboratory.rest.where(np.array([True, False]), state)
-        np.testing.assert_array_equal(laboratory.markers(state)[0], rest[0])
-        assert np.abs(laboratory.markers(state)[1] - rest[1]).max() > 1e-5
-        state = laboratory.step(state, commands)
-        assert not laboratory.lost(state).any()
-        moved = np.abs(laboratory.markers(state) - rest).max((1, 2))
-        assert 0.0 < moved[0] < moved[1]
-        seen = laboratory.seen(state, 3)
-        np.testing.assert_array_equal(laboratory.seen(state, 3), seen)
-        assert 0.0 < np.abs(seen - laboratory.markers(state)).max() < 10.0 * laboratory.noise
+def test_a_body_that_fails_or_begins_again_rests_and_the_other_goes_on(folder):
+    laboratory = Laboratory(driven_settings(folder), folder, "tendon_tension", 2, seed=0, on_failure="count")
+    rest, commands = laboratory.markers(laboratory.rest), np.tile([1.0, 0.0, 0.0], (2, 1))
+    state = laboratory.step(laboratory.rest, commands)
+    assert not laboratory.lost(state).any()
+    state = laboratory.rest.where(np.array([True, False]), state)
+    np.testing.assert_array_equal(laboratory.markers(state)[0], rest[0])
+    assert np.abs(laboratory.markers(state)[1] - rest[1]).max() > 1e-5
+    state = laboratory.step(state, commands)
+    assert not laboratory.lost(state).any()
+    moved = np.abs(laboratory.markers(state) - rest).max((1, 2))
+    assert 0.0 < moved[0] < moved[1]
+    seen = laboratory.seen(state, 3)
+    np.testing.assert_array_equal(laboratory.seen(state, 3), seen)
+    assert 0.0 < np.abs(seen - laboratory.markers(state)).max() < 10.0 * laboratory.noise
 
 
-class TestReducedWorld:
-    def test_it_moves_as_the_model_does_and_a_failure_lasts_until_it_begins(self, model):
-        world = ReducedWorld(model, 2)
-        rest, commands = world.markers(world.rest), np.array([[0.4, 0.0, 0.0], [0.0, 0.3, 0.0]])
-        *_, state = states(world.step, world.rest, [commands] * 4)
-        assert not world.lost(state).any()
-        for row in range(2):
-            expected = model.respond(model.rest(), np.tile(commands[row], (4, 1, 1)))[-1, 0]
-            np.testing.assert_allclose(world.markers(state)[row].ravel(), expected, atol=1e-9)
-        assert np.abs(world.markers(state) - rest).max() > 1e-4
-        furthest, world._furthest = world._furthest, 0.0
-        failed = world.step(state, commands)
-        assert world.lost(failed).all()
-        world._furthest = furthest
-        still = world.step(failed, commands)
-        assert world.lost(still).all()
-        np.testing.assert_array_equal(world.markers(still), rest)
-        again = world.step(world.rest.where(np.array([True, False]), still), commands)
-        assert world.lost(again).tolist() == [False, True]
+def test_a_reduced_world_moves_as_the_model_does_and_a_failure_lasts_until_it_begins(model):
+    world = ReducedWorld(model, 2)
+    rest, commands = world.markers(world.rest), np.array([[0.4, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    *_, state = states(world.step, world.rest, [commands] * 4)
+    assert not world.lost(state).any()
+    for row in range(2):
+        expected = model.respond(model.rest(), np.tile(commands[row], (4, 1, 1)))[-1, 0]
+        np.testing.assert_allclose(world.markers(state)[row].ravel(), expected, atol=1e-9)
+    assert np.abs(world.markers(state) - rest).max() > 1e-4
+    furthest, world._furthest = world._furthest, 0.0
+    failed = world.step(state, commands)
+    assert world.lost(failed).all()
+    world._furthest = furthest
+    still = world.step(failed, commands)
+    assert world.lost(still).all()
+    np.testing.assert_array_equal(world.markers(still), rest)
+    again = world.step(world.rest.where(np.array([True, False]), still), commands)
+    assert world.lost(again).tolist() == [False, True]
 
 
 class TestReducedModel:

@@ -62,13 +62,12 @@ class TestPaths:
         refuses(InputError, said, Path(**given).timed, seconds, 0.01)
 
 
-class TestPolynomials:
-    def test_a_cubic_is_found_again(self):
-        random = np.random.default_rng(0)
-        points, count = random.random((80, 3)), len(powers(3, 3))
-        wanted = Polynomial(random.standard_normal((count, 2, 2)), 3)
-        found = Polynomial.fitted(points, wanted(points), 3)
-        np.testing.assert_allclose(found(points[:5]), wanted(points[:5]), atol=1e-5)
+def test_a_cubic_is_found_again():
+    random = np.random.default_rng(0)
+    points, count = random.random((80, 3)), len(powers(3, 3))
+    wanted = Polynomial(random.standard_normal((count, 2, 2)), 3)
+    found = Polynomial.fitted(points, wanted(points), 3)
+    np.testing.assert_allclose(found(points[:5]), wanted(points[:5]), atol=1e-5)
 
 
 def program(target, rows, least, most, high):
@@ -96,32 +95,31 @@ class TestPrograms:
         refuses(InputError, "tracked names 'd'", tracked_of, "abc", ["d"])
 
 
-class TestEvaluator:
-    @pytest.mark.parametrize(("activation", "blocks"), [("silu", 1), ("normalised_elu", 3)])
-    def test_it_is_the_network(self, activation, blocks):
-        torch.manual_seed(0)
-        samples = torch.randn(20, 4, 3, dtype=torch.float64)
-        config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 5, "blocks": blocks,
-                  "layers": 2, "width": 16, "activation": activation}  # fmt: skip
-        network = build_model(
-            ResidualForce, NetworkSettings(**config), samples[0], samples, samples, samples, samples[:, 0]
-        ).double()
-        network.fit_linear(torch.randn(40, 8), torch.randn(40, 5), 0.1)
-        inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
-        range_ = Range.of(torch.randn(30, 8, dtype=torch.float64))
-        for guard in (None, range_):
-            wanted = network.standardised(inputs if guard is None else guard.clamp(inputs))[0]
-            outputs, _ = Evaluator(network, guard)(inputs.numpy())
-            np.testing.assert_allclose(outputs, wanted.detach().numpy(), atol=1e-12)
-        fading = replace(range_, missed=torch.ones(2, dtype=torch.float64))
-        weight = fading.weight(inputs)
-        assert (weight < 1.0).sum() > 0
-        assert weight.max() > 0.0
-        force = weight[:, None, None] * network.decode(range_.clamp(inputs))[0][0]
-        outputs, left = Evaluator(network, fading)(inputs.numpy())
-        np.testing.assert_array_equal(left, range_.excludes(inputs))
-        np.testing.assert_allclose(outputs, network.encode_outputs(force).detach().numpy(), atol=1e-12)
-        np.testing.assert_allclose(outputs, fading.outputs(network, inputs).detach().numpy(), atol=1e-12)
+@pytest.mark.parametrize(("activation", "blocks"), [("silu", 1), ("normalised_elu", 3)])
+def test_the_evaluator_is_the_network(activation, blocks):
+    torch.manual_seed(0)
+    samples = torch.randn(20, 4, 3, dtype=torch.float64)
+    config = {"kind": "reduced", "position_modes": 3, "velocity_modes": 2, "force_modes": 5, "blocks": blocks,
+              "layers": 2, "width": 16, "activation": activation}  # fmt: skip
+    network = build_model(
+        ResidualForce, NetworkSettings(**config), samples[0], samples, samples, samples, samples[:, 0]
+    ).double()
+    network.fit_linear(torch.randn(40, 8), torch.randn(40, 5), 0.1)
+    inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
+    range_ = Range.of(torch.randn(30, 8, dtype=torch.float64))
+    for guard in (None, range_):
+        wanted = network.standardised(inputs if guard is None else guard.clamp(inputs))[0]
+        outputs, _ = Evaluator(network, guard)(inputs.numpy())
+        np.testing.assert_allclose(outputs, wanted.detach().numpy(), atol=1e-12)
+    fading = replace(range_, missed=torch.ones(2, dtype=torch.float64))
+    weight = fading.weight(inputs)
+    assert (weight < 1.0).sum() > 0
+    assert weight.max() > 0.0
+    force = weight[:, None, None] * network.decode(range_.clamp(inputs))[0][0]
+    outputs, left = Evaluator(network, fading)(inputs.numpy())
+    np.testing.assert_array_equal(left, range_.excludes(inputs))
+    np.testing.assert_allclose(outputs, network.encode_outputs(force).detach().numpy(), atol=1e-12)
+    np.testing.assert_allclose(outputs, fading.outputs(network, inputs).detach().numpy(), atol=1e-12)
 
 
 def driven_line(steps, random, matrices):

@@ -30,17 +30,16 @@ def moved(poses, points=POINTS):
     return rigid(poses).apply(np.broadcast_to(points, (len(poses), *points.shape)))
 
 
-class TestFunctions:
-    def test_nothing_moves_before_the_start_of_the_sinusoids(self):
-        poses = prescribed(SWING, TIMES)
-        assert not poses[TIMES <= 0.3].any()
-        after = TIMES >= 0.5
-        since = TIMES[after] - 0.3
-        turned = np.sin(2 * np.pi * 0.7 * since + 0.4) - np.sin(0.4)
-        np.testing.assert_allclose(poses[after, 3:], turned[:, None] * [0.1, 0.3, -0.2], atol=1e-12)
-        centre = moved(poses, np.array([SWING.about]))[:, 0] - SWING.about
-        expected = np.sin(2 * np.pi * 1.5 * since)[:, None] * [0.02, 0.0, -0.01]
-        np.testing.assert_allclose(centre[after], expected, atol=1e-12)
+def test_nothing_moves_before_the_start_of_the_sinusoids():
+    poses = prescribed(SWING, TIMES)
+    assert not poses[TIMES <= 0.3].any()
+    after = TIMES >= 0.5
+    since = TIMES[after] - 0.3
+    turned = np.sin(2 * np.pi * 0.7 * since + 0.4) - np.sin(0.4)
+    np.testing.assert_allclose(poses[after, 3:], turned[:, None] * [0.1, 0.3, -0.2], atol=1e-12)
+    centre = moved(poses, np.array([SWING.about]))[:, 0] - SWING.about
+    expected = np.sin(2 * np.pi * 1.5 * since)[:, None] * [0.02, 0.0, -0.01]
+    np.testing.assert_allclose(centre[after], expected, atol=1e-12)
 
 
 class TestTables:
@@ -90,7 +89,7 @@ class TestRecorded:
 class TestFollowed:
     NOISE = 1e-4  # m
 
-    def test_the_base_motion_is_more_accurate_than_its_markers(self):
+    def test_the_base_motion_is_more_accurate_than_its_markers_of_which_it_needs_three(self):
         draw = np.random.default_rng(0)
         known = prescribed(SWING, TIMES)
         markers = moved(known) + self.NOISE * draw.standard_normal((len(TIMES), *POINTS.shape))
@@ -100,8 +99,6 @@ class TestFollowed:
         assert error.mean() < self.NOISE
         jerky = np.diff(moved(result), 2, axis=0) - np.diff(moved(known), 2, axis=0)
         assert np.abs(jerky).mean() < 0.2 * self.NOISE  # unsmoothed, 2.4 times the noise over the root of their number
-
-    def test_too_few_markers(self):
         markers = moved(prescribed(SWING, TIMES))
         markers[:150, :2] = np.nan
         with pytest.raises(DataFileError, match=r"a\.npz: the base moves, and three .* in 25 % of the frames"):

@@ -49,24 +49,23 @@ def poses_of_two(steps=20):
     )
 
 
-class TestBaseFrame:
-    def test_a_body_that_goes_with_its_base_is_at_rest_in_its_frame_from_which_states_come_back(self):
-        poses = poses_of_two()
-        points = Body(box_hexahedra(divisions=(2, 1, 1))).mesh.vertices
-        world = torch.from_numpy(
-            np.stack([rigid(p.numpy()).apply(np.broadcast_to(points, (2, *points.shape))) for p in poses])
-        )
-        base = BaseFrame(poses, STEP)
-        for k in range(1, 21):
-            q, v = base.enter(world[k], (world[k] - world[k - 1]) / STEP, k)
-            np.testing.assert_allclose(q, np.stack([points, points]), atol=1e-14)
-            np.testing.assert_allclose(v, np.zeros_like(q), atol=1e-12)
-        base, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(2)
-        q, v, force = (torch.randn(2, 7, 3, dtype=torch.float64, generator=random) for _ in range(3))
-        for k in (0, 1, 7, 20, 25):
-            for actual, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
-                torch.testing.assert_close(actual, expected, rtol=0.0, atol=1e-11)
-            torch.testing.assert_close(base.force_outside(base.force_inside(force, k), k), force, rtol=0.0, atol=1e-14)
+def test_a_body_that_goes_with_its_base_is_at_rest_in_its_frame_from_which_states_come_back():
+    poses = poses_of_two()
+    points = Body(box_hexahedra(divisions=(2, 1, 1))).mesh.vertices
+    world = torch.from_numpy(
+        np.stack([rigid(p.numpy()).apply(np.broadcast_to(points, (2, *points.shape))) for p in poses])
+    )
+    base = BaseFrame(poses, STEP)
+    for k in range(1, 21):
+        q, v = base.enter(world[k], (world[k] - world[k - 1]) / STEP, k)
+        np.testing.assert_allclose(q, np.stack([points, points]), atol=1e-14)
+        np.testing.assert_allclose(v, np.zeros_like(q), atol=1e-12)
+    base, random = BaseFrame(poses_of_two(), STEP), torch.Generator().manual_seed(2)
+    q, v, force = (torch.randn(2, 7, 3, dtype=torch.float64, generator=random) for _ in range(3))
+    for k in (0, 1, 7, 20, 25):
+        for actual, expected in zip(base.leave(*base.enter(q, v, k), k), (q, v), strict=True):
+            torch.testing.assert_close(actual, expected, rtol=0.0, atol=1e-11)
+        torch.testing.assert_close(base.force_outside(base.force_inside(force, k), k), force, rtol=0.0, atol=1e-14)
 
 
 def test_what_networks_are_told_of_a_base_are_its_velocities_and_gravity():

@@ -161,19 +161,18 @@ class Brittle(World):
         return state.q.numpy()
 
 
-class TestFailures:
-    def test_one_in_any_step_of_an_action_ends_the_episode(self):
-        places = np.random.default_rng(0).normal(size=(8, 3))
-        reach = Reach(places, np.zeros((8, 1)))
-        mapping = ActionMapping(np.zeros(1), np.ones(1), np.full(1, 10.0), np.zeros(1), 5)
-        robots = RobotVectorEnv(Brittle(), ReachTask(2, 6, reach), mapping, np.eye(3), 6)
-        robots.reset(seed=0)
-        steps = [robots.step(np.ones((2, 1), dtype=np.float32)) for _ in range(5)]
-        _, rewards, terminated, _, infos = zip(*steps, strict=True)
-        np.testing.assert_array_equal(terminated, [[False] * 2] * 2 + [[True, False]] + [[False] * 2] * 2)
-        assert rewards[2][0] == -10.0
-        assert rewards[3][0] == 0.0  # The next step resets it.
-        np.testing.assert_allclose(infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0]))
+def test_a_failure_in_any_step_of_an_action_ends_the_episode():
+    places = np.random.default_rng(0).normal(size=(8, 3))
+    reach = Reach(places, np.zeros((8, 1)))
+    mapping = ActionMapping(np.zeros(1), np.ones(1), np.full(1, 10.0), np.zeros(1), 5)
+    robots = RobotVectorEnv(Brittle(), ReachTask(2, 6, reach), mapping, np.eye(3), 6)
+    robots.reset(seed=0)
+    steps = [robots.step(np.ones((2, 1), dtype=np.float32)) for _ in range(5)]
+    _, rewards, terminated, _, infos = zip(*steps, strict=True)
+    np.testing.assert_array_equal(terminated, [[False] * 2] * 2 + [[True, False]] + [[False] * 2] * 2)
+    assert rewards[2][0] == -10.0
+    assert rewards[3][0] == 0.0  # The next step resets it.
+    np.testing.assert_allclose(infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0]))
 
 
 class TestPictures:

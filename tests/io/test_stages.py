@@ -57,17 +57,16 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-class TestResources:
-    def test_the_peak_is_the_largest_of_all_stages(self, experiment):
-        experiment.run()
-        used = resuming.resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
-        assert used["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
-        assert used["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
-        path = experiment.run_dir / "stages" / "generate.json"
-        write_json(path, json.loads(path.read_text()) | {"peak_memory_gib": 3.0})
-        assert resuming.resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
-        assert resuming.resources_used(experiment.run_dir, ["none"])["peak_memory_gib"] is None
-        assert experiment.run() == []
+def test_the_peak_of_memory_is_the_largest_of_all_stages(experiment):
+    experiment.run()
+    used = resuming.resources_used(experiment.run_dir, ["generate", "train", "evaluate"])
+    assert used["seconds"] == {name: experiment.seconds[name] for name in ("generate", "train")}
+    assert used["peak_memory_gib"] == pytest.approx(peak_memory_gib(), rel=0.1)
+    path = experiment.run_dir / "stages" / "generate.json"
+    write_json(path, json.loads(path.read_text()) | {"peak_memory_gib": 3.0})
+    assert resuming.resources_used(experiment.run_dir, ["generate", "train"])["peak_memory_gib"] == 3.0
+    assert resuming.resources_used(experiment.run_dir, ["none"])["peak_memory_gib"] is None
+    assert experiment.run() == []
 
 
 class TestSkipping:
@@ -187,21 +186,20 @@ class TestInterruption:
         assert experiment.run() == ["train", "report"]
 
 
-class TestLock:
-    def test_one_process_at_a_time_in_a_folder_that_can_be_made(self, experiment, tmp_path):
-        with (
-            resuming.run_lock(experiment.run_dir),
-            pytest.raises(InputError, match="another process is writing the run folder"),
-        ):
-            experiment.run()
-        assert experiment.ran == []
-        assert experiment.run() == ["generate", "train", "report"]
-        (tmp_path / "file").touch()
-        with (
-            pytest.raises(DataFileError, match="cannot write the run folder"),
-            resuming.run_lock(tmp_path / "file" / "run"),
-        ):
-            pass
+def test_one_process_at_a_time_in_a_folder_that_can_be_made(experiment, tmp_path):
+    with (
+        resuming.run_lock(experiment.run_dir),
+        pytest.raises(InputError, match="another process is writing the run folder"),
+    ):
+        experiment.run()
+    assert experiment.ran == []
+    assert experiment.run() == ["generate", "train", "report"]
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(DataFileError, match="cannot write the run folder"),
+        resuming.run_lock(tmp_path / "file" / "run"),
+    ):
+        pass
 
 
 class TestProgress:

@@ -212,26 +212,23 @@ def same(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
-class TestResume:
-    @pytest.mark.parametrize(
-        ("after", "settings"), [(3, {}), (2, {"schedule": "step", "selection": "validation_loss"})]
-    )
-    def test_a_snapshot_goes_on_exactly(self, after, settings, tmp_path):
-        whole = finish(trainer(**settings))
-        first = trainer(**settings)
-        for _ in range(after):
-            first.run_epoch()
-        path = tmp_path / "training.safetensors"
-        write_checkpoint(path, "training", *first.snapshot())
-        second = trainer(seed=17, **settings)  # nothing of its own start may remain
-        second.resume(*read_checkpoint(path, "training"))
-        finish(second)
-        assert same(second.model.state_dict(), whole.model.state_dict())
-        assert same(second.use_best().state_dict(), whole.use_best().state_dict())
-        assert second.history == whole.history
-        assert (second.best_score, second.best_epoch) == (whole.best_score, whole.best_epoch)
-        assert second.best_error == whole.best_error
-        assert same(second.best, whole.best)
+@pytest.mark.parametrize(("after", "settings"), [(3, {}), (2, {"schedule": "step", "selection": "validation_loss"})])
+def test_a_snapshot_goes_on_exactly(after, settings, tmp_path):
+    whole = finish(trainer(**settings))
+    first = trainer(**settings)
+    for _ in range(after):
+        first.run_epoch()
+    path = tmp_path / "training.safetensors"
+    write_checkpoint(path, "training", *first.snapshot())
+    second = trainer(seed=17, **settings)  # nothing of its own start may remain
+    second.resume(*read_checkpoint(path, "training"))
+    finish(second)
+    assert same(second.model.state_dict(), whole.model.state_dict())
+    assert same(second.use_best().state_dict(), whole.use_best().state_dict())
+    assert second.history == whole.history
+    assert (second.best_score, second.best_epoch) == (whole.best_score, whole.best_epoch)
+    assert second.best_error == whole.best_error
+    assert same(second.best, whole.best)
 
 
 class TestSelection:

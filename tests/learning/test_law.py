@@ -104,7 +104,7 @@ def test_known_coefficients_are_recovered_and_terms_that_the_law_does_not_have_g
     assert without.residual > 1e4 * found.residual
 
 
-def test_a_branch_remembers_the_steps_between_two_rows():
+def test_loads_during_the_motion_and_steps_between_two_rows_are_part_of_the_balance():
     """Rows of a larger stride are among those of every step."""
     sim = simulator(TRUE)
     motion = released(sim, PULLS[:1])
@@ -112,9 +112,6 @@ def test_a_branch_remembers_the_steps_between_two_rows():
     rows = fine.reshape(12, -1, len(UNIT))[::4].reshape(-1, len(UNIT))
     np.testing.assert_allclose(coarse, rows, rtol=0.0, atol=1e-12 * np.abs(rows).max())
     assert np.abs(fine[:, 5]).max() > 0.0
-
-
-def test_loads_during_the_motion_are_part_of_the_balance():
     sim = simulator(TRUE)
     inputs = Inputs(external_force=pulled([(0.0, 0.2, 0.0)]))
     with torch.no_grad():

@@ -108,24 +108,23 @@ def test_mean_distances_count_what_was_seen():
     np.testing.assert_allclose(metrics.mean_distance(markers, measured)[0], [2.0, 3.0, np.nan, np.inf])
 
 
-class TestMedianFilter:
-    def test_it_is_one_of_a_second_and_leaves_out_what_is_not_known(self):
-        values = np.random.default_rng(1).normal(size=(2, 300))
-        smooth = metrics.median_filter(values, 0.01)
-        for at in (0, 20, 50, 150, 299):  # half a second to both sides: 50 steps
-            np.testing.assert_allclose(smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1))
-        step = (np.arange(300) >= 150).astype(float)
-        np.testing.assert_array_equal(metrics.median_filter(step, 0.01), step)
-        spike = np.zeros(300)
-        spike[100:150] = 5.0  # shorter than half of the window
-        assert metrics.median_filter(spike, 0.01).max() == 0.0
-        assert metrics.median_filter(spike, 0.02).max() == 5.0  # at this step it lasts a second
-        values = np.array([1.0, np.nan, 3.0, np.inf, np.nan, np.nan, np.nan])
-        filtered = metrics.median_filter(values, 1.0, 2.0)
-        np.testing.assert_array_equal(filtered, [1.0, 2.0, np.inf, np.inf, np.inf, np.nan, np.nan])
-        for step, window in ((0.0, 1.0), (0.01, -1.0), (np.nan, 1.0)):
-            with pytest.raises(InputError, match="both must be positive"):
-                metrics.median_filter(values, step, window)
+def test_the_median_filter_is_one_of_a_second_and_leaves_out_what_is_not_known():
+    values = np.random.default_rng(1).normal(size=(2, 300))
+    smooth = metrics.median_filter(values, 0.01)
+    for at in (0, 20, 50, 150, 299):  # half a second to both sides: 50 steps
+        np.testing.assert_allclose(smooth[:, at], np.median(values[:, max(0, at - 50) : at + 51], axis=1))
+    step = (np.arange(300) >= 150).astype(float)
+    np.testing.assert_array_equal(metrics.median_filter(step, 0.01), step)
+    spike = np.zeros(300)
+    spike[100:150] = 5.0  # shorter than half of the window
+    assert metrics.median_filter(spike, 0.01).max() == 0.0
+    assert metrics.median_filter(spike, 0.02).max() == 5.0  # at this step it lasts a second
+    values = np.array([1.0, np.nan, 3.0, np.inf, np.nan, np.nan, np.nan])
+    filtered = metrics.median_filter(values, 1.0, 2.0)
+    np.testing.assert_array_equal(filtered, [1.0, 2.0, np.inf, np.inf, np.inf, np.nan, np.nan])
+    for step, window in ((0.0, 1.0), (0.01, -1.0), (np.nan, 1.0)):
+        with pytest.raises(InputError, match="both must be positive"):
+            metrics.median_filter(values, step, window)
 
 
 REST = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])

@@ -40,18 +40,17 @@ def built(kind):
     return build_model(ResidualForce, KINDS[kind], rest, rest + q, v, force), rest + q, v, force
 
 
-class TestSkipMLP:
-    def test_blocks_after_the_first_add_to_their_input(self):
-        torch.manual_seed(0)
-        network = SkipMLP(4, 3, blocks=3, layers=1, width=8, activation="normalised_elu")
-        x = torch.randn(5, 4)
-        first = network.blocks[0](x)
-        second = first + network.blocks[1](first)
-        assert torch.equal(network(x), second + network.blocks[2](second))
-        for block in list(network.blocks)[1:]:
-            nn.init.zeros_(block[-1].weight)
-            nn.init.zeros_(block[-1].bias)
-        assert torch.equal(network(x), first)
+def test_blocks_of_a_skip_mlp_after_the_first_add_to_their_input():
+    torch.manual_seed(0)
+    network = SkipMLP(4, 3, blocks=3, layers=1, width=8, activation="normalised_elu")
+    x = torch.randn(5, 4)
+    first = network.blocks[0](x)
+    second = first + network.blocks[1](first)
+    assert torch.equal(network(x), second + network.blocks[2](second))
+    for block in list(network.blocks)[1:]:
+        nn.init.zeros_(block[-1].weight)
+        nn.init.zeros_(block[-1].bias)
+    assert torch.equal(network(x), first)
 
 
 class TestPOD:
@@ -71,15 +70,14 @@ class TestPOD:
             pod_coder(field(samples), modes)
 
 
-class TestNodalCoder:
-    def test_round_trip_and_standardisation(self):
-        samples = 2.0 + field(40)
-        coder = nodal_coder(samples)
-        coordinates = coder.encode(samples)
-        np.testing.assert_allclose(coordinates.mean(0), 0.0, atol=1e-12)
-        np.testing.assert_allclose(coordinates.std(0), 1.0, rtol=1e-12)
-        np.testing.assert_allclose(coder.decode(coordinates), samples, atol=1e-14)
-        assert coder.size == 18
+def test_round_trip_and_standardisation_of_the_nodal_coder():
+    samples = 2.0 + field(40)
+    coder = nodal_coder(samples)
+    coordinates = coder.encode(samples)
+    np.testing.assert_allclose(coordinates.mean(0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(coordinates.std(0), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(coder.decode(coordinates), samples, atol=1e-14)
+    assert coder.size == 18
 
 
 class TestResidualForce:

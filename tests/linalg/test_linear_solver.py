@@ -143,17 +143,14 @@ def test_a_pivot_that_is_not_positive_is_found_wherever_it_is(unknown, device, c
         assert solver.factor(values_of(solver, bad)).failed.tolist() == [False, True, False]
 
 
-def test_only_a_solver_that_says_so_writes_over_the_values(device):
+def test_only_a_solver_that_says_so_writes_over_the_values_and_nan_stays_or_counts_as_failed(device):
     for kind in layouts(device):
         solver = make(kind, 3, device)
         values = values_of(solver, matrices(3, 20.0))
         before = values.clone()
         solver.factor(values)
         assert bool((values == before).all()) != solver.overwrites
-
-
-def test_nan_counts_as_failed_or_stays_nan():
-    """A NaN in a matrix never turns into a finite solution."""
+    # A NaN in a matrix never turns into a finite solution.
     dense = matrices(3, 20.0)
     dense[2, 5, 5] = np.nan
     right = torch.ones(BATCH, NODES * 3, 1, dtype=torch.float64)

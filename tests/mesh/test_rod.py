@@ -27,7 +27,7 @@ def test_its_volume_is_that_of_a_cone(nodes, core, rings, larger, error):
         assert outer[mesh.vertices[:, 2] == z].max() == pytest.approx(radius * larger, rel=5e-3)
 
 
-def test_along_a_curve_it_keeps_its_radius_and_does_not_twist():
+def test_along_a_curve_it_keeps_its_radius_and_does_not_twist_and_may_be_an_ellipse():
     angle = np.linspace(0.0, np.pi / 2, 200)
     quarter = np.column_stack([0.2 * np.sin(angle), 0.0 * angle, 0.2 * np.cos(angle)])
     mesh = rod(quarter, 0.01, 20)
@@ -37,10 +37,7 @@ def test_along_a_curve_it_keeps_its_radius_and_does_not_twist():
     x, y, z = mesh.vertices.T
     first, last = np.sort(y[np.abs(x) < 1e-9]), np.sort(y[np.abs(z) < 1e-9])
     np.testing.assert_allclose(first, last, atol=1e-4)  # a section that does not turn about the axis
-
-
-def test_a_section_may_be_an_ellipse():
-    """Of which the first semi-axis is along the coordinate axis that the rod crosses most squarely, y here."""
+    # Of which the first semi-axis is along the coordinate axis that the rod crosses most squarely, y here.
     profile = np.array([[0.0, 0.02, 0.005], [0.201, 0.01, 0.005]])
     mesh = rod([[0.0, 0.0, 0.0], [0.02, 0.0, -0.2]], profile, 8, nodes=27)
     assert cell_volumes(mesh).sum() == pytest.approx(np.pi * 0.015 * 0.005 * 0.201, rel=3e-3)

@@ -67,7 +67,7 @@ def test_silhouette_of_a_sphere():
     assert 800.0 * away[:, :2] / away[:, 2:] == pytest.approx(rim.pixels, abs=0.05)
 
 
-def test_what_the_body_covers_is_no_outline():
+def test_what_the_body_covers_is_no_outline_and_what_a_clamp_hides_does_not_count():
     """A small box before a large one: its own edges are inside, and the outline is that of the large one."""
     large, small = (trimesh.creation.box((size, size, 0.2)) for size in (2.0, 0.5))
     small.apply_translation((0.1, 0.0, -1.0))
@@ -76,6 +76,10 @@ def test_what_the_body_covers_is_no_outline():
     half = 800.0 / 4.9
     assert np.abs(rim.pixels).max(1) == pytest.approx(half, abs=1e-6)
     assert rim.lengths.sum() == pytest.approx(8.0 * half, rel=1e-6)
+    corners = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
+    points = np.array([[5.0, 5.0], [13.0, 5.0], [16.0, 5.0], [19.0, 5.0], [30.0, 5.0]])
+    assert visibility(points, corners, 6.0) == pytest.approx([0.0, 0.0, 0.0, 0.5, 1.0])
+    assert visibility(points, np.zeros((0, 2)), 6.0) == pytest.approx(1.0)
 
 
 def test_closest_points_of_a_silhouette():
@@ -96,10 +100,3 @@ def test_a_surface_is_closed_and_before_the_camera():
     pixels = seen(box)
     pixels[3] = np.nan
     refuses(InputError, "behind the camera", ClosedSurface.of(np.asarray(box.faces)).silhouette, pixels)
-
-
-def test_what_a_clamp_hides_does_not_count():
-    corners = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0], [0.0, 10.0]])
-    points = np.array([[5.0, 5.0], [13.0, 5.0], [16.0, 5.0], [19.0, 5.0], [30.0, 5.0]])
-    assert visibility(points, corners, 6.0) == pytest.approx([0.0, 0.0, 0.0, 0.5, 1.0])
-    assert visibility(points, np.zeros((0, 2)), 6.0) == pytest.approx(1.0)

@@ -106,19 +106,16 @@ class TestErrors:
         np.testing.assert_allclose(line.get_ydata(), [2.0, 1.0, np.nan])
 
 
-class TestLearning:
-    def test_one_epoch_is_seen_and_named_by_a_whole_number(self):
-        record = {"epoch": 1, "train_loss": 3e-5, "validation_loss": 1.5e-4, "learning_rate": 1e-3}
-        losses, rate = training_curves([record]).axes
-        assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
-        low, high = rate.get_xlim()
-        assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
-
-    def test_the_start_that_was_kept_is_bold(self):
-        histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
-        (axes,) = loss_histories(histories).axes
-        assert [line.get_color() for line in axes.lines] == [TONES["muted"].light, TONES["sysid"].light]
-        np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
+def test_one_epoch_is_seen_and_named_by_a_whole_number_and_the_start_that_was_kept_is_bold():
+    record = {"epoch": 1, "train_loss": 3e-5, "validation_loss": 1.5e-4, "learning_rate": 1e-3}
+    losses, rate = training_curves([record]).axes
+    assert all(line.get_marker() == "." for line in (*losses.lines, *rate.lines))
+    low, high = rate.get_xlim()
+    assert [tick for tick in rate.get_xticks() if low <= tick <= high] == [1.0]
+    histories = {"sysid": [[{"loss": 1.0}, {"loss": 3.0}, {"loss": 0.5}], [{"loss": 2.0}, {"loss": 0.1}], []]}
+    (axes,) = loss_histories(histories).axes
+    assert [line.get_color() for line in axes.lines] == [TONES["muted"].light, TONES["sysid"].light]
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [1.0, 1.0, 0.5])
 
 
 class TestMotion:

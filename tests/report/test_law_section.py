@@ -107,11 +107,17 @@ def test_a_law_that_its_own_run_did_not_use_and_terms_that_it_does_not_have_are_
     assert law_section.wording("ogden_m3")[0][0] == "Ogden's term of exponent -3"
 
 
-def test_where_the_force_fades_out_the_law_remains():
+def test_where_the_force_fades_out_the_law_remains_and_stretches_beyond_the_training_are_said():
     metrics = {"errors_mm": {"law": {}}, "range": {"resphys": {"first_s": {"up": 0.0}}}}
     table = range_table(metrics, ["50 g", "up"])
     assert table.rows[0].cells == [Cell("1 of 2", "from the start (up)")]
     assert table.note.endswith("fades out, and the law remains.")
+    stretches = {"all test trials": (0.7, 1.4), "the training": (0.9, 1.1)}
+    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches))
+    assert said.startswith("In 12 % of the cells and times of all test trials, a principal stretch lies outside of ")
+    assert "0.90 to 1.10" in said
+    assert law_section.outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
+    assert law_section.outside_text(SimpleNamespace(outside=None, stretches={})) == ""
 
 
 @pytest.mark.parametrize("direction", [None, ALONG, ACROSS])
@@ -158,12 +164,3 @@ def test_moduli_at_small_strains():
     x = law_section.drawn_stretches({"all trials": (0.8, 1.3)})
     assert x[0] < 0.8 < 1.3 < x[-1]
     assert 1.0 in x
-
-
-def test_test_trials_beyond_the_stretches_of_the_training_are_said():
-    stretches = {"all test trials": (0.7, 1.4), "the training": (0.9, 1.1)}
-    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches))
-    assert said.startswith("In 12 % of the cells and times of all test trials, a principal stretch lies outside of ")
-    assert "0.90 to 1.10" in said
-    assert law_section.outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
-    assert law_section.outside_text(SimpleNamespace(outside=None, stretches={})) == ""

@@ -55,23 +55,22 @@ ERRORS = {"sysid": summary(2.0), "resphys": summary(1.0)}
 MORE = {"sysid": summary(None, 1), "resphys": summary(1.5)}
 
 
-class TestErrors:
-    def test_they_are_by_horizon_and_published_ones_stand_beside_the_same_model(self):
-        metrics = {"horizons": {"10": MORE, "5": ERRORS}}
-        table = sections.horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
-        assert table.columns == ["SysID", "ResPhys"]
-        assert {row.head: row.cells for row in table.rows} == {
-            "First 5 s": [Cell("2.00", "7.51 ± 3.63"), Cell("1.00", "5.79 ± 3.09")],
-            "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50", "6.10 ± 3.22")],
-        }
-        (row,) = sections.horizon_table({"horizons": {"5": ERRORS}}, {}).rows
-        assert row.cells == [Cell("2.00"), Cell("1.00")]
-        assert sections.horizon_table({}, {}) is None
-        published = PUBLISHED_MM["beam_real"]
-        beside = sections.published_beside(published, ["published", "simulation", "sysid", "resphys"])
-        assert beside.keys() == {"published", "sysid", "simfree", "resphys"}
-        beside = sections.published_beside(published, ["simulation", "sysid_elastic", "sysid"])
-        assert beside["sysid_elastic"] == ("1.32", "± 1.38")
+def test_errors_are_by_horizon_and_published_ones_stand_beside_the_same_model():
+    metrics = {"horizons": {"10": MORE, "5": ERRORS}}
+    table = sections.horizon_table(metrics, PUBLISHED_WINDOWS_MM["sopra_extrapolation"])
+    assert table.columns == ["SysID", "ResPhys"]
+    assert {row.head: row.cells for row in table.rows} == {
+        "First 5 s": [Cell("2.00", "7.51 ± 3.63"), Cell("1.00", "5.79 ± 3.09")],
+        "First 10 s": [Cell("1 of 3 diverged", "7.57 ± 3.59"), Cell("1.50", "6.10 ± 3.22")],
+    }
+    (row,) = sections.horizon_table({"horizons": {"5": ERRORS}}, {}).rows
+    assert row.cells == [Cell("2.00"), Cell("1.00")]
+    assert sections.horizon_table({}, {}) is None
+    published = PUBLISHED_MM["beam_real"]
+    beside = sections.published_beside(published, ["published", "simulation", "sysid", "resphys"])
+    assert beside.keys() == {"published", "sysid", "simfree", "resphys"}
+    beside = sections.published_beside(published, ["simulation", "sysid_elastic", "sysid"])
+    assert beside["sysid_elastic"] == ("1.32", "± 1.38")
 
 
 def test_control_is_told_by_controller_and_speed():
@@ -181,48 +180,25 @@ def test_rows_of_markers_that_were_never_seen():
     assert [cell.text for cell in table.rows[8].cells] == ["0.70", "4", "0.50"]
 
 
-class TestWhatIsShown:
-    def test_bodies_at_frames_instants_that_lie_apart_the_uncorrected_model_and_the_best_one(self):
-        positions = np.arange(4.0)[:, None, None] * np.ones((1, 2, 3))
-        times = np.array([0.0, 0.1, 0.2, 0.3])
-        between = at_times(positions, times, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
-        np.testing.assert_allclose(between[:, 0, 0], [0.0, 0.5, 1.1, 3.0, 3.0])
-        positions[2:] = np.nan
-        np.testing.assert_array_equal(at_times(positions, times, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan])
-        measured, rest = np.zeros((100, 1, 3)), np.zeros((1, 3))
-        measured[40, 0, 2] = -1.0
-        simulated = measured.copy()
-        simulated[97, 0, 0] = 1.0
-        assert instants(measured, rest, simulated) == [25, 40, 97]  # The last is too close to where the model is worst.
-        simulated[70, 0, 0] = 2.0
-        assert instants(measured, rest, simulated) == [40, 70, 99]
-        measured[70] = np.nan
-        assert instants(measured, rest, simulated) == [25, 40, 97]
-        assert instants(measured[:1], rest, simulated[:1]) == [0]
-        assert wording.shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
-        assert wording.shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
-
-
-def test_trials_out_of_range_are_counted_where_they_belong():
-    none, some, late = {"first_s": {}}, {"first_s": {"b": 2.5, "a": 1.0}}, {"first_s": {"d": 0.25}}
-    metrics = {
-        "range": {"resphys": some, "simfree": none},
-        "scales_range": {
-            "1": {"resphys": some, "simfree": none},
-            "1.5": {"resphys": late, "simfree": none},
-            "1.25": {"resphys": none, "simfree": none},
-        },
-    }
-    table = range_table({**metrics, "errors_mm": {}}, ["a", "b", "c"])
-    assert table.columns == ["Of the test trials", f"Inputs {TIMES} 1.25", f"Inputs {TIMES} 1.5"]
-    rows = {row.head: [(c.text, c.small.replace(NO_BREAK_SPACE, " ")) for c in row.cells] for row in table.rows}
-    assert rows == {
-        "SimFree": [("none of 3", "")] * 3,
-        "ResPhys": [("2 of 3", "after 1.00 s (a)"), ("none of 3", ""), ("1 of 3", "after 0.25 s (d)")],
-    }
-    at_once = {"range": {"simfree": {"first_s": dict.fromkeys("abcd", 0.0)}}, "errors_mm": {}}
-    assert range_table(at_once, "abcd").rows[0].cells == [Cell("4 of 4", "from the start (a, b and 2 more)")]
-    assert range_table({}, ["a"]) is None
+def test_bodies_at_frames_instants_that_lie_apart_the_uncorrected_model_and_the_best_one():
+    positions = np.arange(4.0)[:, None, None] * np.ones((1, 2, 3))
+    times = np.array([0.0, 0.1, 0.2, 0.3])
+    between = at_times(positions, times, np.array([0.0, 0.05, 0.11, 0.3, 0.5]))
+    np.testing.assert_allclose(between[:, 0, 0], [0.0, 0.5, 1.1, 3.0, 3.0])
+    positions[2:] = np.nan
+    np.testing.assert_array_equal(at_times(positions, times, np.array([0.1, 0.11]))[:, 0, 0], [1.0, np.nan])
+    measured, rest = np.zeros((100, 1, 3)), np.zeros((1, 3))
+    measured[40, 0, 2] = -1.0
+    simulated = measured.copy()
+    simulated[97, 0, 0] = 1.0
+    assert instants(measured, rest, simulated) == [25, 40, 97]  # The last is too close to where the model is worst.
+    simulated[70, 0, 0] = 2.0
+    assert instants(measured, rest, simulated) == [40, 70, 99]
+    measured[70] = np.nan
+    assert instants(measured, rest, simulated) == [25, 40, 97]
+    assert instants(measured[:1], rest, simulated[:1]) == [0]
+    assert wording.shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
+    assert wording.shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
 
 
 def test_numbers_have_sensible_digits_and_shares_those_for_what_is_left():
@@ -293,11 +269,30 @@ def result(simulation, sysid=None, law=None, **more):
     return {"vertices": 225, "moved_mm": 12.5, "errors_mm": kept, **more}
 
 
-def test_a_model_that_diverges_on_a_body():
+def test_trials_out_of_range_and_models_that_diverge_on_a_body_are_counted_where_they_belong():
     lost = result(1.0, 0.2)
     lost["errors_mm"]["law"] = None
     rows = {row.head: [cell.text for cell in row.cells] for row in sections.shapes_table({"rod": lost}).rows}
     assert rows == {"rod": ["1.00", "0.200", "diverged"]}
+    none, some, late = {"first_s": {}}, {"first_s": {"b": 2.5, "a": 1.0}}, {"first_s": {"d": 0.25}}
+    metrics = {
+        "range": {"resphys": some, "simfree": none},
+        "scales_range": {
+            "1": {"resphys": some, "simfree": none},
+            "1.5": {"resphys": late, "simfree": none},
+            "1.25": {"resphys": none, "simfree": none},
+        },
+    }
+    table = range_table({**metrics, "errors_mm": {}}, ["a", "b", "c"])
+    assert table.columns == ["Of the test trials", f"Inputs {TIMES} 1.25", f"Inputs {TIMES} 1.5"]
+    rows = {row.head: [(c.text, c.small.replace(NO_BREAK_SPACE, " ")) for c in row.cells] for row in table.rows}
+    assert rows == {
+        "SimFree": [("none of 3", "")] * 3,
+        "ResPhys": [("2 of 3", "after 1.00 s (a)"), ("none of 3", ""), ("1 of 3", "after 0.25 s (d)")],
+    }
+    at_once = {"range": {"simfree": {"first_s": dict.fromkeys("abcd", 0.0)}}, "errors_mm": {}}
+    assert range_table(at_once, "abcd").rows[0].cells == [Cell("4 of 4", "from the start (a, b and 2 more)")]
+    assert range_table({}, ["a"]) is None
 
 
 @pytest.mark.usefixtures("no_drawing")

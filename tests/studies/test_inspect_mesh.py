@@ -41,17 +41,16 @@ def arm():
     return mesh_arm(ArmMesh())
 
 
-class TestQuality:
-    def test_ideal_cells_are_worth_one_and_a_sheared_brick_the_sine_of_its_angle(self):
-        assert scaled_jacobian(box_hexahedra((3.0, 1.0, 1.0), (1, 1, 1))) == pytest.approx(1.0)
-        regular = Mesh(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 2, 1, 3]]))
-        np.testing.assert_allclose(np.abs(scaled_jacobian(regular)), 1.0)
-        np.testing.assert_allclose(scaled_jacobian(quadratic(regular)), scaled_jacobian(regular))
-        box = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
-        sheared = Mesh(box.vertices + box.vertices[:, 1:2] * [[1.0 / np.tan(0.5), 0.0, 0.0]], box.cells)
-        assert scaled_jacobian(sheared) == pytest.approx(np.sin(0.5))
-        inverted = Mesh(box.vertices * [1.0, 1.0, -1.0], box.cells)
-        assert scaled_jacobian(inverted) == pytest.approx(-1.0)
+def test_ideal_cells_are_worth_one_and_a_sheared_brick_the_sine_of_its_angle():
+    assert scaled_jacobian(box_hexahedra((3.0, 1.0, 1.0), (1, 1, 1))) == pytest.approx(1.0)
+    regular = Mesh(np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 2, 1, 3]]))
+    np.testing.assert_allclose(np.abs(scaled_jacobian(regular)), 1.0)
+    np.testing.assert_allclose(scaled_jacobian(quadratic(regular)), scaled_jacobian(regular))
+    box = box_hexahedra((1.0, 1.0, 1.0), (1, 1, 1))
+    sheared = Mesh(box.vertices + box.vertices[:, 1:2] * [[1.0 / np.tan(0.5), 0.0, 0.0]], box.cells)
+    assert scaled_jacobian(sheared) == pytest.approx(np.sin(0.5))
+    inverted = Mesh(box.vertices * [1.0, 1.0, -1.0], box.cells)
+    assert scaled_jacobian(inverted) == pytest.approx(-1.0)
 
 
 class TestQuadraticCells:
@@ -93,16 +92,15 @@ class TestQuadraticCells:
         assert not {"one cell thick", "quadratic cells"} & inspected(f"mesh.path={tmp_path}/beam.msh").keys()
 
 
-class TestOpenCavities:
-    def test_closed_chambers_are_none_without_its_last_cap(self, arm):
-        assert open_cavities(arm[0]) == []
-        assert open_cavities(box_tetrahedra()) == []
-        mesh, _ = arm
-        cavities = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
-        assert len(cavities) == 3
-        around = sorted(np.degrees(np.arctan2(cavity.centre[1], cavity.centre[0])) for cavity in cavities)
-        assert around == pytest.approx([-120.0, 0.0, 120.0], abs=1.0)
-        assert all(3e-3 < cavity.area < 6e-3 for cavity in cavities)
+def test_closed_chambers_are_none_without_its_last_cap(arm):
+    assert open_cavities(arm[0]) == []
+    assert open_cavities(box_tetrahedra()) == []
+    mesh, _ = arm
+    cavities = open_cavities(without(mesh, mesh.vertices[mesh.cells].mean(axis=1)[:, 2] < -0.271))
+    assert len(cavities) == 3
+    around = sorted(np.degrees(np.arctan2(cavity.centre[1], cavity.centre[0])) for cavity in cavities)
+    assert around == pytest.approx([-120.0, 0.0, 120.0], abs=1.0)
+    assert all(3e-3 < cavity.area < 6e-3 for cavity in cavities)
 
 
 class TestNamedSurfaces:

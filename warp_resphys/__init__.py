@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from .io.imports import collector_paused
+from .io.process import collector_paused
 
 # In a copy of the repository without an editable installation, kernels/ and conf/ are next to this folder.
 if importlib.util.find_spec(f"{__name__}.kernels") is None:

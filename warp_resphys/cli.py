@@ -8,7 +8,7 @@ import sys
 from . import __version__
 from .commands import COMMANDS, USER_ERROR, ends_where_nobody_reads, help_text, parse
 from .io.errors import InputError
-from .io.imports import collector_paused
+from .io.process import collector_paused
 
 
 def main() -> None:

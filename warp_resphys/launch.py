@@ -7,9 +7,7 @@ import logging
 import os
 import re
 import shlex
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,7 +27,7 @@ from yaml import MarkedYAMLError
 from .commands import CONFIG_PACKAGE, OWN_OPTIONS, USER_ERROR, configuration, ends_where_nobody_reads, quote, run_label
 from .io.atomic import is_disk_full
 from .io.errors import ResphysError, ResphysWarning, did_you_mean
-from .io.imports import collector_paused
+from .io.process import collector_paused, ends_as_after_ctrl_c
 from .io.settings import Settings, parse
 from .option_files import names_are_texts, run_schema
 from .overrides import LateOverride, readable
@@ -92,7 +90,7 @@ class _Job:
         parsed.overrides += _SILENT if self.shown is not None else ()
         OmegaConf.register_new_resolver("run_label", self._label, replace=True)
         setbase("1.3")
-        with _ends_as_after_ctrl_c(), names_are_texts():
+        with ends_as_after_ctrl_c(), names_are_texts():
             _run_hydra(parsed, parser, self._call, f"pkg://{CONFIG_PACKAGE}", configuration(command))
 
     def _label(self, overrides: Sequence[str], excluded: Sequence[str] = ()) -> str:
@@ -151,19 +149,6 @@ def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
         run = getattr(import_module(f"{__package__}.{module}"), function)
     settings, *_ = get_type_hints(run).values()
     return run, settings
-
-
-@contextmanager
-def _ends_as_after_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM, by which clusters and containers end a process, act as Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _sentence_of_warning(

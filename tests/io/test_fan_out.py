@@ -165,15 +165,17 @@ def lives(process):
 
 
 @pytest.mark.slow
-def test_workers_end_with_their_parent(tmp_path):
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM])
+def test_workers_end_with_their_parent(tmp_path, sent):
     """Even if it is killed: otherwise they would write to the files of a run that resumes."""
     program = "from test_fan_out import *\nfolder = Path(sys.argv[1])\n"
     program += "fan_out(works_or_waits, [(folder, False), (folder, True)], Workers(2), folder)"
-    parent = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=Path(__file__).parent)
+    command = [sys.executable, "-c", program, str(tmp_path)]
+    parent = subprocess.Popen(command, cwd=Path(__file__).parent, stderr=subprocess.PIPE)
     wait_until(lambda: len([*tmp_path.glob("process_*")]) == 2)
     workers = [int(path.name.removeprefix("process_")) for path in tmp_path.glob("process_*")]
-    parent.kill()
-    parent.wait()
+    parent.send_signal(sent)
+    assert "leaked" not in parent.communicate()[1].decode() or sent == signal.SIGKILL
     wait_until(lambda: not any(map(lives, workers)))
 
 

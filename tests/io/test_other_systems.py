@@ -14,9 +14,9 @@ import warp as wp
 
 from warp_resphys.io import atomic, fan_out, machine
 from warp_resphys.io.errors import InputError
-from warp_resphys.io.imports import collector_paused
 from warp_resphys.io.kernel_cache import ensure_kernel_cache
 from warp_resphys.io.machine import available_cores, commit, hardware
+from warp_resphys.io.process import collector_paused
 
 REPOSITORY = Path(__file__).parents[2]
 UNIX_ALONE = ("fcntl", "resource", "pwd", "grp", "termios")

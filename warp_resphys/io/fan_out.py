@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from .errors import InputError, ResphysError, ResphysWarning
 from .kernel_cache import start_quietly
+from .process import ends_as_after_ctrl_c
 from .progress import be_quiet
 
 log = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ def fan_out(
         if not left:
             break
         try:
-            with _local(workers) if workers.address is None else _dask(workers.address):
+            with ends_as_after_ctrl_c(), _local(workers) if workers.address is None else _dask(workers.address):
                 # With n_jobs=1, joblib would work in this process.
                 parallel = Parallel(
                     n_jobs=max(workers.count, 2),

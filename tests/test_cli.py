@@ -20,8 +20,7 @@ from hydra._internal.utils import get_args_parser
 from omegaconf import OmegaConf
 from pydantic import ConfigDict
 
-from support.command_line import outcome
-from support.main_job import end_of
+from support.command_line import ended, outcome
 from warp_resphys import InputError, __version__, cli, commands
 from warp_resphys.commands import NOBODY_READS, run_label
 from warp_resphys.io.resuming import StageInterrupted
@@ -88,7 +87,7 @@ class Command:
 
     def __call__(self, *arguments: str) -> tuple[int, str]:
         self.outputs.clear()
-        return end_of(cli.main, *self.arguments, *arguments)
+        return ended(cli.main, *self.arguments, *arguments)[::2]
 
 
 @pytest.fixture

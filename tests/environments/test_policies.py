@@ -6,8 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from support.main_job import end_of
-from warp_resphys import cli
+from support.command_line import outcome
 from warp_resphys.control import reduction
 from warp_resphys.environments import making
 from warp_resphys.environments.making import make_vector
@@ -72,7 +71,7 @@ def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
     """Every policy in every world; finished training and trials are not repeated."""
     pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
-    arguments = ("warp-resphys", "train-policy", f"run={folder}", "skill=reach", "models=[sysid]", "robots=4")
+    arguments = ("train-policy", f"run={folder}", "skill=reach", "models=[sysid]", "robots=4")
     place, tried = folder / "policies", []
 
     def counted(environment, *rest):
@@ -85,7 +84,7 @@ def test_the_command_learns_and_tries_once(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(reduction, "ReductionSettings", lambda: few)
 
     def commanded(steps, seeds):
-        code, err = end_of(cli.main, *arguments, f"steps={steps}", f"seeds={seeds}", "episodes=2", "hydra.run.dir=here")
+        code, _, err = outcome(*arguments, f"steps={steps}", f"seeds={seeds}", "episodes=2", "hydra.run.dir=here")
         assert code == 0, err
         tries = len(tried)
         tried.clear()
@@ -126,6 +125,6 @@ def test_policies_of_several_seeds_are_told_in_one_row():
 @pytest.mark.parametrize("wrong", ["seeds=[0,0]", "models=[]"])
 def test_wrong_settings_are_refused(folder, tmp_path, monkeypatch, wrong):
     monkeypatch.chdir(tmp_path)
-    code, err = end_of(cli.main, "warp-resphys", "train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
+    code, _, err = outcome("train-policy", f"run={folder}", wrong, "hydra.run.dir=here")
     assert code == 2
     assert err.startswith(f"error: {wrong.split('=')[0]}")

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.command_line import ended
-from warp_resphys import cli, pipeline
+from support.command_line import outcome
+from warp_resphys import pipeline
 
 REPOSITORY = Path(__file__).parents[2]
 STAGES = ["simulate", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "time", "report"]
@@ -42,12 +42,6 @@ ROD = ["mesh.layers=3", "mesh.nodes=20", "laboratory.mesh.layers=4", "laboratory
 QUIET = ("hydra/job_logging=none", "hydra/hydra_logging=none")
 
 
-def end_of(program, *arguments):
-    """Runs a program in this process, with its name as the first argument; returns exit code and stderr."""
-    code, _, err = ended(program, *arguments)
-    return code, err
-
-
 @contextlib.contextmanager
 def without_reports():
     """Replaces reports and estimates of durations, which take most of a tiny run's time and have tests of their own."""
@@ -60,7 +54,7 @@ def without_reports():
 
 def run(*arguments):
     """Runs the command without a log in this process; returns exit code and stderr."""
-    return end_of(cli.main, "warp-resphys", *arguments, *QUIET)
+    return outcome(*arguments, *QUIET)[::2]
 
 
 def finish(*arguments):

@@ -71,9 +71,9 @@ def succeeded(*arguments):
 @pytest.mark.slow
 class TestSimulatedLaboratory:
     def test_the_material_comes_back_from_outlines_and_a_finished_search_is_kept(self, folder, monkeypatch):
-        monkeypatch.setattr(stages, "law_content", MagicMock(side_effect=KeyboardInterrupt))
-        assert outcome(*SIMULATED, IN_RUN).code
-        monkeypatch.undo()
+        with monkeypatch.context() as patch:
+            patch.setattr(stages, "law_content", MagicMock(side_effect=KeyboardInterrupt))
+            assert outcome(*SIMULATED, IN_RUN).code
         monkeypatch.setattr(search, "search_parameters", None)
         out = succeeded(*SIMULATED, IN_RUN)
         check_modulus(folder / "run")

@@ -260,6 +260,8 @@ def test_invalid_motions_are_refused(robot):
         (lambda r, m, f: evaluate(r, m.trials), "motions is of type Trials: it must be .*ObservedMotions"),
         (lambda r, m, f: identify(BODY, m, {}), "simulator is of type Body: it must be .*Simulator"),
         (lambda r, m, f: wr.identify_law(r, m, ["density"]), "is of type list: it must be a mapping or None"),
+        (lambda r, m, f: wr.identify_law(r, m, known="law.json"), "known is of type str: it must be a mapping or None"),
+        (lambda r, m, f: identify(r, m, {}, starts=None), "starts is of type NoneType: it must be int"),
         (lambda r, m, f: reconstruct(r, m, "motion 0"), "names is of type str: it must be a list or None"),
         (lambda r, m, f: reconstruct(r, m, parameters={"density": None}), "the parameter density is of type NoneType"),
         (lambda r, m, f: evaluate(r, m, parameters={"density": np.ones(3)}), r"density is an array of shape \(3,\)"),

@@ -19,6 +19,7 @@ from typing import (
     get_args,
     get_origin,
     get_type_hints,
+    is_typeddict,
 )
 
 _LONGEST = 1000
@@ -127,10 +128,11 @@ def checks_types(function: Callable[P, R]) -> Callable[P, R]:
         hints = get_type_hints(function)
         for name, value in signature.bind(*given, **options).arguments.items():
             parts = get_args(hints[name]) if get_origin(hints[name]) in (Union, UnionType) else (hints[name],)
-            kinds = [get_origin(kind) or kind for kind in parts]
+            kinds = [Mapping if is_typeddict(kind) else get_origin(kind) or kind for kind in parts]
             letters = isinstance(value, str) and str not in kinds  # which are no list of names
             if Any not in kinds and (letters or not isinstance(value, tuple(_WIDER.get(kind, kind) for kind in kinds))):
                 words = " or ".join(_WORDS.get(kind, f"{kind.__module__}.{kind.__name__}") for kind in kinds)
+                words = words.replace("builtins.", "")
                 raise InputError(f"{function.__name__}: {name} is {in_short(value)}: it must be {words}.")
         return function(*given, **options)
 

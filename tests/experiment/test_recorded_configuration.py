@@ -69,6 +69,18 @@ def test_a_configuration_is_checked(base, key, value, said):
     refuses(ResphysError, said, check, changed(composed(*base), key, value))
 
 
+@pytest.mark.parametrize(
+    "fits",
+    [
+        ("data.rest=file", "data.begins=static", "data.axes=[x,y,z]"),  # nothing is released
+        ("gravity=[0,0,0]", "data.begins=static", "data.axes=[x,y,z]"),
+        ("+data.steps=10", "data.horizons=[0.3]"),  # steps are those of driven trials
+    ],
+)
+def test_settings_of_releases_and_of_driven_trials_are_for_those_alone(fits):
+    check(composed(*REAL, *fits))
+
+
 def test_bodies_of_the_laboratory_are_held_undeformed_or_pulled():
     pulled = composed("experiment=beam_real", "release.sideways=0")
     pulled["laboratory"]["trials"]["m10"]["pull"] = [0.0, 0.1, 0.0]

@@ -84,5 +84,6 @@ def test_a_rest_without_an_orientation_is_refused(tmp_path):
         own = {"positions": x, "quaternions": turned, "rest": x[0]}
         np.savez(tmp_path / f"{name}.npz", labels=[*places], rate_hz=100.0, **own)
     trials = "data.trials={a: {file: a.npz, begins: released}, b: {file: b.npz, begins: released}}"
+    options = (trials, "data.rest=file", "data.seconds=0.1", "release.sideways=0")
     with pytest.raises(DataFileError, match=r"a\.npz: 'rest' has no orientation of 'plate': set data\.rest to held"):
-        imported(tmp_path, trials, "data.rest=file", "data.seconds=0.1", *recorded(tmp_path, "a", "b"))
+        imported(tmp_path, *options, *recorded(tmp_path, "a", "b"))

@@ -8,15 +8,23 @@ import torch
 
 import warp_resphys as wr
 from support.refusals import refuses
-from warp_resphys import ObservedMotions, evaluate, identify, reconstruct
+from warp_resphys import ObservedMotions, evaluate, identify, identify_law, reconstruct
 from warp_resphys.data.markers import WHOLE_STATE
+from warp_resphys.io.errors import DataFileError
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Parts
 from warp_resphys.learning.comparison import Comparison, Model
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.residuals.fitting import Fitting, fit_force
-from warp_resphys.settings.learning import Bounds, InTheLoopSettings, NetworkSettings, Prior, TrainerSettings
+from warp_resphys.settings.learning import (
+    Bounds,
+    InTheLoopSettings,
+    LawSettings,
+    NetworkSettings,
+    Prior,
+    TrainerSettings,
+)
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
 BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0))
@@ -25,6 +33,7 @@ MARKERS = wr.bind_markers(
     MESH, np.array([[0.1, 0.01, 0.022], [0.06, 0.01, 0.022], [0.1, 0.022, 0.01]]), ["a", "b", "c"]
 )
 STEPS = 25
+STIFF = {"youngs_modulus": (1e5, 1e6)}
 
 
 def beam(youngs_modulus, time_step=0.01):
@@ -60,6 +69,15 @@ def test_youngs_modulus_is_recovered(robot):
     assert not result.at_bounds
     assert float(evaluate(beam(180e3), motion, parameters=result.parameters).max()) < 1e-6
     assert float(evaluate(beam(180e3), motion).mean()) > 1e-4
+
+
+def test_a_law_begins_with_the_material_of_the_simulator_where_nothing_was_identified(robot):
+    stiff = Bounds(lower=1e5, upper=1e6, prior=Prior(mean=264e3, deviation=50e3))
+    motion = let_go(robot, 0.05, known_start=True)
+    law = identify_law(
+        beam(200e3), motion, {"youngs_modulus": stiff}, settings=LawSettings(terms=(), branches=0, families=0)
+    )
+    assert 2.0 * law.parameters["c10"] == pytest.approx(264e3 / 2.9, rel=0.02)
 
 
 def test_trials_have_their_values_sessions_their_places_and_finished_searches_are_kept(tmp_path, monkeypatch, capsys):
@@ -259,8 +277,8 @@ def test_invalid_motions_are_refused(robot):
         (lambda r, m, f: evaluate(r, m, f.read("force")), "force is an array of shape .*Learned or a function or None"),
         (lambda r, m, f: evaluate(r, m.trials), "motions is of type Trials: it must be .*ObservedMotions"),
         (lambda r, m, f: identify(BODY, m, {}), "simulator is of type Body: it must be .*Simulator"),
-        (lambda r, m, f: wr.identify_law(r, m, ["density"]), "is of type list: it must be a mapping or None"),
-        (lambda r, m, f: wr.identify_law(r, m, known="law.json"), "known is of type str: it must be a mapping or None"),
+        (lambda r, m, f: identify_law(r, m, ["density"]), "is of type list: it must be a mapping or None"),
+        (lambda r, m, f: identify_law(r, m, known="law.json"), "known is of type str: it must be a mapping or None"),
         (lambda r, m, f: identify(r, m, {}, starts=None), "starts is of type NoneType: it must be int"),
         (lambda r, m, f: reconstruct(r, m, "motion 0"), "names is of type str: it must be a list or None"),
         (lambda r, m, f: reconstruct(r, m, parameters={"density": None}), "the parameter density is of type NoneType"),
@@ -271,12 +289,32 @@ def test_invalid_motions_are_refused(robot):
         (lambda r, m, f: identify(r, m, {}, held_out=["x"]), "there is no trial 'x'"),
         (lambda r, m, f: fit_force(r, m, f, validation=["motion 0"]), "no trials are named"),
         (lambda r, m, f: fit_force(*longer(r), f), "forces on 24 vertices were reconstructed, but the body has 28"),
+        (lambda r, m, f: fit_force(r, dropped(r, 2), f), "of 3 steps were reconstructed, but motion 0 has 2 of 10 ms"),
+        (lambda r, m, f: fit_force(r, dropped(r, 4), f), "of 3 steps were reconstructed, but motion 0 has 4 of 10 ms"),
+        (lambda r, m, f: fit_force(beam(2e5, 0.03), m, f), "of 3 steps .*, but motion 0 has 1 of 30 ms"),
+        (lambda r, m, f: fit_force(r, m, f, force_frame="own"), "force_frame is 'own': choose world or corotated"),
+        (lambda r, m, f: identify(r, m, STIFF, {"colour": 1.0}), "first_guess: there is no parameter 'colour'"),
+        (lambda r, m, f: identify(r, m, STIFF, {"density": "x"}), r"identify\.first_guess\.density is 'x'"),
+        (lambda r, m, f: identify(r, m, STIFF, starts=0), "starts is 0: it must be a whole number, one or more"),
+        (lambda r, m, f: identify(r, m, STIFF, max_evaluations=0), "max_evaluations is 0: it must be a whole number"),
+        (lambda r, m, f: identify(r, m, {"density": ("a", 1.0)}), r"parameters\.density: Bounds\.lower is 'a'"),
+        (lambda r, m, f: identify_law(r, m, {"colour": (1.0, 2.0)}), "parameters: there is no parameter 'colour'"),
     ],
 )
 def test_arguments_of_wrong_types_and_shapes_are_refused(robot, call, sentence):
-    motion = ObservedMotions.of(robot, robot.rollout(robot.rest_state(), 3).q, robot.rest_state())
+    motion = dropped(robot, 3)
     with pytest.raises(wr.InputError, match=sentence):
         call(robot, motion, reconstruct(robot, motion))
+
+
+def test_a_folder_does_not_keep_searches(robot, tmp_path):
+    with pytest.raises(DataFileError, match="is a folder: give the path of a file"):
+        identify(robot, dropped(robot, 3), STIFF, kept=tmp_path)
+
+
+def dropped(robot, steps):
+    """A motion that begins undeformed, without velocity."""
+    return ObservedMotions.of(robot, robot.rollout(robot.rest_state(), steps).q, robot.rest_state())
 
 
 def longer(robot):
@@ -286,7 +324,7 @@ def longer(robot):
 
 
 def test_a_force_of_another_body_is_refused(robot):
-    motion = ObservedMotions.of(robot, robot.rollout(robot.rest_state(), 3).q, robot.rest_state())
+    motion = dropped(robot, 3)
     network = NetworkSettings(position_modes=1, velocity_modes=0, force_modes=1, width=2)
     force = fit_force(robot, motion, reconstruct(robot, motion), network=network, trainer=TrainerSettings(epochs=1))
     with pytest.raises(wr.InputError, match="a force on 24 vertices was learned, but the body has 28"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from ..data.markers import WHOLE_STATE, MarkerMap
+from ..data.trials import RESTING
 from ..dynamics.simulator import Simulator
 from ..energies.catalogue import read_material
 from ..energies.convex_material import ConvexMaterial
@@ -19,7 +20,7 @@ from ..learning.parameters import MASS_FACTOR, check_names, check_ranges, identi
 from ..learning.residuals.networks import core_factory
 from ..learning.residuals.reconstruction import make_reconstructor
 from ..mesh.selection import vertices_at
-from ..settings.data_kinds import ReleaseFromLoad
+from ..settings.data_kinds import RecordedData, ReleaseFromLoad
 from ..settings.learning import IdentifySettings, LawSettings
 from ..settings.performed import Trial
 from ..settings.run import RunSettings
@@ -103,6 +104,8 @@ def _check_learning(run: RunSettings, simulator: Simulator, trials: Sequence[Tri
     """Checks what is learned from the trials, and how these are read or played."""
     if run.markers is not None:
         Reader(run, trials, Path())
+    if run.recorded is not None:
+        _check_begins(run, run.recorded, {trial.begins for trial in trials})
     if run.is_laboratory:
         check_laboratory(run, trials)
     if run.published is not None:
@@ -115,6 +118,24 @@ def _check_learning(run: RunSettings, simulator: Simulator, trials: Sequence[Tri
     if run.identify is not None:
         with naming("identify."):
             _check_identification(run, run.identify, simulator, any(trial.session for trial in trials))
+
+
+def _check_begins(run: RunSettings, data: RecordedData, begins: set[str]) -> None:
+    """Checks what is estimated of releases, and that driven trials are as long as the horizons."""
+    if begins & {"held", "released"} and (sideways := run.release.sideways):
+        if data.rest != "held":
+            raise InputError(
+                f"release.sideways is {sideways:g} m, but data.rest is {data.rest}, which gives the markers on the "
+                "undeformed body: set release.sideways to 0."
+            )
+        if not any(run.gravity):
+            raise InputError("release.sideways is across gravity, but gravity is zero: set release.sideways to 0.")
+    if begins & {*RESTING} and data.steps is not None and data.horizons:
+        length = data.steps * run.time_step
+        if data.horizons[-1] > length + 1e-9:
+            raise InputError(
+                f"data.horizons is {list(data.horizons)}: they must rise, up to the {length:g} s of data.steps."
+            )
 
 
 def _check_identification(run: RunSettings, identify: IdentifySettings, simulator: Simulator, sessions: bool) -> None:

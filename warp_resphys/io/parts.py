@@ -13,6 +13,7 @@ from joblib.hashing import NumpyHasher
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from .errors import DataFileError
 from .fan_out import ALONE, Workers, fan_out
 from .progress import Progress
 from .resuming import StageContext
@@ -170,12 +171,17 @@ class Checkpoint:
 
     Attributes:
         parts: results of the finished parts by key.
+
+    Raises:
+        DataFileError: the path is that of a folder.
     """
 
     def __init__(self, path: str | Path | None, *depends_on: object) -> None:
         self.parts: dict[str, Any] = {}
         self._path = None if path is None else Path(path)
         if self._path is not None:
+            if self._path.is_dir():
+                raise DataFileError(f"{path} is a folder: give the path of a file for the finished searches.")
             self._fingerprint = _Hasher("md5").hash(depends_on)
             checkpoint = resume_checkpoint(self._path, "parts", self._fingerprint)
             self.parts = {} if checkpoint is None else checkpoint[1]["parts"]

@@ -27,17 +27,23 @@ _NOT_NEGATIVE: Final = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPE
 Limits = Bounds | tuple[float, float]
 
 
-def bounds_of(limits: Limits) -> Bounds:
-    """Returns bounds, also from a pair of numbers, which is logarithmic if both are positive.
+def ranges_of(parameters: Mapping[str, Limits]) -> dict[str, Bounds]:
+    """Returns the bounds of parameters, also from pairs of numbers, which are logarithmic if both are positive.
 
     Raises:
         InputError: neither.
     """
-    if isinstance(limits, Bounds):
-        return limits
-    if not isinstance(limits, Sequence) or len(limits) != 2:
-        raise InputError(f"a range is {limits!r}: give the smallest and the largest value, or Bounds.")
-    return Bounds(lower=limits[0], upper=limits[1], logarithmic=min(limits) > 0.0)
+    ranges = dict[str, Bounds]()
+    for name, limits in parameters.items():
+        if isinstance(limits, Bounds):
+            ranges[name] = limits
+            continue
+        with naming(f"parameters.{name}: "):
+            if isinstance(limits, str) or not isinstance(limits, Sequence) or len(limits) != 2:
+                raise InputError(f"a range is {limits!r}: give the smallest and the largest value, or Bounds.")
+            bounds = Bounds(lower=limits[0], upper=limits[1])
+        ranges[name] = bounds.changed(logarithmic=bounds.lower > 0.0)
+    return ranges
 
 
 def value_name(name: str, owner: str) -> str:

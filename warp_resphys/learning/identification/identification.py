@@ -16,16 +16,18 @@ import torch
 from ...data.rigid_bodies import independent
 from ...data.trials import RELEASED, RESTING, Trials
 from ...dynamics.simulator import Simulator
-from ...io.errors import ConvergenceError, checks_types
+from ...io.errors import ConvergenceError, checks_types, naming
 from ...io.parts import Checkpoint
-from ...settings.learning import Bounds
+from ...io.settings import parse
+from ...settings.learning import Bounds, IdentifySettings
 from ..observed_motions import ObservedMotions
 from ..parameters import (
     Limits,
-    bounds_of,
+    check_names,
     check_ranges,
     configured_parameters,
     identifiable_parameters,
+    ranges_of,
     split_name,
     value_name,
 )
@@ -65,7 +67,7 @@ def identify(
         motions: observed states or markers.
         parameters: range of every parameter to identify, by a name of `Replay.parameter_names`, in its unit. A pair of
             positive numbers is searched on a logarithmic scale.
-        first_guess: start of the search; the simulator's own values where left out.
+        first_guess: start of the search, which is brought into the ranges; the simulator's own values where left out.
         names: trials to identify from; all by default.
         held_out: other trials, whose own values follow from their first frames.
         accuracy: of marker places and the recording's frame, which are identified; None: they are exact.
@@ -79,17 +81,22 @@ def identify(
             anything that they depend on has changed. None: nothing is kept.
 
     Raises:
-        InputError: an unknown parameter, an empty range, or a motion in which nothing moves.
+        InputError: an unknown parameter, an empty range, a number out of range, or a motion in which nothing moves.
         ConvergenceError: the simulation fails at every start.
     """
     trials = motions.trials.chosen(names)
     motions.trials.rows(held_out)
-    ranges = {name: bounds_of(limits) for name, limits in parameters.items()}
-    check_ranges(simulator, ranges, identifiable_parameters(simulator), bool(motions.trials.sessions))
+    ranges, identifiable = ranges_of(parameters), identifiable_parameters(simulator)
+    check_ranges(simulator, ranges, identifiable, bool(motions.trials.sessions))
+    with naming("first_guess: "):
+        check_names(first_guess or {}, identifiable)
+    many = 4 * starts if candidates is None else candidates
+    numbers = {"starts": starts, "candidates": many, "max_evaluations": max_evaluations, "tolerance": tolerance}
+    parse(IdentifySettings, {**numbers, "seconds": seconds, "first_guess": {**(first_guess or {})}}, "identify")
     bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
     known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds]), **(first_guess or {})}
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}
-    seconds, many = _learned(motions, replays, seconds), 4 * starts if candidates is None else candidates
+    seconds = _learned(motions, replays, seconds)
     first_search = (guess, starts, many, seed)
     searched = (simulator, motions, bounds, trials, accuracy, seconds, first_search, max_evaluations, tolerance)
 

@@ -24,11 +24,11 @@ from ...dynamics.simulator import Simulator
 from ...energies.catalogue import LawContent, LawTest, TriedClass, make_material
 from ...energies.convex_material import ConvexMaterial
 from ...energies.materials import MASS_DAMPING
-from ...io.errors import InputError, checks_types
+from ...io.errors import InputError, checks_types, naming
 from ...io.parts import Checkpoint
 from ...settings.learning import Bounds, LawSettings, Prior
 from ..observed_motions import Identified, ObservedMotions
-from ..parameters import Limits, bounds_of
+from ..parameters import Limits, check_names, identifiable_parameters, ranges_of
 from .law import (
     VISCOSITIES,
     IdentifiedLaw,
@@ -89,12 +89,14 @@ def identify_law(
         kept: see `identify`.
 
     Raises:
-        InputError: the simulator has materials of regions.
+        InputError: the simulator has materials of regions, or a range is of an unknown parameter.
         ConvergenceError: the simulation fails at every start.
     """
     if "" not in simulator.materials:
         raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
-    ranges = {name: bounds_of(limits) for name, limits in (parameters or {}).items()}
+    ranges = ranges_of(parameters or {})
+    with naming("parameters: "):
+        check_names(ranges, identifiable_parameters(simulator))
     names = motions.trials.chosen(train)
     if motions.train_fraction < 1.0:
         learned = motions.train_fraction * float(motions.trials.times.max())
@@ -351,6 +353,6 @@ class _LawSearch:
         """Returns the range of a parameter of a law."""
         prior, modulus = None, self.ranges.get("youngs_modulus")
         if modulus is not None and modulus.prior is not None:
-            share = self.guess["c10"] / self.identified.parameters["youngs_modulus"]
+            share = self.guess["c10"] / self.known["youngs_modulus"]
             prior = Prior(mean=share * modulus.prior.mean, deviation=share * modulus.prior.deviation)
         return bounds_of_parameter(name, value, self.guess, 1.0 if self.motions.sees_states else _FURTHER, prior)

@@ -296,7 +296,13 @@ class Learned(Brief):
 
 
 def force_frames(simulator: Simulator, kind: str) -> VertexFrames | None:
-    """Returns the corotational frames of residual forces; None for forces in the world's frame (``world``)."""
+    """Returns the corotational frames of residual forces; None for forces in the world's frame (``world``).
+
+    Raises:
+        InputError: another kind.
+    """
+    if kind not in ("world", COROTATED):
+        raise InputError(f"force_frame is {kind!r}: choose world or {COROTATED}.")
     return VertexFrames(simulator.body, simulator.time_step, simulator.rest_positions) if kind == COROTATED else None
 
 

@@ -71,7 +71,7 @@ def fit_force(
         (S, N, 3) [N].
 
     Raises:
-        InputError: sizes that do not fit the motions.
+        InputError: sizes, or a number of reconstructed steps, that do not fit the motions.
     """
     others = [name for name in motions.trials.names if name not in validation]
     train = motions.trials.chosen(others if train is None else train)
@@ -169,6 +169,13 @@ class Fitting:
         if (given := arrays[0].shape[2]) != (wanted := len(self.simulator.rest_positions)):
             raise InputError(f"forces on {given} vertices were reconstructed, but the body has {wanted}: do so for it.")
         q, v, force, error = (torch.as_tensor(array, device=self.device) for array in arrays)
+        if trials.moving(names) and not self.data_driven:
+            steps = self.motions.learned_steps(int(trials.seconds(names) / self.simulator.time_step + 1e-6))
+            if len(q[0]) <= steps or error[:, steps + 1 :].isfinite().any():
+                raise InputError(
+                    f"forces of {len(q[0]) - 1} steps were reconstructed, but {names[0]} has {steps} of "
+                    f"{1e3 * self.simulator.time_step:g} ms: do so with this simulator and these motions."
+                )
         return q, v, force, error[:, 1:].isfinite()
 
     def new_network(self, train: Samples, settings: TrainingSettings) -> StateMap:

@@ -343,6 +343,7 @@ def test_values_by_the_name_of_an_obstacle():
     ("make", "message"),
     [
         (lambda: Contact({}), "needs an obstacle"),
+        (lambda: Contact({"a": {"shape": "sphere"}}), "the obstacle a is of type dict: give one, such as HalfSpace"),
         (lambda: Contact({"a": HalfSpace()}, friction=-0.1), "contact_friction.* -0.1"),
         (lambda: Contact({"a": HalfSpace()}, stiffness=0.0), "contact_stiffness.* 0"),
         (lambda: Contact({"a": HalfSpace()}, friction=[0.1, 0.2]), "contact_friction has 2 values for 1 obstacle"),

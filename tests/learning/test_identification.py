@@ -10,8 +10,9 @@ from support.refusals import refuses
 from support.slopes import differences
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
 from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
+from warp_resphys.io.errors import DataFileError
 from warp_resphys.learning.identification.misfit import Misfit
-from warp_resphys.learning.identification.search import first_points, search_parameters
+from warp_resphys.learning.identification.search import Identification, first_points, search_parameters
 from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, redundancy, uncertainty_of
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
@@ -96,6 +97,16 @@ def test_starts_are_the_first_guess_and_the_best_candidates():
     assert starts[0] == pytest.approx(FIRST)
     assert starts == first_points(misfit, FIRST, 3, 8, seed=0) != first_points(misfit, FIRST, 3, 8, seed=1)
     assert abs(np.log(starts[1]["youngs_modulus"] / 215e3)) < 0.5
+
+
+def test_identifications_of_other_versions_are_refused():
+    """Such as those with the values of trials by another key."""
+    for plain, key in (
+        ({"own": {"factor@bend": 1.1}}, "own"),
+        ({"parameters": {"density": "x"}}, r"parameters\.density"),
+    ):
+        with pytest.raises(DataFileError, match=f"^{key} is not of an identification of this version: identify again"):
+            Identification.from_plain(plain)
 
 
 def test_no_parameters_and_a_motion_that_stands_still_are_refused():

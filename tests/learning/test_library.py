@@ -15,6 +15,7 @@ from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Parts
 from warp_resphys.learning.comparison import Comparison, Model
 from warp_resphys.learning.identification.misfit import Misfit
+from warp_resphys.learning.observed_motions import Identified
 from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.residuals.fitting import Fitting, fit_force
 from warp_resphys.settings.learning import (
@@ -230,6 +231,8 @@ def test_representations_have_shapes_in_place_of_arrays(robot):
         "times=array (1, 26), observed=array (1, 26, 3, 3), held=array (1, 3, 3), "
     )
     assert "observe=SurfaceMarkers(vertices=array (3, 3), labels=('a', 'b', 'c'), weights=array" in repr(motion)
+    stiffness = {"youngs_modulus": np.float64(264123.4), "density": torch.tensor(1070.0)}
+    assert repr(Identified(stiffness)) == "Identified(parameters={'density': 1070, 'youngs_modulus': 264123})"
     found = reconstruct(robot, motion)
     assert repr(found) == "ReconstructedTrials(names=('motion 0',), read=partial)"
     network = NetworkSettings(position_modes=1, velocity_modes=0, force_modes=1, width=2)

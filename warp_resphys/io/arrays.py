@@ -36,7 +36,9 @@ class _Shapes(reprlib.Repr):
     @override
     def repr1(self, x: Any, level: int) -> str:
         shape = getattr(x, "shape", None)
-        return super().repr1(x, level) if shape is None else f"array {tuple(shape)}"
+        if shape is None:
+            return super().repr1(x, level)
+        return f"array {tuple(shape)}" if len(shape) else super().repr1(x.item(), level)
 
     @override
     def repr_instance(self, x: Any, level: int) -> str:

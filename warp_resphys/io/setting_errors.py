@@ -124,7 +124,7 @@ def _unknown(place: _Place, where: str) -> str:
         if name in other and "kind" in other and "kind" in kinds[0]:
             kind = _words_of(other["kind"])[0]
             return f"{key} is a setting of kind {kind}, not of {group.value['kind']}: remove it with ~{key}."
-    near, every = list(kinds[0]) if kinds else [], list(keys(place.schema))
+    near, every = list(kinds[0]) if kinds else [], list(dict.fromkeys(keys(place.schema)))
     same = [known for known in every if known.rpartition(".")[2] == name]
     hint = did_you_mean(name, same, same) or did_you_mean(name, near) or did_you_mean(_dotted(place.path), every)
     hint = hint or f": {_dotted(group.path, where) or 'a configuration'} has {', '.join(near)}."

@@ -34,7 +34,7 @@ import torch
 from typing_extensions import override
 
 from ...fem.integration_points import Points
-from ...io.errors import InputError, listed
+from ...io.errors import InputError, in_short, listed
 from ...mesh.volume_mesh import Mesh
 from ...settings.contact import Obstacle, SurfaceFile
 from ...stepping.quantity import Parameter, Quantity
@@ -89,6 +89,9 @@ class Contact(Energy):
         """Checks the values."""
         if not self.obstacles:
             raise InputError("contact needs an obstacle or more: give them by name.")
+        for name, obstacle in self.obstacles.items():
+            if not isinstance(obstacle, Obstacle):
+                raise InputError(f"the obstacle {name} is {in_short(obstacle)}: give one, such as HalfSpace(axis=...).")
         grids = {name: DistanceGrid.of_file(o) for name, o in self.obstacles.items() if isinstance(o, SurfaceFile)}
         object.__setattr__(self, "obstacles", {**self.obstacles, **grids})
         for name in ("distance", "slip_speed"):

@@ -13,14 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from ...io.arrays import FloatArray
-from ...io.errors import ConvergenceError
+from ...io.errors import ConvergenceError, DataFileError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress
 from ...io.safe_files import read_json
@@ -52,6 +52,8 @@ class Identification(Identified):
         first_guess: start of the search.
     """
 
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
+
     loss: float = math.nan
     history: Sequence[Sequence[Mapping[str, float]]] = ()
     at_bounds: tuple[str, ...] = ()
@@ -71,8 +73,16 @@ class Identification(Identified):
 
     @staticmethod
     def from_plain(plain: Any) -> "Identification":
-        """Returns the identification that `plain` wrote."""
-        return _PLAIN.validate_python(plain)
+        """Returns the identification that `plain` wrote.
+
+        Raises:
+            DataFileError: another version wrote it.
+        """
+        try:
+            return _PLAIN.validate_python(plain)
+        except ValidationError as error:
+            key = ".".join(map(str, error.errors()[0]["loc"]))
+            raise DataFileError(f"{key} is not of an identification of this version: identify again.") from error
 
     @classmethod
     def read(cls, path: Path) -> "dict[str, Identification]":

@@ -102,7 +102,7 @@ def test_gradients_with_fibres(kind, taut):
         end = s.rollout(State(given["q"], 0.0 * start), 3, inputs, parameters)
         return (weights * end.q[-1]).sum()
 
-    check_slopes(loss, values, {name: 1e-4 * float(value.abs().mean()) for name, value in values.items()})
+    check_slopes(loss, values, {name: 2e-5 * float(value.abs().mean()) for name, value in values.items()})
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from support.refusals import refuses
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.fan_out import WorkerError, WorkerFaultError, Workers, fan_out
 
@@ -76,12 +75,14 @@ def fails(task):
     ],
 )
 def test_an_error_ends_the_work(task, error, message, workers, tmp_path):
-    refuses(error, message, done, fails, ["", task, ""], workers, tmp_path)
+    with pytest.raises(error, match=message):
+        done(fails, ["", task, ""], workers, tmp_path)
 
 
 @pytest.mark.slow
 def test_a_task_that_always_kills_its_worker_is_an_error(tmp_path):
-    refuses(WorkerError, "3 times in a row", done, fails, ["", "killed"], Workers(2), tmp_path)
+    with pytest.raises(WorkerError, match="3 times in a row"):
+        done(fails, ["", "killed"], Workers(2), tmp_path)
 
 
 def dies_once(task):

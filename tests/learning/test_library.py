@@ -310,9 +310,15 @@ def test_arguments_of_wrong_types_and_shapes_are_refused(robot, call, sentence):
         call(robot, motion, reconstruct(robot, motion))
 
 
-def test_a_folder_does_not_keep_searches(robot, tmp_path):
+def test_searches_are_kept_in_a_file_if_they_depend_on_what_modules_have(robot, tmp_path):
     with pytest.raises(DataFileError, match="is a folder: give the path of a file"):
         identify(robot, dropped(robot, 3), STIFF, kept=tmp_path)
+
+    class Local(wr.Corotated):
+        pass
+
+    with pytest.raises(wr.InputError, match=r"no part of a module .*Local.*: define it at the top of a file"):
+        identify(replace(robot, material=Local(2e5)), dropped(robot, 3), STIFF, kept=tmp_path / "kept.safetensors")
 
 
 def dropped(robot, steps):

@@ -177,7 +177,7 @@ REFUSED = [
             lambda at=at: select_vertices(BEAM, x=at),
             r"select_vertices\.x is .*: it must be (two rising|a number or two)",
         )
-        for at in ([0.02, 0.01], [0.0, 0.01, 0.02], [], float("nan"), [0.0, float("inf")])
+        for at in ("base", [0.02, 0.01], [0.0, 0.01, 0.02], [], float("nan"), [0.0, float("inf")])
     ),
     (lambda: read_mesh(__file__, units="inch"), "m, cm, mm, not inch"),
     (lambda: read_mesh(__file__, order=3), "order of a mesh must be 1 or 2, not 3"),

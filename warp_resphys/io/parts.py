@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from pickle import PicklingError
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from joblib.hashing import NumpyHasher
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from .errors import DataFileError
+from .errors import DataFileError, InputError
 from .fan_out import ALONE, Workers, fan_out
 from .progress import Progress
 from .resuming import StageContext
@@ -174,6 +175,7 @@ class Checkpoint:
 
     Raises:
         DataFileError: the path is that of a folder.
+        InputError: the work depends on a class or function that is defined within a function.
     """
 
     def __init__(self, path: str | Path | None, *depends_on: object) -> None:
@@ -182,7 +184,13 @@ class Checkpoint:
         if self._path is not None:
             if self._path.is_dir():
                 raise DataFileError(f"{path} is a folder: give the path of a file for the finished searches.")
-            self._fingerprint = _Hasher("md5").hash(depends_on)
+            try:
+                self._fingerprint = _Hasher("md5").hash(depends_on)
+            except PicklingError as error:
+                raise InputError(
+                    f"{path} cannot keep searches with a class or function that is no part of a module "
+                    f"({error.args[0]}): define it at the top of a file, or leave kept out."
+                ) from error
             checkpoint = resume_checkpoint(self._path, "parts", self._fingerprint)
             self.parts = {} if checkpoint is None else checkpoint[1]["parts"]
 

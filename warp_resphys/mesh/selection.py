@@ -31,7 +31,7 @@ def select_vertices(
         MeshError: No coordinate, or no vertex lies there.
     """
     coordinates = {"x": x, "y": y, "z": z}
-    values = {axis: np.asarray(at, dtype=np.float64).tolist() for axis, at in coordinates.items() if at is not None}
+    values = {axis: np.asarray(at).tolist() for axis, at in coordinates.items() if at is not None}
     return vertices_at(mesh, parse(Place, {**values, "tolerance": tolerance}, "select_vertices"))
 
 

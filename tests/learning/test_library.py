@@ -301,6 +301,10 @@ def test_invalid_motions_are_refused(robot):
         (lambda r, m, f: identify(r, m, STIFF, starts=0), "starts is 0: it must be a whole number, one or more"),
         (lambda r, m, f: identify(r, m, STIFF, max_evaluations=0), "max_evaluations is 0: it must be a whole number"),
         (lambda r, m, f: identify(r, m, {"density": ("a", 1.0)}), r"parameters\.density: Bounds\.lower is 'a'"),
+        (
+            lambda r, m, f: identify_law(r, m, known={"model": "law", "constants": {}}),
+            "known has model, constants: a law",
+        ),
         (lambda r, m, f: identify_law(r, m, {"colour": (1.0, 2.0)}), "parameters: there is no parameter 'colour'"),
     ],
 )

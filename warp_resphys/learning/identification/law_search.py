@@ -89,11 +89,13 @@ def identify_law(
         kept: see `identify`.
 
     Raises:
-        InputError: the simulator has materials of regions, or a range is of an unknown parameter.
+        InputError: the simulator has materials of regions, a range of an unknown parameter, or a law of another version.
         ConvergenceError: the simulation fails at every start.
     """
     if "" not in simulator.materials:
         raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
+    if known is not None and not {"model", "parameters"} <= {*known}:
+        raise InputError(f"known has {', '.join(known)}: a law of this version has model and parameters.")
     ranges = ranges_of(parameters or {})
     with naming("parameters: "):
         check_names(ranges, identifiable_parameters(simulator))

@@ -89,7 +89,7 @@ def identify_law(
         kept: see `identify`.
 
     Raises:
-        InputError: the simulator has materials of regions, a range of an unknown parameter, or a law of another version.
+        InputError: materials of regions, a range of an unknown parameter, or a law of another version.
         ConvergenceError: the simulation fails at every start.
     """
     if "" not in simulator.materials:

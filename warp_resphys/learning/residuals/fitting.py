@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from ...data.trials import STATIC
+from ...data.trials import GIVEN, RESTING, STATIC
 from ...dynamics.modes import RestStiffness
 from ...dynamics.simulator import Simulator
 from ...io.errors import InputError, checks_types
@@ -169,14 +169,23 @@ class Fitting:
         if (given := arrays[0].shape[2]) != (wanted := len(self.simulator.rest_positions)):
             raise InputError(f"forces on {given} vertices were reconstructed, but the body has {wanted}: do so for it.")
         q, v, force, error = (torch.as_tensor(array, device=self.device) for array in arrays)
-        if trials.moving(names) and not self.data_driven:
-            steps = self.motions.learned_steps(int(trials.seconds(names) / self.simulator.time_step + 1e-6))
-            if len(q[0]) <= steps or error[:, steps + 1 :].isfinite().any():
-                raise InputError(
-                    f"forces of {len(q[0]) - 1} steps were reconstructed, but {names[0]} has {steps} of "
-                    f"{1e3 * self.simulator.time_step:g} ms: do so with this simulator and these motions."
-                )
+        steps = None if self.data_driven else self._steps(names)
+        if steps is not None and len(q[0]) != steps + 1:
+            raise InputError(
+                f"forces of {len(q[0]) - 1} steps were reconstructed, but {names[0]} has {steps} of "
+                f"{1e3 * self.simulator.time_step:g} ms: do so with this simulator and these motions."
+            )
         return q, v, force, error[:, 1:].isfinite()
+
+    def _steps(self, names: Sequence[str]) -> int | None:
+        """Number of steps of trials that are learned from; None if delays, smoothing or other trials determine it."""
+        trials, release = self.motions.trials, self.motions.release
+        begins = trials.begin_of(names[0])
+        exact = begins == GIVEN or (begins in RESTING and trials.smoothed is None and release.delay == 0.0)
+        lengths = {trials.seconds([name]) for name in trials.names}
+        if not exact or len(lengths) > 1:
+            return None
+        return self.motions.learned_steps(int(lengths.pop() / self.simulator.time_step + 1e-6))
 
     def new_network(self, train: Samples, settings: TrainingSettings) -> StateMap:
         """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""

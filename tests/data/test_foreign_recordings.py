@@ -164,3 +164,24 @@ def test_a_changed_byte_that_crashes_the_decoder_or_makes_it_claim_memory_or_tim
     for limit, given in limits.items():
         monkeypatch.setattr(decoding, limit, given)
     refuses(DataFileError, rf"whole\.c3d cannot be decoded \(.*{message}\): copy", read_recording, path)
+
+
+def test_uneven_times_are_sampled_again(tmp_path, caplog):
+    """Positions are linear between lines, inputs hold, a long gap is an occlusion, and a last line may be cut off."""
+    lines = ["t, X, Y, Z, p", *(f"{t}, {20.0 * t}, 0, 0, {p}" for t, p in ((5.0, 1), (5.03, 2), (5.11, 3), (5.13, 4)))]
+    lines += [f"{t}, {20.0 * t}, 0, 0, 5" for t in (5.45, 5.5)]
+    path = tmp_path / "loop.csv"
+    path.write_text("\n".join([*lines, "5.55, 11.1, 0"]))
+    names = {"t": "time [s]", "X": "a.x [mm]", "Y": "a.y [mm]", "Z": "a.z [mm]", "p": "p [kPa]"}
+    read = read_recording(path, table=TableSettings(names=names, rate=20.0))
+    times = 5.0 + 0.05 * np.arange(11)
+    expected = np.where((times > 5.14) & (times < 5.44), np.nan, 0.02 * times)
+    np.testing.assert_allclose(read.positions[:, 0, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(read.actuation[:, 0], 1e3 * np.array([1, 2, 2, 4, 4, 4, 4, 4, 4, 5, 5]))
+    assert (read.rate, read.start) == (20.0, 5.0)
+    assert "loop.csv: the last line, 8, is cut off, and left out." in caplog.text
+    path.write_text("\n".join(lines))
+    refuses(DataFileError, "the frames are not evenly spaced", read_recording, path, table=TableSettings(names=names))
+    path.write_text("\n".join([*lines[:3], lines[1], *lines[3:]]))
+    sampled = TableSettings(names=names, rate=20.0)
+    refuses(DataFileError, "line 4: the time or frame does not rise", read_recording, path, table=sampled)

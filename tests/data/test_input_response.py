@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from warp_resphys.data.input_response import InputResponse, with_means
+from warp_resphys.data.input_response import InputResponse, response_of, with_means
+from warp_resphys.stepping.quantity import Quantity
 
 STEP = 0.01
 
@@ -127,3 +128,28 @@ def test_gears_turn_back_after_their_backlash():
     np.testing.assert_allclose(result.detach(), np.stack([2.0 * commands[:, 0, 0], expected], 1))
     (slope,) = torch.autograd.grad(result.sum(), widths)
     np.testing.assert_allclose(slope, [2.0 * 4, 2.0 * 4])  # in as many steps the gears have turned back
+
+
+@pytest.mark.parametrize("word", ["factor", "delay", "rise", "slew", "dead_band", "zero", "backlash", "slope_2"])
+def test_a_part_with_a_value_of_its_own_responds_as_if_all_had_it(word):
+    commands = np.random.default_rng(2).random((20, 3, 2)) * 2.0
+    common = {"factor": 0.8, "delay": 0.013, "rise": 0.03, "slew": 0.1, "dead_band": 0.05, "zero": 0.1}
+    common |= {"backlash": 0.1, "slope_2": 1.2}
+    value = {"delay": 0.035}.get(word, 1.5 * common[word])
+    pressure = Quantity("pressure", "Pa", per="chamber")
+    known = {f"pressure_{name}": x for name, x in common.items()} | {f"pressure_{word}_2": value}
+    arguments = response_of(pressure, known, ("1", "2"))
+    np.testing.assert_array_equal(arguments[word], [common[word], value])
+    alone = [InputResponse(STEP, **{**common, word: x}).from_rest(commands)[0] for x in (common[word], value)]
+    expected = np.stack([of_all[..., part] for part, of_all in enumerate(alone)], -1)
+    np.testing.assert_allclose(InputResponse(STEP, **arguments).from_rest(commands)[0], expected, atol=1e-12)
+    tensors = {name: torch.full((3,), x, dtype=torch.float64) for name, x in known.items()}
+    result, _ = InputResponse(STEP, **response_of(pressure, tensors, ("1", "2"))).from_rest(torch.as_tensor(commands))
+    np.testing.assert_allclose(result, expected, atol=1e-12)
+
+
+def test_other_parts_have_the_value_without_an_effect():
+    known = {"tension_factor_left": 2.0, "tension_delay_right": 0.1}
+    arguments = response_of(Quantity("tension", "N"), known, ("left", "right"))
+    np.testing.assert_array_equal(arguments["factor"], [2.0, 1.0])
+    np.testing.assert_array_equal(arguments["delay"], [0.0, 0.1])

@@ -257,3 +257,11 @@ def test_ambiguous_markers_are_named_and_ambiguous_assignments_refused():
     refuses(InputError, "both must be", assign, seen(), PLACES[:4], LETTERS, source="file")
     with pytest.raises(DataFileError, match="no three of its markers stand as those"):
         assign(10.0 * seen(), PLACES, LETTERS, source="file")
+
+
+def test_without_markers_the_origin_is_that_of_the_recording():
+    points, rotation = shifted(["x", "z", "-y"])
+    result = register_markers(points, NOMINAL, NAMES, source=SOURCE, use=(), rotation=rotation)
+    np.testing.assert_allclose(result.positions, points @ rotation.T)
+    assert np.isnan(result.residual).all()
+    assert not result.inliers.any()

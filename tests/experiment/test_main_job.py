@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -25,7 +26,10 @@ from warp_resphys.io.progress import Progress
 from warp_resphys.io.resuming import fingerprint, package_versions
 from warp_resphys.io.safe_files import read_checkpoint, read_hdf5
 from warp_resphys.learning.baselines import BASELINES
+from warp_resphys.learning.residuals.correction import Learned
+from warp_resphys.learning.residuals.networks import NextState
 from warp_resphys.learning.residuals.reconstruction import LBFGSB
+from warp_resphys.robot.description import finished_experiment
 
 LEARNED_FILES = (("", "safetensors"), ("training_", "json"))
 
@@ -88,6 +92,15 @@ class TestCompleteRun:
         _, metadata = read_checkpoint(finished[0] / "resphys.safetensors", "residual force")
         assert metadata.items() >= kept.items()
         assert metrics(finished[0])["networks"]["resphys"] == kept
+
+    def test_a_force_that_is_no_clear_gain_is_not_used(self, finished, monkeypatch):
+        experiment = finished_experiment(finished[0])
+        learned = experiment.learned("resphys")
+        refused = replace(learned, test={**learned.test, "used": False})
+        monkeypatch.setattr(Learned, "read", lambda *_: refused)
+        assert experiment.model("resphys").learned is None
+        monkeypatch.setattr(Learned, "read", lambda *_: replace(refused, network=NextState.__new__(NextState)))
+        assert experiment.learned("simfree") is not None
 
     def test_the_second_call_runs_nothing(self, finished):
         _, first, second = finished

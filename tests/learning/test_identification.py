@@ -13,7 +13,8 @@ from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, 
 from warp_resphys.io.errors import DataFileError
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.search import Identification, first_points, search_parameters
-from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, redundancy, uncertainty_of
+from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, uncertainty_of
+from warp_resphys.learning.metrics import redundancy
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
 from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.settings.learning import Bounds, Prior

@@ -176,11 +176,15 @@ class TestInTheLoop:
         exact = simulated(Replay(simulator(), MARKERS, motions), release)
         other = MotionLoss([TrialGroup(exact, release, LOADS)], {})
         config, seen = CONFIG.changed(epochs=3), []
-        assert cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1)) == 3
+        epochs, (before, after) = cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1))
+        assert epochs == 3
+        assert len(before) == len(after) == len(motions.names)
+        assert np.mean([row.mean() for row in before]) == pytest.approx(loss.error_mm(None), rel=1e-9)
+        assert np.mean([row.mean() for row in after]) < np.mean([row.mean() for row in before])
         assert len(seen) == 3
         for patience, spent in ((2, 2), (9, 3)):
             seen.clear()
-            chosen = cross_validated_epochs(
+            chosen, _ = cross_validated_epochs(
                 network, [(loss, other)], config.changed(patience=patience), lambda: seen.append(1)
             )
             assert (chosen, len(seen)) == (0, spent)
@@ -190,7 +194,7 @@ class TestInTheLoop:
             histories.append([record["rollout_error_mm"] for record in alone.history])
         parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
         mean = np.average(histories, axis=0, weights=[2, 1])
-        assert 0 < np.argmin(mean) == cross_validated_epochs(network, parts, config, lambda: None)
+        assert 0 < np.argmin(mean) == cross_validated_epochs(network, parts, config, lambda: None)[0]
         trainer = InTheLoop(network(), loss, loss, config, epochs=0)
         trainer.begin()
         assert trainer.finished

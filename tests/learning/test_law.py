@@ -15,10 +15,11 @@ from warp_resphys.energies import make_material
 from warp_resphys.energies.catalogue import unit_of
 from warp_resphys.energies.materials import Corotated
 from warp_resphys.learning.identification.law import LawClass, _parameters, branches_of, fit_classes, strong_names
-from warp_resphys.learning.identification.law_scores import Score, tried_without_states
+from warp_resphys.learning.identification.law_scores import tried_without_states
 from warp_resphys.learning.identification.law_search import identify_law
 from warp_resphys.learning.identification.weak_form import KnownMotion, NormalEquations, WeakForm
 from warp_resphys.learning.observed_motions import ObservedMotions
+from warp_resphys.learning.scores import Score
 from warp_resphys.settings.learning import LawSettings
 
 MESH = box_hexahedra((0.08, 0.02, 0.02), (4, 1, 1))

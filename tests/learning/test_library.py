@@ -10,7 +10,7 @@ import warp_resphys as wr
 from support.refusals import refuses
 from warp_resphys import ObservedMotions, evaluate, identify, identify_law, reconstruct
 from warp_resphys.data.markers import WHOLE_STATE
-from warp_resphys.io.errors import DataFileError
+from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Parts
 from warp_resphys.learning.comparison import Comparison, Model
@@ -127,6 +127,30 @@ def test_trials_have_their_values_sessions_their_places_and_finished_searches_ar
         identified(tolerance=1e-3)
 
 
+def test_each_tendon_may_have_a_factor_of_its_own():
+    routes = {side: [[x, y, 0.02] for x in (0.0, 0.05, 0.1)] for side, y in (("left", 0.0), ("right", 0.02))}
+    body = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[wr.Tendons(routes)])
+    simulator = wr.Simulator(body, wr.Corotated(264e3, 0.45, density=1070.0, stiffness_damping=3e-3))
+    ramp = torch.linspace(0.0, 1.0, 15, dtype=torch.float64)[:, None, None]
+    tension = ramp * torch.tensor([[0.3, 0.0], [0.1, 0.3]], dtype=torch.float64)
+    start, factors = simulator.rest_state(batch=2), torch.tensor([1.4, 0.8], dtype=torch.float64)
+    q = simulator.rollout(start, 15, wr.Inputs(tendon_tension=factors * tension)).q
+    motions = ObservedMotions.of(simulator, q, start, wr.Inputs(tendon_tension=tension))
+    ranges = {"tendon_tension_factor": Bounds(lower=0.5, upper=2.0, per="part")}
+    found = identify(simulator, motions, ranges, {"tendon_tension_factor": 1.1})
+    assert found.first_guess == {"tendon_tension_factor_left": 1.1, "tendon_tension_factor_right": 1.1}
+    assert found.parameters == pytest.approx(
+        {"tendon_tension_factor_left": 1.4, "tendon_tension_factor_right": 0.8}, rel=1e-3
+    )
+    assert evaluate(simulator, motions, parameters=found.parameters).max() < 1e-6
+    alone = {"tendon_tension_factor_left": Bounds(lower=0.5, upper=2.0)}
+    assert identify(simulator, motions, alone).parameters["tendon_tension_factor_left"] > 1.2
+    with pytest.raises(InputError, match=r"youngs_modulus.per is part, but the body has no parts with a young"):
+        identify(simulator, motions, {"youngs_modulus": Bounds(lower=1e5, upper=1e6, per="part")})
+    with pytest.raises(InputError, match=r"no parameter 'slack'.*or those of a part, such as tendon_"):
+        identify(simulator, motions, {"slack": (0.1, 1.0)})
+
+
 def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     wrong = beam(200e3)
     seen = let_go(robot, 0.04, 0.07, 0.1, 0.13, known_start=True)
@@ -154,6 +178,25 @@ def test_a_learned_force_beats_the_simulator_on_a_motion_it_has_not_seen(robot):
     assert evaluate(wrong, unseen, judged).mean() < 0.2 * uncorrected.mean()
     held_out = 1e3 * evaluate(wrong, seen, judged, names=["motion 3"])[1:].mean()
     assert judged.training["kept"]["validation_rollout_error_mm"] == pytest.approx(held_out, rel=1e-6)
+    without = 1e3 * evaluate(wrong, seen, names=["motion 3"])[1:].mean()
+    assert (judged.test["used"], judged.test["split"], judged.test["trials"]) == (True, "validation", ["motion 3"])
+    assert (judged.test["error_mm"], judged.test["below_mm"]) == pytest.approx((held_out, without), rel=1e-6)
+
+
+def test_a_force_that_is_no_gain_on_left_out_motions_is_not_used(robot, caplog):
+    """The motions are those of the simulator, with noise of the points that a network can learn by heart alone."""
+    seen = let_go(robot, 0.04, 0.07, 0.1, known_start=True)
+    noise = 2e-4 * np.random.default_rng(0).standard_normal(seen.trials.observed[:, 1:].shape)
+    noisy = np.concatenate([seen.trials.observed[:, :1], seen.trials.observed[:, 1:] + noise], 1)
+    seen = replace(seen, trials=replace(seen.trials, observed=noisy))
+    network = NetworkSettings(position_modes=3, velocity_modes=3, force_modes=4, layers=1, width=16)
+    trainer = TrainerSettings(epochs=20, rollout_every=5)
+    test = fit_force(robot, seen, reconstruct(robot, seen), network=network, trainer=trainer).test
+    assert test["trials"] == [*seen.trials.names]
+    assert test["split"] == "left-out training"
+    assert test["error_mm"] > test["below_mm"] > 0.1
+    assert not test["used"]
+    assert "fit_force: the network is no clear gain: on the left-out training trials" in caplog.text
 
 
 def test_the_network_has_the_actuation_as_input():

@@ -24,7 +24,7 @@ from warp_resphys.report.identification_section import parameter_rows, placement
 from warp_resphys.report.page import Cell, PageTable, Row
 from warp_resphys.report.run_page import range_table
 from warp_resphys.report.wording import MINUS, NO_BREAK_SPACE, NONE
-from warp_resphys.settings.learning import Bounds
+from warp_resphys.settings.learning import IdentifySettings
 
 TIMES = "\N{MULTIPLICATION SIGN}"
 DOWN = np.array([0.0, 0.0, -9.8])
@@ -129,6 +129,7 @@ class TestIdentification:
             ("tendon_contraction_dead_band", 0.003, "Tendon contraction dead band [mm]", "3"),
             ("muscle_contraction_dead_band", 0.03, "Muscle contraction dead band [%]", "3"),
             ("pressure_slope_3", 2.0, "Pressure slope 3", "2"),
+            ("pressure_delay_1", 0.02, "Pressure delay 1 [ms]", "20"),
             ("tip_youngs_modulus", 2e5, "Tip Young's modulus [kPa]", "200"),
             ("obstacle_turn_x_bar", np.pi / 180, "Obstacle turn x bar [°]", "1"),
             ("unknown", 2.0, "Unknown", "2"),
@@ -139,11 +140,11 @@ class TestIdentification:
         assert (row.head, row.cells[1].text) == (head, text)
 
     def test_what_the_data_cannot_tell(self, identified):
-        said = uncertainty_text("sysid", identified, {}).replace(NO_BREAK_SPACE, " ")
+        said = uncertainty_text("sysid", identified, None).replace(NO_BREAK_SPACE, " ")
         assert said == "SysID: stiffness damping is least certain (3.4 % of the range)."
-        assert uncertainty_text("sysid", replace(identified, uncertainty=None), {}) == ""
+        assert uncertainty_text("sysid", replace(identified, uncertainty=None), None) == ""
         tied = replace(identified.uncertainty, poorest_deviation=1.9, correlation=[[1.0, -0.95], [-0.95, 1.0]])
-        said = uncertainty_text("sysid", replace(identified, uncertainty=tied), {})
+        said = uncertainty_text("sysid", replace(identified, uncertainty=tied), None)
         assert "the data do not constrain stiffness damping: set a prior." in said
         assert f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)" in said
 
@@ -151,8 +152,8 @@ class TestIdentification:
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):
         identified.uncertainty.deviation["youngs_modulus"] = deviation
         prior = {"mean": 250e3, "deviation": 10e3}
-        ranges = {"youngs_modulus": parse(Bounds, {"lower": 5e4, "upper": 2e6, "prior": prior})}
-        said = uncertainty_text("sysid", identified, ranges)
+        ranges = {"youngs_modulus": {"lower": 5e4, "upper": 2e6, "prior": prior}}
+        said = uncertainty_text("sysid", identified, parse(IdentifySettings, {"parameters": ranges}))
         assert said.endswith("do not constrain Young's modulus beyond its prior (250 ± 10 kPa).") is not informs
 
     def test_where_markers_and_recordings_lie(self):

@@ -9,7 +9,7 @@ import pytest
 from support.configured import settings
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.baselines import BASELINES
-from warp_resphys.report.data import trial_errors, untrained
+from warp_resphys.report.data import trial_errors, unused
 from warp_resphys.report.page import write_page
 from warp_resphys.report.verdict import LEAST_TRIALS, results_table, verdict
 from warp_resphys.report.wording import NO_BREAK_SPACE, model_words
@@ -116,13 +116,20 @@ class TestSentences:
 
     def test_what_diverged_or_was_not_trained(self):
         errors = {**self.ERRORS, "sysid": [None, 0.5, 0.7, 0.6, 0.5]}
-        networks = {"resphys": {"epoch": 0}, "simfree": {"epoch": 3}}
-        _, check, use = sentences(errors, networks=networks)
-        assert "SysID diverged in 1 of 5 trials; no epoch of the training of ResPhys lowered the validation" in check
+        tests = [
+            {"trials": ["a"], "split": "validation", "error_mm": 46.0, "below_mm": 11.0, "used": x}
+            for x in (False, True)
+        ]
+        networks = {"resphys": {"test": tests[0]}, "simfree": {"test": tests[1]}}
+        _, why, check, use = sentences(errors, networks=networks)
+        assert why == (
+            "ResPhys is not used: on the validation trials (a) it has 46 mm, and the simulator without it has 11 mm."
+        )
+        assert check.startswith("Check before use: SysID diverged in 1 of 5 trials")
         assert use == "Use the uncorrected simulator."
         assert table_of(errors)["+ identified parameters (SysID)"] == (["1 of 5 diverged"], "")
-        folds = {"a": {"networks": networks}, "b": {"networks": {"simfree": {"epoch": 1}}}}
-        assert untrained({"folds": folds}) == {"resphys"}
+        folds = {"a": {"networks": networks}, "b": {"networks": {"resphys": {"test": tests[0]}}}}
+        assert unused({"folds": folds}) == {"resphys": "it is clearly closer in none of the 2 folds"}
         assert sentences({"resphys": [None]})[0] == "All models diverged."
         assert sentences({"reconstruction": [0.1]}) == []
 

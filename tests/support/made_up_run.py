@@ -33,7 +33,8 @@ def _write_trainings(folder, models):
     ]
     for record in epochs[4::5]:
         record["rollout_error_mm"] = 1.0 / record["epoch"]
-    kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.2}
+    test = {"trials": ["bare"], "split": "validation", "error_mm": 0.2, "below_mm": 0.5, "used": True}
+    kept = {"epoch": 30, "selection": "rollout", "validation_rollout_error_mm": 0.2, "test": test}
     for model in {"simfree", "resphys_uncorrected", "resphys"} & set(models):
         write_json(folder / f"training_{model}.json", {"kept": kept, "epochs": epochs})
 

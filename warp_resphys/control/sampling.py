@@ -132,7 +132,7 @@ def check_plannable(robot: Robot) -> None:
     """
     driven = driven_input(robot)
     for word in ("slew", "dead_band", "zero", "backlash", *SLOPES):
-        if f"{driven.name}_{word}" in robot.parameters:
+        if any(f"{name}_".startswith(f"{driven.name}_{word}_") for name in robot.parameters):
             raise InputError(
                 f"{driven.name}_{word} is identified, but plans need an input without slew rate, curve, dead band, "
                 "zero or backlash: take it out of identify.parameters, or set control=none."
@@ -157,7 +157,7 @@ class Source:
         self.filters = robot.description.filters if self.learned is not None else ()
         values = {name: float(value[0]) for name, value in robot.parameters.items()}
         self.range, self.moving = np.stack([self._low, self._high]), np.flatnonzero(self._high > self._low)
-        self.acts = response_of(driven.quantity, values)
+        self.acts = response_of(driven.quantity, values, driven.parts)
         self.response = InputResponse(robot.time_step, **self.acts)
         reach = np.abs(self.response.scaled(np.stack([self._low, self._high]))).max(0)
         self.scale = np.where(reach > 0.0, reach, 1.0)

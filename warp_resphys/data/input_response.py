@@ -23,10 +23,11 @@ from ..stepping.quantity import Quantity
 
 Array = Any  # of NumPy or torch
 Memory = Mapping[str, Array]
-Number = torch.Tensor | float | None
+Number = torch.Tensor | FloatArray | float | None
 
 SLOPES = tuple(f"slope_{k}" for k in range(1, 9))  # of the characteristic curve, in octaves of the typical command
 RESPONSES = ("factor", "delay", "rise", "slew", "dead_band", "zero", "backlash", *SLOPES)  # of an input to its commands
+UNITS = ("factor", *SLOPES)  # that are one where they have no effect; the others are zero
 _FIRST_KNOT = 0.25  # of the typical command, where the second slope begins; the next knots are each twice as large
 _ROUNDED = 0.1  # of a knot: width over which the slope changes
 _LEAST_SLEW = 1e-12  # s/unit
@@ -133,25 +134,25 @@ class InputResponse:
     internal variables of Maxwell elements driven by the input: the creep of a viscoelastic body depends on the duration
     of an input, which the state does not contain.
 
+    Parameters are numbers, (1 or B,) for commands (T, B, C), or (1 or B, C) and (C,) where parts differ.
+
     Args:
         time_step: h [s].
-        factor: on the commands; a number, or (1 or B,) for commands (T, B, C); None for no factor.
+        factor: on the commands; None for no factor.
         delay: zero or more [s], not differentiable at whole numbers of steps; None for no delay.
         rise: time constant of the lag [s]; None for no lag.
         slew: reciprocal of the slew rate [s/unit], the largest change of the input in a second, as of a valve whose
-            flow is choked; a number, or (1 or B,). None or zero for no limit.
+            flow is choked. None or zero for no limit.
         dead_band: largest command without an effect, as of a tendon that hangs slack; larger ones act less by it. Zero
-            or more; a number, or (1 or B,). None for none.
-        zero: command at which nothing acts, as of a gauge or a winch that was not zeroed; a number, or (1 or B,). None
-            for zero.
+            or more. None for none.
+        zero: command at which nothing acts, as of a gauge or a winch that was not zeroed; None for zero.
         backlash: fall of the commands after which they act again when they turn back, as of gears that are loaded in
-            one direction; at rest, commands have risen to their values. Zero or more; a number, or (1 or B,). None for
-            none.
+            one direction; at rest, commands have risen to their values. Zero or more. None for none.
         lower: least input; with a zero, lower ones count as this one.
         typical: typical command, which the octaves of the characteristic curve follow.
         filters: F time constants of the exponential means [s].
-        slopes: of the characteristic curve by the names in `SLOPES`, numbers or (1 or B,); those left out are one.
-            `_curved` describes it. A straight line without any.
+        slopes: of the characteristic curve by the names in `SLOPES`; those left out are one. `_curved` describes it. A
+            straight line without any.
     """
 
     def __init__(
@@ -233,20 +234,36 @@ class InputResponse:
     def _delayed(self, queue: Array, count: int) -> Array:
         """Delayed commands (T, ..., C), from a queue (L + T, ..., C)."""
         late, first = self._late, self._length
-        if not isinstance(late, torch.Tensor):
-            assert late is not None
+        if isinstance(late, float | int):
             share, first = late - int(late), first - int(late)
             return (1.0 - share) * queue[first : first + count] + share * queue[first - 1 : first - 1 + count]
-        rows = torch.arange(queue.shape[1], device=queue.device)
-        now = first + torch.arange(count, device=queue.device)[:, None] - _whole(late) + 0 * rows
-        share = _column(late - _whole(late))
-        return (1.0 - share) * queue[now, rows] + share * queue[now - 1, rows]
+        whole = _column(_whole(late))
+        share = _column(late) - whole
+        now: Any = first + np.arange(count).reshape(-1, *[1] * (queue.ndim - 1))
+        if isinstance(queue, torch.Tensor):
+            now = torch.as_tensor(now, device=queue.device)
+        taken: Any = torch.take_along_dim if isinstance(queue, torch.Tensor) else np.take_along_axis
+        now = now - whole
+        return (1.0 - share) * taken(queue, now, 0) + share * taken(queue, now - 1, 0)
 
 
-def response_of(quantity: Quantity, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the arguments of `InputResponse` for the identified parameters of an input, besides its filters."""
-    values = {word: parameters.get(f"{quantity.name}_{word}") for word in RESPONSES}
-    known = {word: value for word, value in values.items() if value is not None}
+def response_of(quantity: Quantity, parameters: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
+    """Returns the arguments of `InputResponse` for the identified parameters of an input, besides its filters.
+
+    Args:
+        quantity: the input.
+        parameters: numbers or (B,) by name, such as ``pressure_factor``, or ``pressure_factor_1`` of the part ``1``.
+        parts: names of its parts.
+    """
+    known = dict[str, Any]()
+    for word in RESPONSES:
+        name = f"{quantity.name}_{word}"
+        of_parts = [parameters.get(f"{name}_{part}") for part in parts]
+        if name in parameters:
+            known[word] = parameters[name]
+        if (one := next((value for value in of_parts if value is not None), None)) is not None:
+            common = known.get(word, 0.0 * one + (1.0 if word in UNITS else 0.0))
+            known[word] = _library(one).stack([common if value is None else value for value in of_parts], -1)
     return {**known, "lower": quantity.lower, "typical": quantity.typical}
 
 
@@ -307,24 +324,26 @@ def _geared(output: Array, series: Array, width: Array) -> Array:
     return like.stack(geared)
 
 
-def _share_kept(time: torch.Tensor | float, step: float) -> Array:
+def _share_kept(time: Array, step: float) -> Array:
     """Decay exp(-step / time) of a lag in a step; (B, 1) for time constants (B,) [s]."""
-    if isinstance(time, torch.Tensor):
-        return _column(torch.exp(-step / time.clamp_min(_FASTEST * step)))
-    return math.exp(-step / max(time, _FASTEST * step))
+    if isinstance(time, float | int):
+        return math.exp(-step / max(time, _FASTEST * step))
+    return _column(_library(time).exp(-step / _at_least(time, _FASTEST * step)))
 
 
-def _at_least(value: torch.Tensor | float, least: float) -> Any:
-    return value.clamp_min(least) if isinstance(value, torch.Tensor) else max(value, least)
+def _at_least(value: Array, least: float) -> Array:
+    return value.clamp_min(least) if isinstance(value, torch.Tensor) else np.maximum(value, least)
 
 
-def _column(values: torch.Tensor | float) -> Array:
-    return values[:, None] if isinstance(values, torch.Tensor) else values
+def _column(values: Array) -> Array:
+    """Returns numbers, (C,) or (B, C) unchanged, and tensors (B,) as (B, 1)."""
+    return values[:, None] if isinstance(values, torch.Tensor) and values.ndim == 1 else values
 
 
-def _whole(steps: torch.Tensor | float) -> Array:
+def _whole(steps: Array) -> Array:
     """Rounds down to whole numbers of steps."""
-    return steps.detach().floor().clamp_min(0.0).long() if isinstance(steps, torch.Tensor) else np.array(int(steps))
+    whole = _at_least(steps.detach() if isinstance(steps, torch.Tensor) else steps, 0.0)
+    return whole.long() if isinstance(whole, torch.Tensor) else np.asarray(whole).astype(int)
 
 
 def _library(values: Array) -> Any:

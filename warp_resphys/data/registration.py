@@ -128,7 +128,8 @@ def register_markers(
         names: M names.
         source: File of the recording, for messages.
         largest_residual: Accuracy of the nominal positions [m].
-        use: Names of the markers to fit, such as those on the clamp; all if None.
+        use: Names of the markers to fit, such as those on the clamp; all if None. None at all, with a known rotation:
+            the origin of the recording is that of the body.
         rotation: (3, 3) from the frame of the recording to that of the body, if known.
         vertical: (3,) upward directions in the frame of the recording and in that of the body, if known.
 
@@ -139,19 +140,25 @@ def register_markers(
             or too many of them are too far off.
     """
     a, b = np.asarray(measured, dtype=np.float64), np.asarray(nominal, dtype=np.float64)
+    if use is not None and not use and rotation is not None:
+        known, nothing = (
+            RigidTransform(np.asarray(rotation, dtype=np.float64), np.zeros(3)),
+            np.full(len(names), np.nan),
+        )
+        return Registration(tuple(names), known, known.apply(a), nothing, np.isfinite(nothing), (), 0.0)
     used = _used(a, b, names, use, source, 1 if rotation is not None else 3 if vertical is None else 2)
-    fewest, turned, known = max(4, len(used) // 2 + 1), None, ""
+    fewest, turned, shown = max(4, len(used) // 2 + 1), None, ""
     if rotation is not None:
         fewest, turned = len(used) // 2 + 1, np.asarray(rotation, dtype=np.float64)
-        known = " with the axes that are given"
+        shown = " with the axes that are given"
     elif _distance_from_line(b[used]) <= largest_residual:
         turned = _upright(a[used], b[used], vertical, largest_residual, listed([names[row] for row in used]))
-        fewest, known = len(used), " with the vertical that is given"
+        fewest, shown = len(used), " with the vertical that is given"
     best = _consensus(a, b, used, fewest, turned, largest_residual)
     if best is None:
         raise DataFileError(
             f"{source}: the markers at rest do not fit their nominal positions to {_MILLI * largest_residual:.1f} mm"
-            f"{known}: {_worst(a, b, used, turned, names)}; check its name, its nominal position, the unit and the "
+            f"{shown}: {_worst(a, b, used, turned, names)}; check its name, its nominal position, the unit and the "
             "axes, or name those that stand where they should in markers.register_with."
         )
     rows, motion = best

@@ -111,7 +111,7 @@ class EnergySet:
             self.defaults |= {f"{prefix}{name}": value for name, value in energy.defaults.items()}
             for q in (*energy.parameters, *energy.inputs):
                 self.counts[f"{prefix}{q.name}"] = energy.count_of(q)
-                if q in energy.parameters and energy.names and energy.count_of(q) == energy.count:
+                if energy.names and energy.count_of(q) == energy.count:
                     self.parts[f"{prefix}{q.name}"] = energy.names
             self.memory |= {f"{prefix}{m.name}": replace(m, name=f"{prefix}{m.name}") for m in bound.memory}
         self._loading, self._stepping, self._posing = (

@@ -182,14 +182,16 @@ class Experiment:
         return Model(self.model_simulator(name), self.identified(name), learned, name in INTERVAL_MODELS)
 
     def learned(self, model: str) -> Learned | None:
-        """Trained network of a model; None for models without a network.
+        """Trained network of a model; None for models without one, and for a force that is no clear gain.
 
         Raises:
             DataFileError: the file is missing or damaged.
         """
         if model not in LEARNED:
             return None
-        return Learned.read(self.folder / weights_file(model), network_of(model), self.like.device)
+        learned = Learned.read(self.folder / weights_file(model), network_of(model), self.like.device)
+        refused = learned.test is not None and not learned.test["used"] and not learned.replaces_simulator
+        return None if refused else learned
 
     def reconstructed(self, model: str) -> ReconstructedTrials | None:
         """Trials that were reconstructed with a model's simulator; None without any."""

@@ -37,7 +37,8 @@ def time_models(context: StageContext) -> None:
     target, shared = settings.target, ("mesh", "parts", "time_step")
     if target is not None and all(getattr(target, key) == getattr(settings, key) for key in shared):
         rows["target"] = ("simulation", None, experiment.simulator("target"))
-    rows |= {"resphys": ("resphys", learned, simulator), "inference": ("resphys", learned, simulator)}
+    rows |= {"resphys": ("resphys", learned, simulator)}
+    rows |= {} if learned is None else {"inference": ("resphys", learned, simulator)}
     times: dict[str, dict[str, float]] = {}
     steps = 0
     with Progress(context.name, len(rows) * len(names), "trials") as progress, torch.no_grad():

@@ -2,9 +2,9 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from typing import Any, Final
 
@@ -232,15 +232,19 @@ class TrialRollout:
         series = torch.stack([*points[-1:]] if self.replay.is_static else [*points], 1)
         return np.asarray(self.replay.at_frames(series, self.start).cpu().numpy())
 
-    def errors(self, learned: Learned) -> list[FloatArray]:
-        """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged."""
+    def errors(self, learned: Learned | None) -> list[FloatArray]:
+        """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged.
+
+        Args:
+            learned: network; None for the simulator alone.
+        """
         motions, observed, steps = self._motions, self.replay.trials.observed, self.steps
         observed = observed[:, : motions.learned_steps(observed.shape[1] - 1) + 1]
         if motions.train_fraction < 1.0:
             steps = min(steps, motions.learned_steps(steps))
         series: list[torch.Tensor] = []
         with contextlib.suppress(ConvergenceError):
-            for state in islice(self.roll(self.predictor(learned)), steps + 1):
+            for state in islice(self.roll(None if learned is None else self.predictor(learned)), steps + 1):
                 if series and bool(state.lost.all()):
                     series = []
                     break
@@ -257,26 +261,46 @@ def first_frame(trials: Trials, names: Sequence[str]) -> int:
     return int(trials.begin_of(names[0]) == GIVEN)
 
 
-def rollout_error(
-    simulator: Simulator, motions: ObservedMotions, names: Sequence[str], identified: Identified, data_driven: bool
-) -> Callable[[Learned], float]:
-    """Returns a function that computes the mean error of a network over trials [mm]; infinite if a roll-out diverged.
+class HeldOutRollouts:
+    """Roll-outs of trials with any networks, whose starts are estimated once, at the first one.
 
     Args:
         simulator: its solver settings must count failures rather than raise them.
         motions: observed motions.
         names: names of the trials.
         identified: parameters of the simulator.
-        data_driven: whether a network replaces the simulator.
+        data_driven: whether networks replace the simulator.
     """
-    runs: list[TrialRollout] = []
 
-    def error(learned: Learned) -> float:
-        if not runs:  # The starts of the trials are estimated once, at the first call.
-            batches = motions.trials.batches(names)
-            runs.extend(TrialRollout(simulator, motions, batch, identified, data_driven) for batch in batches)
-        rows = [row for run in runs for row in run.errors(learned)]
-        mean = summarise(rows)["mean"]
+    def __init__(
+        self,
+        simulator: Simulator,
+        motions: ObservedMotions,
+        names: Sequence[str],
+        identified: Identified,
+        data_driven: bool = False,
+    ) -> None:
+        self.batches = motions.trials.batches(names)
+        self._of = partial(TrialRollout, simulator, motions, identified=identified, data_driven=data_driven)
+
+    @cached_property
+    def _runs(self) -> list[TrialRollout]:
+        return [self._of(batch) for batch in self.batches]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the trials, in the order of the errors."""
+        return [name for batch in self.batches for name in batch]
+
+    def amplitudes_mm(self) -> list[float]:
+        """Amplitudes of the trials [mm]."""
+        return [1e3 * size for run in self._runs for size in run.replay.trials.amplitude.tolist()]
+
+    def errors(self, learned: Learned | None) -> list[FloatArray]:
+        """Mean distances of the points of each trial by frame [mm], see `TrialRollout.errors`."""
+        return [row for run in self._runs for row in run.errors(learned)]
+
+    def error_mm(self, learned: Learned) -> float:
+        """Mean error of a network over the trials [mm]; infinite if a roll-out diverged."""
+        mean = summarise(self.errors(learned))["mean"]
         return float("inf") if mean is None else mean
-
-    return error

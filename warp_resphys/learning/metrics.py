@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import takewhile
 from typing import Final, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
@@ -261,3 +262,16 @@ def _over_folds(summaries: Sequence[ErrorSummary]) -> ErrorSummary:
 def _finite_mean(values: NDArray[np.float64]) -> float | None:
     mean = float(np.mean(values))
     return mean if math.isfinite(mean) else None
+
+
+def autocorrelation(series: NDArray[np.float64]) -> list[float]:
+    """Returns the autocorrelation of (T, C) values at lags of 1, 2, ... frames, up to its first zero."""
+    products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
+    if not products or products[0] <= 0.0:
+        return []
+    return [value / products[0] for value in takewhile(lambda value: value > 0.0, products[1:])]
+
+
+def redundancy(series: NDArray[np.float64]) -> float:
+    """Returns the number of correlated frames of a series (T, C) with as much information as one independent frame."""
+    return 1.0 + 2.0 * sum(autocorrelation(series))

@@ -5,7 +5,7 @@ parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from ..settings.learning import Bounds
 
 MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
+T = TypeVar("T")
 _OWN: Final = "@"
 HUNG: Final = ("attached_mass", PAYLOAD.name)
 _NOT_NEGATIVE: Final = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
@@ -60,19 +61,33 @@ def split_name(name: str) -> tuple[str, str]:
 def identifiable_parameters(simulator: Simulator) -> tuple[str, ...]:
     """Names of the parameters of a simulator that can be identified, which are numbers; see `replay.Replay`."""
     numbers = (name for name, quantity in simulator.parameters.items() if name != "gravity" and not quantity.shape)
-    constants = (*numbers, *parameters_of_parts(simulator))
     responses = [f"{name}_{word}" for name in simulator.inputs if name not in HUNG for word in RESPONSES]
-    return (*constants, MASS_FACTOR, *TILTS, *responses)
+    return (*numbers, MASS_FACTOR, *TILTS, *responses, *parameters_of_parts(simulator))
 
 
 def parameters_of_parts(simulator: Simulator) -> dict[str, tuple[str, int]]:
-    """Name of the constant and index of the part, for every part of energies with several, by parameter name."""
-    return {
-        f"{name}_{part}": (name, number)
-        for name, parts in simulator.parts.items()
-        if len(parts) > 1
-        for number, part in enumerate(parts)
-    }
+    """Name for all parts and index of the part, by parameter name, for energies with several parts.
+
+    These are constants, such as ``tendon_stiffness_left``, and responses of inputs, such as ``pressure_factor_1``.
+    """
+    found = dict[str, tuple[str, int]]()
+    for name, parts in simulator.parts.items():
+        words = [f"{name}_{word}" for word in RESPONSES if name not in HUNG] if name in simulator.inputs else [name]
+        for number, part in enumerate(parts if len(parts) > 1 else ()):
+            found |= {f"{whole}_{part}": (whole, number) for whole in words}
+    return found
+
+
+def by_part(simulator: Simulator, values: Mapping[str, T], ranges: Mapping[str, Bounds]) -> dict[str, T]:
+    """Returns values by name, with one for each part where the range of a parameter is per part."""
+    names: dict[str, list[str]] = {}
+    for part, (whole, _) in parameters_of_parts(simulator).items():
+        names.setdefault(whole, []).append(part)
+    found = dict[str, T]()
+    for name, value in values.items():
+        each = name in ranges and ranges[name].per == "part"
+        found |= dict.fromkeys(names[name] if each else [name], value)
+    return found
 
 
 def check_names(names: Iterable[str], known: Sequence[str]) -> None:
@@ -83,7 +98,10 @@ def check_names(names: Iterable[str], known: Sequence[str]) -> None:
     """
     for name in (split_name(name)[0] for name in names):
         if name not in known:
-            raise InputError(f"there is no parameter {name!r} to identify: choose from {', '.join(known)}.")
+            parts = [part for part in known if any(part.startswith(f"{whole}_") for whole in known)]
+            shown = ", ".join(one for one in known if one not in parts)
+            also = f", or those of a part, such as {parts[0]}" if parts else ""
+            raise InputError(f"there is no parameter {name!r} to identify: choose from {shown}{also}.")
 
 
 def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequence[str], sessions: bool) -> None:
@@ -112,6 +130,8 @@ def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequ
                 f"parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not negative: set it to "
                 "zero or more."
             )
+        if limits.per == "part" and not any(whole == name for whole, _ in of_parts.values()):
+            raise InputError(f"parameters.{name}.per is part, but the body has no parts with a {name}: leave it out.")
         if limits.per in ("material", "lens"):
             raise InputError(f"parameters.{name}.per is {limits.per}, which is for data.kind pictures: leave it out.")
         if limits.per == "session" and not sessions:
@@ -152,17 +172,17 @@ def constants_of(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -
 
 def _by_part(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """(E, count) constants of energies with values (E,) for single parts; the other parts have the common value."""
-    of_parts, by_part = parameters_of_parts(simulator), dict[str, list[torch.Tensor]]()
+    of_parts, columns = parameters_of_parts(simulator), dict[str, list[torch.Tensor]]()
     for name, value in parameters.items():
-        if name not in of_parts:
+        constant, part = of_parts.get(name, ("", 0))
+        if constant not in simulator.parameters:
             continue
-        constant, part = of_parts[name]
-        if constant not in by_part:
+        if constant not in columns:
             common = parameters[constant] if constant in parameters else simulator.tensor(simulator.defaults[constant])
             common = common[:, None] if constant in parameters else simulator.parameters[constant].shaped(common)
-            by_part[constant] = list(common.expand(len(value), simulator.counts[constant]).unbind(1))
-        by_part[constant][part] = value
-    return {name: torch.stack(columns, 1) for name, columns in by_part.items()}
+            columns[constant] = list(common.expand(len(value), simulator.counts[constant]).unbind(1))
+        columns[constant][part] = value
+    return {name: torch.stack(values, 1) for name, values in columns.items()}
 
 
 def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: torch.Tensor | None) -> torch.Tensor:
@@ -195,6 +215,7 @@ def tilted_gravity(simulator: Simulator, first: torch.Tensor | None, second: tor
 
 def command_of(simulator: Simulator, name: str) -> tuple[str, str]:
     """Input and the word of `RESPONSES` in a name such as ``pressure_delay``; else two empty strings."""
+    name = parameters_of_parts(simulator).get(name, (name, 0))[0]
     for word in RESPONSES:
         driven = name.removesuffix(f"_{word}")
         if driven != name and driven in simulator.inputs and driven not in HUNG:

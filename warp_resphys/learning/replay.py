@@ -175,11 +175,12 @@ class Replay:
         for name, commands in inputs.actuation.items():
             if name in HUNG:
                 continue
-            response = InputResponse(self.simulator.time_step, **response_of(self.simulator.inputs[name], spread))
+            arguments = response_of(self.simulator.inputs[name], spread, self.simulator.parts.get(name, ()))
+            response = InputResponse(self.simulator.time_step, **arguments)
             throughout = commands.ndim == 2
             first = resting.actuation.get(name, 0.0 * (commands if throughout else commands[0]))
             acting[name] = response.scaled(commands) if throughout else response(response.steady(first), commands)[0]
-            if name in resting.actuation or f"{name}_zero" in spread:
+            if name in resting.actuation or arguments.get("zero") is not None:
                 before[name] = response.scaled(first)
         return acting, before
 

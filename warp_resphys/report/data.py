@@ -1,6 +1,5 @@
 """Data of the page of a run."""
 
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,6 +16,7 @@ from ..learning.baselines import BASELINES
 from ..learning.error_tables import ErrorTables
 from ..learning.identification.search import Identification
 from ..learning.metrics import PublishedError, mean_distance, published_errors
+from ..learning.scores import HeldOutTest, text_of
 from ..mesh.chambers import Chamber
 from ..mesh.volume_mesh import Mesh
 from ..settings.data_kinds import ReleaseFromLoad
@@ -34,6 +34,7 @@ class KeptWeights(TypedDict):
     selection: str
     epoch: int
     validation_rollout_error_mm: float | None
+    test: HeldOutTest
 
 
 class UsedLaw(LawContent):
@@ -303,13 +304,17 @@ def grouped_errors(metrics: Metrics, settings: RunSettings) -> dict[str, Errors]
     return {f"{count} test trial{'s' * (count != 1)}": errors} if errors else {}
 
 
-def untrained(metrics: Metrics) -> set[str]:
-    """Returns the models of which no fold kept an epoch of training, so that their learned force is zero."""
-    epochs: dict[str, int] = Counter()
+def unused(metrics: Metrics) -> dict[str, str]:
+    """Returns why learned models are not used, by model: in no fold are they clearly closer to held-out trials."""
+    tests: dict[str, list[HeldOutTest]] = {}
     for fold in folds_in(metrics):
         for model, kept in fold.get("networks", {}).items():
-            epochs[model] += kept["epoch"]
-    return {model for model, count in epochs.items() if not count}
+            tests.setdefault(model, []).append(kept["test"])
+    return {
+        model: text_of(found[0]) if len(found) == 1 else f"it is clearly closer in none of the {len(found)} folds"
+        for model, found in tests.items()
+        if not any(test["used"] for test in found)
+    }
 
 
 def missing_baselines(metrics: Metrics) -> dict[str, str]:

@@ -13,7 +13,7 @@ from ..data.rigid_bodies import as_markers, corners_of, owners
 from ..learning.identification.search import Identification
 from ..learning.parameters import split_name, value_name
 from ..learning.placement import PlainPlacement
-from ..settings.learning import Bounds
+from ..settings.learning import IdentifySettings
 from . import figures
 from .data import RunReport
 from .page import Canvas, Cell, PageTable, Part, Row, Text
@@ -57,8 +57,8 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
         for name, result in identified.items()
     ]
     blocks += [table for result in identified.values() if (table := trials_table(result)) is not None]
-    ranges = {} if data.settings.identify is None else data.settings.identify.parameters
-    uncertain = list(filter(None, (uncertainty_text(name, result, ranges) for name, result in identified.items())))
+    texts = (uncertainty_text(name, result, data.settings.identify) for name, result in identified.items())
+    uncertain = list(filter(None, texts))
     notes = []
     if uncertain:
         notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
@@ -140,7 +140,8 @@ def trials_table(identified: Identification) -> PageTable | None:
 def parameter_wording(parameter: str) -> Wording:
     """Returns the name of a parameter as in the settings but with spaces, its unit on the page, and the factor."""
     words = parameter.replace("_", " ").replace("youngs", "Young's").replace("poissons", "Poisson's")
-    fits = ((unit, factor) for pattern, unit, factor in _UNITS if re.fullmatch(pattern, parameter))
+    names = (parameter, parameter.rpartition("_")[0])  # The second one is that of a part, such as pressure_delay_1.
+    fits = ((unit, factor) for name in names for pattern, unit, factor in _UNITS if re.fullmatch(pattern, name))
     return words[0].upper() + words[1:], *next(fits, ("", 1.0))
 
 
@@ -197,7 +198,7 @@ def placement_text(name: str, placed: PlainPlacement, lengths: Mapping[str, floa
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
 
 
-def uncertainty_text(name: str, identified: Identification, ranges: Mapping[str, Bounds]) -> str:
+def uncertainty_text(name: str, identified: Identification, settings: IdentifySettings | None) -> str:
     """Returns sentences on the parameters of a model that the data do not determine; empty without uncertainties."""
     uncertainty = identified.uncertainty
     if uncertainty is None:
@@ -219,8 +220,9 @@ def uncertainty_text(name: str, identified: Identification, ranges: Mapping[str,
     text += f" The data do not separate {', '.join(tied)}." if tied else ""
     unknown = list[str]()
     for parameter, deviation in uncertainty.deviation.items():
-        prior = ranges[parameter].prior if parameter in ranges else None
-        if prior is not None and ranges[parameter].per == "all" and deviation > _UNINFORMED * prior.deviation:
+        limits = None if settings is None else settings.parameters.get(settings.key_of(parameter))
+        prior = None if limits is None or limits.per in ("session", "trial") else limits.prior
+        if prior is not None and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)
             where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()
             unknown.append(f"{words[parameter]} beyond its prior ({where})")

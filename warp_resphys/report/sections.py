@@ -13,17 +13,7 @@ from ..learning.identification.sensitivity import FreeFit
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, ErrorSummary, PublishedError, published_errors
 from ..settings.run import RunSettings
 from .body_picture import registration_picture
-from .data import (
-    Driven,
-    Errors,
-    Metrics,
-    RunReport,
-    ShapeErrors,
-    folds_in,
-    grouped_errors,
-    missing_baselines,
-    untrained,
-)
+from .data import Driven, Errors, Metrics, RunReport, ShapeErrors, folds_in, grouped_errors, missing_baselines, unused
 from .page import Canvas, Cell, Drawn, Items, PageTable, Part, Row, Text
 from .verdict import error_cell, interval_text
 from .wording import (
@@ -52,7 +42,7 @@ def details_table(metrics: Metrics, settings: RunSettings) -> PageTable:
 
     With two groups of test trials, each has a column; published errors are of trials as in training.
     """
-    errors, groups, idle = metrics["errors_mm"], grouped_errors(metrics, settings), untrained(metrics)
+    errors, groups, idle = metrics["errors_mm"], grouped_errors(metrics, settings), unused(metrics)
     published = published_beside(published_errors(settings.name), list(errors))
     beside = {"Published": {model: Cell.of(error) for model, error in published.items()}}
     columns: dict[str, dict[str, Cell]] = {}
@@ -76,7 +66,7 @@ def details_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     rows, missing = [], missing_baselines(metrics)
     for model, (name, meaning, _) in MODELS.items():
         if model in errors or model in published or model in missing:
-            small = "no force: no epoch of its training was kept" if model in idle else missing.get(model, meaning)
+            small = f"not used: {idle[model]}" if model in idle else missing.get(model, meaning)
             rows.append(Row(name, [by_model.get(model, Cell(NONE)) for by_model in columns.values()], small=small))
     return PageTable("All models [mm]", list(columns), rows)
 
@@ -219,8 +209,8 @@ def horizon_table(metrics: Metrics, published: Mapping[str, Mapping[str, Publish
 
 def registration_section(data: RunReport, canvas: Canvas) -> Part | None:
     """Returns the picture of the registered markers on the body at rest, and the residuals."""
-    recordings = data.recordings
-    if recordings is None:
+    recordings, markers = data.recordings, data.settings.markers
+    if recordings is None or (markers is not None and markers.register_with == ()):
         return None
     shown = f"The body at rest with the registered markers of the trial {recordings.worst}"
 

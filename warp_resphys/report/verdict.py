@@ -14,7 +14,7 @@ from ..learning.baselines import BASELINES
 from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
-from .data import Errors, Metrics, folds_in, grouped_errors, missing_baselines, untrained
+from .data import Errors, Metrics, folds_in, grouped_errors, missing_baselines, unused
 from .identification_section import in_sentence, with_unit
 from .page import Cell, PageTable, Row
 from .wording import mm_text, model_words, number_text, share_text, unbroken
@@ -81,7 +81,7 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
 
     Of the models without physics, the best one of each column is shown. The metrics are of a split or of folds.
     """
-    groups, idle = grouped_errors(metrics, settings), untrained(metrics)
+    groups, idle = grouped_errors(metrics, settings), not_used(metrics)
     columns = {
         title: {model: error_cell(by_model) for model, by_model in errors.items()} for title, errors in groups.items()
     }
@@ -140,18 +140,20 @@ def less_error(best: str, second: str, share: float) -> str:
 
 def verdict(metrics: Metrics, settings: RunSettings) -> list[str]:
     """Returns a sentence on what is best, by how much and on how many trials, and at most two sentences of advice."""
-    groups, idle = [*grouped_errors(metrics, settings).values()], untrained(metrics)
+    groups, learned = [*grouped_errors(metrics, settings).values()], unused(metrics)
+    idle = not_used(metrics)
     if not groups or not {*_RANKED} & groups[-1].keys():
         return []
     known = known_errors(groups[-1], idle)
     beyond = "beyond the training loads, " if len(groups) > 1 else ""
     texts = [f"{beyond}{_best_text(known)}"] if known else ["all models diverged"]
+    texts += [f"{model_words(model)} is not used: {idle[model]}" for model in CORRECTED if model in idle]
     inside = best_of(known_errors(groups[0], idle), _RANKED) if len(groups) > 1 else ""
     advice = [f"within them, {model_words(inside)} is {'enough' if inside in BASELINES else 'best'}"] if inside else []
-    if doubts := [*_failed(groups[-1], known, idle), *_doubts(metrics, settings, known, len(groups))]:
+    if doubts := [*_failed(groups[-1], known), *_doubts(metrics, settings, known, len(groups))]:
         advice += [f"check before use: {'; '.join(doubt.fact for doubt in doubts[:_MOST_DOUBTS])}", doubts[0].remedy]
     elif not inside:
-        advice += _use(known)
+        advice += _use(known, learned)
     return [unbroken(f"{text[0].upper()}{text[1:]}.") for text in [*texts, *advice[:2]] if text]
 
 
@@ -188,13 +190,19 @@ def is_clear(gain: Gain) -> bool:
     return gain.trials < LEAST_TRIALS or gain.lower > 0.0
 
 
-def _use(known: Known) -> Iterator[str]:
+def not_used(metrics: Metrics) -> dict[str, str]:
+    """Returns why learned corrections of the simulator are not used, by model; their roll-outs are the simulator's."""
+    return {model: why for model, why in unused(metrics).items() if model in CORRECTED}
+
+
+def _use(known: Known, without: Collection[str]) -> Iterator[str]:
     """Yields which model to use: of those that are not clearly worse than the best one, the simplest simulator."""
     best = best_of(known, _RANKED)
     if best in BASELINES:
         yield f"{model_words(best)} is enough for trials like these; to judge the simulator, test it on others"
     elif best:
-        chosen = next(m for m in _RANKED if m in known and m not in BASELINES and _as_good(known[m], known[best]))
+        usable = [model for model in _RANKED if model in known and model not in (*BASELINES, *without)]
+        chosen = next(model for model in usable if _as_good(known[model], known[best]))
         simpler = f", which is simpler than {model_words(best)} and not significantly worse"
         yield f"use {model_words(chosen)}{simpler * (chosen != best)}"
 
@@ -204,15 +212,13 @@ def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:
     return gain.share < _EQUAL or (gain.share < _SIMPLER and not is_clear(gain))
 
 
-def _failed(errors: Errors, known: Known, idle: Collection[str]) -> Iterator[Doubt]:
-    """Yields corrections that diverged, or that no epoch of a training improved."""
+def _failed(errors: Errors, known: Known) -> Iterator[Doubt]:
+    """Yields corrections that diverged."""
     best = best_of(known, ("simulation", *CORRECTED))
     use = f"use {model_words(best)}" if best else ""
     for model in (model for model in CORRECTED if model in errors):
         if lost := sum(error is None for error in errors[model]):
             yield Doubt(f"{model_words(model)} diverged in {lost} of {len(errors[model])} trials", use)
-        elif model in idle:
-            yield Doubt(f"no epoch of the training of {model_words(model)} lowered the validation error", use)
 
 
 def _doubts(metrics: Metrics, settings: RunSettings, known: Known, groups: int) -> Iterator[Doubt]:
@@ -256,8 +262,9 @@ def _bounds(metrics: Metrics, settings: IdentifySettings | None) -> Iterator[Dou
     for model, group in _GROUPS.items():
         ranges = (None if settings is None else getattr(settings, group)) or {}
         start, values = (metrics.get("first_guesses", {}).get(model, {}), metrics.get("parameters", {}).get(model, {}))
-        for name, limits in ((name, limits) for name, limits in ranges.items() if name in values):
-            key, close = f"identify.{group}.{name}", _CLOSE * (limits.upper - limits.lower)
+        keys = {name: settings.key_of(name) if group == "parameters" and settings else name for name in values}
+        for name, limits in ((name, ranges[key]) for name, key in keys.items() if key in ranges):
+            key, close = f"identify.{group}.{keys[name]}", _CLOSE * (limits.upper - limits.lower)
             ends = {end: getattr(limits, end) for end in ("lower", "upper")}
             if end := next((end for end, bound in ends.items() if abs(values[name] - bound) <= close), ""):
                 mend = f"widen {key}.{end}" if ends[end] else f"remove it from the fit (~{key})"

@@ -204,7 +204,8 @@ class Commands:
         self._mass_factor = parameters.get(MASS_FACTOR)
         h, filters = simulator.time_step, description.filters if description.learned is not None else ()
         taken = [name for name, declared in inputs.items() if declared.is_taken]
-        responses = {name: response_of(simulator.inputs[name], parameters) for name in taken}
+        parts = simulator.parts
+        responses = {name: response_of(simulator.inputs[name], parameters, parts.get(name, ())) for name in taken}
         self._responses = {name: InputResponse(h, **values, filters=filters) for name, values in responses.items()}
 
     def begin(self, body: State, inputs: Mapping[str, torch.Tensor]) -> State:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.input_response import response_of
 from ..data.rigid_bodies import as_markers
 from ..data.trials import STATIC
 from ..dynamics.trajectory import Motion
@@ -16,7 +17,7 @@ from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
 from ..io.errors import DataFileError, InputError, listed
-from ..learning.parameters import value_name
+from ..learning.parameters import split_name
 from ..stepping.state import State
 from .actuation import BASE
 from .description import SUFFIX, Description, describe, finished_experiment
@@ -166,20 +167,24 @@ def _commands(
 ) -> dict[str, torch.Tensor]:
     """Commands under which the robot does what it did under those of a trial with a zero or factor of its own."""
     values, commands = experiment.parameters(robot.description.model), dict(inputs)
-    owners = (name, experiment.trials.session(name))
+    of_trial = dict(values)
+    for owner in (experiment.trials.session(name), name):
+        of_trial |= {split_name(full)[0]: value for full, value in values.items() if split_name(full)[1] == owner}
     for key, series in inputs.items():
-        zero, factor = (values.get(f"{key}_{word}") for word in ("zero", "factor"))
-        trial_zero, trial_factor = (
-            next((values[full] for owner in owners if (full := value_name(f"{key}_{word}", owner)) in values), common)
-            for word, common in (("zero", zero), ("factor", factor))
-        )
-        if trial_zero is not None and zero is not None:
-            commands[key] = (series - trial_zero + zero).clamp_min(robot.simulator.inputs[key].lower)
-        if trial_factor is not None and factor is not None:
-            origin = sum(x for x in (zero, values.get(f"{key}_dead_band")) if x is not None)
-            beyond = (commands[key] - origin).clamp_min(0.0) if f"{key}_dead_band" in values else commands[key] - origin
-            commands[key] = commands[key] + beyond * (trial_factor / factor - 1.0)
+        quantity, parts = robot.simulator.inputs[key], robot.simulator.parts.get(key, ())
+        here, there = (response_of(quantity, known, parts) for known in (of_trial, values))
+        if "zero" in here:
+            commands[key] = (series - _column(here["zero"]) + _column(there["zero"])).clamp_min(quantity.lower)
+        if "factor" in here:
+            beyond = commands[key] - sum(_column(there[word]) for word in ("zero", "dead_band") if word in there)
+            beyond = beyond.clamp_min(0.0) if "dead_band" in there else beyond
+            commands[key] = commands[key] + beyond * (_column(here["factor"]) / _column(there["factor"]) - 1.0)
     return commands
+
+
+def _column(values: torch.Tensor) -> torch.Tensor:
+    """Returns values (1,) of all parts, or (1, C) of each, as (1, 1 or C)."""
+    return values.view(1, -1)
 
 
 def _experiment(robot: Robot) -> Experiment:

@@ -81,6 +81,9 @@ class TableSettings(Settings):
     columns: Many[Word | None] = setting((), "headers such as 'time [s]' or 'tip.x [mm]'; null: not read")
     names: dict[str, Word] = setting({}, "such headers by those of the file, in place of columns")
     header_lines: Count = setting(0, "lines before the numbers, or before the header")
+    rate: Positive | None = setting(
+        None, "rate at which uneven times are sampled again, linearly, with inputs that hold; null: even times", "Hz"
+    )
 
     @model_validator(mode="after")
     def _has_one(self) -> Self:

@@ -50,8 +50,10 @@ class Bounds(Settings):
     upper: float = setting(description="upper bound, in the parameter's unit")
     logarithmic: bool = setting(False, "whether the scale is logarithmic")
     prior: Prior | None = setting(None, "prior knowledge")
-    per: Literal["all", "session", "trial", "material", "lens"] = setting(
-        "all", "what shares a value; session, trial: values near the mean of the prior; material, lens: for pictures"
+    per: Literal["all", "part", "session", "trial", "material", "lens"] = setting(
+        "all",
+        "what shares a value; part: one for each chamber, tendon or muscle; session, trial: near the mean of the "
+        "prior; material, lens: for pictures",
     )
 
     @model_validator(mode="after")
@@ -127,6 +129,12 @@ class IdentifySettings(Settings):
     candidates: Count = setting(4, "random candidates")
     max_evaluations: Natural = setting(10, "evaluations of the loss and its gradient per start")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
+
+    def key_of(self, parameter: str) -> str:
+        """Returns the key of the range of a parameter, which may be that of all parts; empty if it has none."""
+        shared = [name for name, limits in self.parameters.items() if limits.per == "part"]
+        whole = max((name for name in shared if parameter.startswith(f"{name}_")), key=len, default="")
+        return parameter if parameter in self.parameters else whole
 
     @model_validator(mode="after")
     def _guesses_lie_within(self) -> Self:

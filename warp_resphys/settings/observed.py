@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 from ..io.classes import ClassSettings
 from ..io.settings import Many, Positive, Settings, Vector, Word, setting
 from .mesh import Place
-from .performed import CORNERS, Axis, Labels, different
+from .performed import CORNERS, Axis, different
 
 
 class RigidBodySettings(Settings):
@@ -72,7 +72,9 @@ class MarkerSettings(BindingSettings):
     )
     frame: Literal["body", "own"] = setting("body", "own: markers measure the shape alone, as for swimming")
     labels: Literal["recorded", "assigned"] = setting("recorded", "assigned: names are assigned by position")
-    register_with: Labels | None = setting(None, "markers for registration; null: all of a body at rest")
+    register_with: Annotated[Many[Word], AfterValidator(different)] | None = setting(
+        None, "markers for registration; null: all of a body at rest; []: none, as recordings are in the body's frame"
+    )
     largest_residual: Positive = setting(0.004, "largest residual of the registration", "m")
     largest_distortion: Positive = setting(0.001, "largest motion of a reference marker in a session", "m")
     largest_shift: Positive | None = setting(None, "largest shift of a reference marker; null: any", "m")

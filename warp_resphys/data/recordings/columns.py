@@ -25,6 +25,7 @@ _NEXT = 1.5  # of the median interval: the longest one without a missing frame
 _WHOLE = 5e-4  # difference of a rate from a whole number that counts as none; that of NTSC, 59.94 Hz, is 1e-3
 _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
+_LONGEST_GAP = 3.0  # median intervals between lines, through which coordinates of uneven times are interpolated
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
 
 Place = tuple[str, str, int]  # label, axis and column of a coordinate
@@ -54,7 +55,8 @@ class Layout:
         unit: of positions; None if the table does not state it.
         clock: column of the frame number or time; None if every line is a frame.
         seconds: unit of the time [s]; None for frame numbers.
-        rate: of the frames [Hz], where there is no time.
+        rate: of the frames [Hz], where there is no time; with times, that at which these are sampled again, as they are
+            uneven.
         channels: factors to SI units of the columns of the actuation.
         planar: whether a coordinate that no marker has a column for is zero.
         turn: how rotations are given.
@@ -83,6 +85,8 @@ class Layout:
         stamps = np.arange(len(values), dtype=np.float64)
         if self.clock is not None:
             stamps = values[:, self.clock] * (self.seconds or 1.0)
+        if self.seconds is not None and self.rate is not None:
+            values, stamps, lines = self._even(values, stamps, lines, self.rate, path)
         frames, measured_rate = _frames(stamps, self.seconds is not None, lines, path)
         actuation = None
         if self.channels:
@@ -108,6 +112,25 @@ class Layout:
             unit=self.unit or "",
             turns=turns if turned else None,
         )
+
+    def _even(
+        self, values: FloatArray, stamps: FloatArray, lines: Sequence[int], rate: float, path: Path
+    ) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Returns values, times [s] and lines at a rate [Hz], from times that rise.
+
+        Channels hold their values; coordinates are interpolated linearly, and are NaN between lines that are further
+        apart than three in the median.
+        """
+        _check_rise(stamps, lines, path)
+        times = stamps[0] + np.arange(int((stamps[-1] - stamps[0]) * rate + 1e-6) + 1) / rate
+        before = (np.searchsorted(stamps, times + 1e-9, side="right") - 1).clip(0, len(stamps) - 2)
+        share = ((times - stamps[before]) / (stamps[before + 1] - stamps[before])).clip(0.0, 1.0)[:, None]
+        even = np.where(share > 0.0, (1.0 - share) * values[before] + share * values[before + 1], values[before])
+        apart = np.diff(stamps)[before] > _LONGEST_GAP * np.median(np.diff(stamps))
+        even[apart & (share[:, 0] > 0.0) & (share[:, 0] < 1.0)] = np.nan
+        last = np.where(share[:, 0] < 1.0, before, before + 1)
+        even[:, [*self.channels]], even[:, -1] = values[last][:, [*self.channels]], 0.0
+        return even, times, [lines[row] for row in last]
 
     def _markers(self, path: Path) -> tuple[list[str], list[int], dict[int, list[int]]]:
         """Returns labels, the columns of their x, y and z, and those of rotations by the index of the rigid body.
@@ -142,6 +165,9 @@ class Layout:
         for line, row in enumerate(rows[self.first :], start=self.first + 1):
             if not any(row):
                 continue
+            if self.rate is not None and len(row) < self.width and not any(map(any, rows[line:])):
+                log.warning("%s: the last line, %d, is cut off, and left out.", path.name, line)
+                break
             if len(row) < self.width or any(row[self.width :]):
                 raise DataFileError(
                     f"{path}, line {line}: {len(row)} cells where the other lines have {self.width}; the file is cut "
@@ -197,16 +223,21 @@ def is_data(row: Sequence[str]) -> bool:
     return len(row) >= 3 and begins and 2 * sum(number(cell) is not None for cell in filled) > len(filled)
 
 
-def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -> tuple[IntArray, float | None]:
-    """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
+def _check_rise(stamps: FloatArray, lines: Sequence[int], path: Path) -> None:
+    """Refuses times or frame numbers that do not rise."""
     known = np.abs(stamps) <= _LARGEST_STAMP
-    steps = np.diff(np.where(known, stamps, np.nan))
-    wrong = np.append(~known[0], ~(steps > 0.0))
+    wrong = np.append(~known[0], ~(np.diff(np.where(known, stamps, np.nan)) > 0.0))
     if wrong.any():
         raise DataFileError(
             f"{path}, line {lines[int(np.argmax(wrong))]}: the time or frame does not rise, or is no number below "
             "1e12; sort the lines and fill it in."
         )
+
+
+def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -> tuple[IntArray, float | None]:
+    """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
+    _check_rise(stamps, lines, path)
+    steps = np.diff(stamps)
     interval, span = float(np.median(steps)) if timed else 1.0, float(stamps[-1] - stamps[0])
 
     def foreign(row: int) -> DataFileError:

@@ -129,11 +129,11 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
     clocks = [column for column, (name, _) in columns.items() if name.lower() in (*_TIMES, *_FRAMES)]
     if len(clocks) > 1:
         raise DataFileError(f"{path}: columns {clocks[0] + 1} and {clocks[1] + 1} both tell the time: read one only.")
-    return _read_table(rows, first, columns, list(SI_PER_ACTUATION_UNIT), width, path)
+    return _read_table(rows, first, columns, list(SI_PER_ACTUATION_UNIT), width, path, table.rate)
 
 
 def _read_table(
-    rows: Rows, first: int, columns: Columns, channel_units: Sequence[str], width: int, path: Path
+    rows: Rows, first: int, columns: Columns, accepted: Sequence[str], width: int, path: Path, rate: float | None = None
 ) -> Recording:
     """Reads columns `time [s]` or `frame`, `<marker>.x`, `.y` and `.z`, of a rigid body `.qw` to `.qz`, and channels.
 
@@ -141,9 +141,10 @@ def _read_table(
         rows: all lines.
         first: number of the first line of numbers.
         columns: names and units by number, at most one of them a time or frame.
-        channel_units: units in brackets of the columns that are channels.
+        accepted: units in brackets of the columns that are channels.
         width: number of cells of a line.
         path: of the file.
+        rate: at which uneven times are sampled again [Hz]; None: they are even.
     """
     clock = next((column for column, (name, _) in columns.items() if name.lower() in (*_TIMES, *_FRAMES)), None)
     seconds = None
@@ -168,21 +169,21 @@ def _read_table(
             label, axis = coordinates[column]
             places.append((label, axis, column))
             units |= {unit} if unit and axis in AXES else set()
-        elif unit is not None and unit in channel_units:
+        elif unit is not None and unit in accepted:
             channels[column] = SI_PER_ACTUATION_UNIT[unit]
         elif column != clock and any(number(row[column]) is not None for row in rows[first:] if len(row) > column):
-            kept = {*coordinates, clock, *(other for other, (_, u) in columns.items() if u in channel_units)}
+            kept = {*coordinates, clock, *(other for other, (_, u) in columns.items() if u in accepted)}
             heads = {other: head if unit is None else f"{head} [{unit}]" for other, (head, unit) in columns.items()}
             read = [f'"{heads[other]}"' if other in kept else "null" for other in range(width)]
             raise DataFileError(
                 f"{path}: column {column + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
-                f"channel with a unit in brackets ({', '.join(channel_units)}); rename it, or leave it out by naming "
+                f"channel with a unit in brackets ({', '.join(accepted)}); rename it, or leave it out by naming "
                 f"the others: 'recording.table={{columns: [{', '.join(read)}], header_lines: {first}}}' for inspect "
                 "and convert, data.table in a configuration."
             )
     if len(units) > 1:
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
-    layout = Layout(first, width, places, next(iter(units), None), clock, seconds, channels=channels, planar=True)
+    layout = Layout(first, width, places, next(iter(units), None), clock, seconds, rate, channels=channels, planar=True)
     return layout.read(rows, path)
 
 

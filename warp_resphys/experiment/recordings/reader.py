@@ -52,7 +52,7 @@ class Reader:
             determines it.
         vertical: upward directions in the frames of the recordings and of the body; None if either is unknown.
         enough: number of reference markers that suffice to register a recording: 1 with known rotation, 2 with known
-            vertical, else 3.
+            vertical, none if it is in the frame of the body, else 3.
 
     Raises:
         InputError: the trials cannot be read, registered or driven with these settings.
@@ -75,6 +75,7 @@ class Reader:
         up, gravity = self.data.up, np.asarray(settings.gravity, dtype=np.float64)
         self.vertical = None if up is None or not gravity.any() else (unit_vector(up), -gravity)
         self.enough = 1 if self.rotation is not None else 3 if self.vertical is None else 2
+        self.enough = 0 if self.markers.register_with == () else self.enough
         self._folder = folder
         self._check_trials()
         self._check_registration()
@@ -128,6 +129,11 @@ class Reader:
     def _check_registration(self) -> None:
         """Refuses too few markers for the registration of the trials."""
         begins, standing, enough = {trial.begins for trial in self.trials}, len(self.markers.reference), self.enough
+        if not enough and self.rotation is None:
+            raise InputError(
+                "markers.register_with is empty, as of recordings in the frame of the body: name the axes of the "
+                "recordings along which the body's x, y and z are in data.axes, such as [x, y, z]."
+            )
         if (count := len(self.markers.tracked) + standing) < enough:
             raise InputError(
                 f"markers.tracked and markers.reference name {number_of(count, 'marker')}: registration needs at least "
@@ -141,7 +147,8 @@ class Reader:
         if UNDER_INPUTS in begins and standing < enough and self.markers.frame != "own":
             raise InputError(
                 f"trials that begin driven are bent from the first frame on, and markers.reference names {standing}: "
-                f"registration needs {enough} markers on what the body is fixed to, or markers.frame own."
+                f"registration needs {enough} markers on what the body is fixed to, or markers.frame own, or "
+                "markers.register_with [] for recordings in the frame of the body."
             )
 
     def tracked_in(self, trial: Trial) -> list[str]:

@@ -23,6 +23,7 @@ from ...settings.learning import Bounds, IdentifySettings
 from ..observed_motions import ObservedMotions
 from ..parameters import (
     Limits,
+    by_part,
     check_names,
     check_ranges,
     configured_parameters,
@@ -59,8 +60,9 @@ def identify(
 ) -> Identification:
     """Finds the parameters with which a simulator comes closest to observed motions.
 
-    A parameter with ``per`` trial or session has a value for each, near the mean of its prior. That of trials whose
-    motion inputs begin can also be identified from their first frames (`ReleaseSettings.window`).
+    A parameter with ``per`` part has a value for each chamber, tendon or muscle, such as ``pressure_factor_1``; with
+    ``per`` trial or session it has one for each, near the mean of its prior. That of trials whose motion inputs begin
+    can also be identified from their first frames (`ReleaseSettings.window`).
 
     Args:
         simulator: gives all other parameters.
@@ -86,15 +88,17 @@ def identify(
     """
     trials = motions.trials.chosen(names)
     motions.trials.rows(held_out)
-    ranges, identifiable = ranges_of(parameters), identifiable_parameters(simulator)
-    check_ranges(simulator, ranges, identifiable, bool(motions.trials.sessions))
+    wanted, identifiable = ranges_of(parameters), identifiable_parameters(simulator)
+    check_ranges(simulator, wanted, identifiable, bool(motions.trials.sessions))
+    ranges = by_part(simulator, wanted, wanted)
     with naming("first_guess: "):
         check_names(first_guess or {}, identifiable)
     many = 4 * starts if candidates is None else candidates
     numbers = {"starts": starts, "candidates": many, "max_evaluations": max_evaluations, "tolerance": tolerance}
     parse(IdentifySettings, {**numbers, "seconds": seconds, "first_guess": {**(first_guess or {})}}, "identify")
     bounds, replays = _bounds_of_owners(ranges, motions.trials, trials), motions.replays(simulator, trials)
-    known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds]), **(first_guess or {})}
+    known = {**configured_parameters(simulator, [split_name(name)[0] for name in bounds])}
+    known |= by_part(simulator, first_guess or {}, wanted)
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}
     seconds = _learned(motions, replays, seconds)
     first_search = (guess, starts, many, seed)

@@ -1,9 +1,8 @@
-"""Laws that are refined through the simulator: their errors, their comparison, a search by it, and stretches."""
+"""Laws that are refined through the simulator: their errors, a search by these, and the stretches of a body."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import fmean
 from typing import Final
 
 import numpy as np
@@ -17,48 +16,12 @@ from ...mesh.volume_mesh import Mesh
 from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay, Start
+from ..scores import Score
 from .law import LawClass, branches_of, family, longest_side
 from .search import Identification
-from .uncertainty import redundancy
 
-_CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
-_SIGNIFICANT: Final = 2.0  # standard errors
 _RUBBERY: Final = 25.0  # least bulk over shear modulus in the first guess of a search; Poisson's ratio of 0.49
 _MEMBERS: Final = {"branches": ("prony",), "fibres": ("fibre",)}  # names of parameters of a group begin with these
-
-
-@dataclass(frozen=True)
-class Score:
-    """Errors of a simulator on trials: in each frame the mean square over the squared amplitude of the trial."""
-
-    frames: tuple[FloatArray, ...]  # (T,) of each trial
-
-    @property
-    def error(self) -> float:
-        """Root mean square over the amplitude, over all trials; infinite if one failed."""
-        if not self.frames:
-            return math.inf
-        square = fmean(float(of_trial.mean()) for of_trial in self.frames)
-        return math.sqrt(square) if math.isfinite(square) else math.inf
-
-    def beats(self, other: "Score") -> bool:
-        """Whether the error is at most half, or its mean square smaller by two standard errors.
-
-        Frames are correlated in time, so that a short trial may show no less than a large gain. Of static poses the
-        standard error is that of the trials' mean; one pose has none, and its error must be smaller by 5 %.
-        """
-        if not math.isfinite(self.error) or self.error <= _CLEARLY * other.error:
-            return self.error < other.error
-        less = [theirs - ours for ours, theirs in zip(self.frames, other.frames, strict=True)]
-        means = np.array([d.mean() for d in less])
-        if max(len(d) for d in less) > 1:
-            variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
-            doubt = math.sqrt(sum(variance)) / len(less)
-        elif len(less) > 1:
-            doubt = float(means.std(ddof=1)) / math.sqrt(len(less))
-        else:
-            return self.error < _CLOSER * other.error
-        return float(means.mean()) > _SIGNIFICANT * doubt
 
 
 @dataclass(frozen=True)

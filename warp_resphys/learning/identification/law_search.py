@@ -28,7 +28,8 @@ from ...io.errors import InputError, checks_types, naming
 from ...io.parts import Checkpoint
 from ...settings.learning import Bounds, LawSettings, Prior
 from ..observed_motions import Identified, ObservedMotions
-from ..parameters import Limits, check_names, identifiable_parameters, ranges_of
+from ..parameters import Limits, by_part, check_names, identifiable_parameters, ranges_of
+from ..scores import Score
 from .law import (
     VISCOSITIES,
     IdentifiedLaw,
@@ -41,7 +42,7 @@ from .law import (
     is_shape,
     strong_names,
 )
-from .law_scores import RefinedLaw, Score, scores_of, stretches_in, tried_without_states
+from .law_scores import RefinedLaw, scores_of, stretches_in, tried_without_states
 from .misfit import Misfit
 from .search import Identification, first_points, refined_searches
 from .weak_form import KnownMotion, WeakForm
@@ -96,9 +97,10 @@ def identify_law(
         raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
     if known is not None and not {"model", "parameters"} <= {*known}:
         raise InputError(f"known has {', '.join(known)}: a law of this version has model and parameters.")
-    ranges = ranges_of(parameters or {})
+    wanted = ranges_of(parameters or {})
     with naming("parameters: "):
-        check_names(ranges, identifiable_parameters(simulator))
+        check_names(wanted, identifiable_parameters(simulator))
+    ranges = by_part(simulator, wanted, wanted)
     names = motions.trials.chosen(train)
     if motions.train_fraction < 1.0:
         learned = motions.train_fraction * float(motions.trials.times.max())

@@ -24,12 +24,13 @@ from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
 from ...settings.learning import Bounds
 from ...stepping.state import State
+from ..metrics import redundancy
 from ..parameters import check_names, split_name
 from ..placement import Accuracy, DisplacedMarkers
 from ..replay import Replay, Start, exact
 from ..trial_batch import TrialBatch
 from .nuisances import NuisanceFit, Nuisances
-from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, redundancy, uncertainty_of
+from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, uncertainty_of
 
 _LEAST_WEIGHT = 1e-18  # of the priors, where the residuals are rounding
 _MOST_ITERATIONS = 200  # of a solve; steps take a handful, and parameters that need more have failed

@@ -17,13 +17,13 @@ parameter's prior.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
 from typing import NamedTuple
 
 import numpy as np
 
 from ...io.arrays import Brief, FloatArray
 from ...settings.learning import Bounds
+from ..metrics import autocorrelation
 from .nuisances import Nuisances
 
 _UNIFORM = 12.0  # reciprocal variance of a parameter in its range, as a fraction of it
@@ -161,19 +161,6 @@ def uncertainty_of(linear: LinearMisfit, bounds: Mapping[str, Bounds], unit: Flo
     )
 
 
-def _autocorrelation(series: FloatArray) -> list[float]:
-    """Autocorrelation of (T, C) values at lags of 1, 2, ... frames, up to its first zero."""
-    products = [float((series[lag:] * series[: len(series) - lag]).sum()) for lag in range(len(series) // 2)]
-    if not products or products[0] <= 0.0:
-        return []
-    return [value / products[0] for value in takewhile(lambda value: value > 0.0, products[1:])]
-
-
-def redundancy(series: FloatArray) -> float:
-    """Number of correlated frames of a series (T, C) with as much information as one independent frame."""
-    return 1.0 + 2.0 * sum(_autocorrelation(series))
-
-
 def _scatter(rows: FloatArray, jacobian: FloatArray) -> FloatArray:
     """(P, P) covariance of J^T e, for errors e of unit variance that are as correlated in time as the residuals.
 
@@ -183,7 +170,7 @@ def _scatter(rows: FloatArray, jacobian: FloatArray) -> FloatArray:
     """
     slopes = jacobian.reshape(*rows.shape, -1)
     covariance = np.einsum("tcp,tcq->pq", slopes, slopes)
-    for lag, correlation in enumerate(_autocorrelation(rows), 1):
+    for lag, correlation in enumerate(autocorrelation(rows), 1):
         lagged = correlation * np.einsum("tcp,tcq->pq", slopes[lag:], slopes[:-lag])
         covariance += lagged + lagged.T
     values, vectors = np.linalg.eigh(covariance)  # A truncated autocorrelation may leave negative eigenvalues.

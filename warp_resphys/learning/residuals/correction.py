@@ -17,6 +17,7 @@ from ...io.errors import ConvergenceError, InputError, in_short
 from ...io.safe_files import read_checkpoint, write_checkpoint
 from ...stepping.inputs import Inputs
 from ...stepping.state import State
+from ..scores import HeldOutTest
 from .networks import NextState, ResidualForce, StateMap, restore
 
 COROTATED: Final = "corotated"
@@ -251,12 +252,14 @@ class Learned(Brief):
         range_: training range to which roll-outs clamp its inputs; None for no clamping.
         force_frame: frame of the predicted forces, see `force_frames`.
         training: ``kept``, the selection and error of the weights, and ``epochs``, a record of each.
+        test: of the network on held-out trials; None: it was not tested.
     """
 
     network: StateMap
     range_: Range | None = None
     force_frame: str = "world"
     training: Mapping[str, Any] = field(default_factory=dict)
+    test: HeldOutTest | None = None
 
     def to(self, device: torch.device) -> "Learned":
         """Returns the model on a device; its network moves there."""
@@ -270,7 +273,8 @@ class Learned(Brief):
 
     def description(self) -> dict[str, Any]:
         """Metadata of a checkpoint besides the description of the network."""
-        return {"range": None if self.range_ is None else self.range_.description(), "force_frame": self.force_frame}
+        range_ = None if self.range_ is None else self.range_.description()
+        return {"range": range_, "force_frame": self.force_frame, "test": self.test}
 
     def write(self, path: Path, fingerprint: str) -> None:
         """Writes a checkpoint of the network.
@@ -292,7 +296,7 @@ class Learned(Brief):
         tensors, description = read_checkpoint(path, _KINDS[network_type])
         network, limits = restore(network_type, tensors, description).to(device), description["range"]
         range_ = None if limits is None else Range.restore(limits, network.linear)
-        return cls(network, range_, str(description["force_frame"]))
+        return cls(network, range_, str(description["force_frame"]), test=description["test"])
 
 
 def force_frames(simulator: Simulator, kind: str) -> VertexFrames | None:

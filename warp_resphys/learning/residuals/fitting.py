@@ -8,20 +8,22 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
 import torch
 
 from ...data.trials import GIVEN, RESTING, STATIC
 from ...dynamics.modes import RestStiffness
 from ...dynamics.simulator import Simulator
+from ...io.arrays import FloatArray
 from ...io.errors import InputError, checks_types
 from ...io.progress import Progress
 from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
-from ..evaluation import rollout_error
+from ..evaluation import HeldOutRollouts
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay, Start, Windows
+from ..scores import HeldOutTest, held_out_test, text_of
 from .correction import Learned, Range, force_frames
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model
@@ -30,6 +32,8 @@ from .training import EpochTrainer, Samples, SequenceTrainer, Trainer
 
 log = logging.getLogger(__name__)
 _SAVE_SECONDS = 10.0
+_FOLDS: Final = 3  # of the training trials, without validation trials
+HELD_OUT: Final = "left-out training"
 
 Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
@@ -230,11 +234,11 @@ class Fitting:
         network = self.new_network(train, settings)
         learned = Learned(network, self._range_of(network, train), self.force_frame)
         counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
-        error = rollout_error(counting, self.motions, judged, self.identified, self.data_driven)
+        rollouts = HeldOutRollouts(counting, self.motions, judged, self.identified, self.data_driven)
         kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
 
         def judge(weights: StateMap) -> float:
-            return error(replace(learned, network=weights))
+            return rollouts.error_mm(replace(learned, network=weights))
 
         return kind(network, train, validation, judge, settings.trainer, settings.seed), learned
 
@@ -267,7 +271,7 @@ class Fitting:
             assert isinstance(network, ResidualForce)
             return network.double()
 
-        epochs, after = None, 0
+        epochs, after, test = None, 0, None
         if loop.start == "steps":
             first, _ = self._on_steps(samples, settings)
             run_epochs(f"{name}: steps", first)
@@ -275,14 +279,45 @@ class Fitting:
         elif loop.hold_out and not validation and len(train) > 1:
             parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
             with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
-                epochs = cross_validated_epochs(make_network, parts, loop, progress.advance)
+                epochs, (below, errors) = cross_validated_epochs(make_network, parts, loop, progress.advance)
+            sizes = [size for _, held_out in parts for size in held_out.amplitudes_mm()]
+            test = held_out_test(train, HELD_OUT, errors, below, sizes)
+            epochs = epochs if test["used"] else 0
             log.debug("%s: %d epochs are best for held-out trials", name, epochs)
             network = make_network()
         else:
             network = make_network()
         trainer = InTheLoop(network, loss(train, loop.window), loss(validation or train), loop, epochs, after)
         trainer.begin()
-        return trainer, Learned(trainer.model, self._range_of(trainer.model, samples), self.force_frame)
+        return trainer, Learned(trainer.model, self._range_of(trainer.model, samples), self.force_frame, test=test)
+
+    def test(self, learned: Learned, settings: TrainingSettings, name: str) -> HeldOutTest:
+        """Tests a network beside the simulator alone: on the validation trials, or on training trials in turn.
+
+        Without validation trials, a third of the training trials is left out of a fit each time; a single trial is
+        tested on itself.
+        """
+        if self.validation or len(self.train) == 1:
+            parts = [(learned, self.validation or self.train)]
+        else:
+            parts, count = [], min(len(self.train), _FOLDS)
+            for number in range(count):
+                left_out = self.train[number::count]
+                rest = tuple(name for name in self.train if name not in left_out)
+                trainer, fitted = replace(self, train=rest).trainer(settings, name)
+                run_epochs(f"{name}: without {number + 1} of {count}", trainer)
+                parts.append((replace(fitted, network=trainer.use_best()), left_out))
+        counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
+        names, errors, below, sizes = list[str](), list[FloatArray](), list[FloatArray](), list[float]()
+        for fitted, trials in parts:
+            common = (counting, self.motions, trials, self.identified)
+            runs = [HeldOutRollouts(*common, data_driven=kind) for kind in (self.data_driven, False)]
+            names += runs[0].names
+            sizes += runs[0].amplitudes_mm()
+            errors += runs[0].errors(fitted)
+            below += runs[1].errors(None)
+        split = "validation" if self.validation else HELD_OUT if len(self.train) > 1 else "training"
+        return held_out_test(names, split, errors, below, sizes)
 
     def _group(
         self,
@@ -330,8 +365,12 @@ def fit(
     error = trainer.best_error if math.isfinite(trainer.best_error) else None
     if error is None:
         log.warning("%s: the selected weights diverge on the validation split", name)
+    learned = replace(learned, network=best)
+    test = learned.test or fitting.test(learned, settings, name)
+    if not test["used"]:
+        log.warning("%s: the network is no clear gain: %s", name, text_of(test))
     kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
-    return replace(learned, network=best, training={"kept": kept, "epochs": trainer.history})
+    return replace(learned, training={"kept": {**kept, "test": test}, "epochs": trainer.history}, test=test)
 
 
 def run_epochs(

@@ -21,6 +21,7 @@ import torch
 from typing_extensions import override
 
 from ...dynamics.frames import BaseFrame, VertexFrames
+from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...settings.learning import InTheLoopSettings
 from ..replay import Replay, Start, Windows
@@ -51,10 +52,13 @@ class MotionLoss:
     Args:
         groups: of trials.
         parameters: (1,) identified physical parameters.
+
+    Attributes:
+        judged: for each call of `error_mm`, the mean distances (T,) by frame of each trial [mm], NaN where it diverged.
     """
 
     def __init__(self, groups: Sequence[TrialGroup], parameters: Mapping[str, torch.Tensor]) -> None:
-        self._groups, self._parameters = groups, parameters
+        self._groups, self._parameters, self.judged = groups, parameters, list[list[FloatArray]]()
         counts = [len(group.replay.trials.names) for group in groups]
         shares = [count / sum(counts) for count in counts]
         self._weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
@@ -80,14 +84,25 @@ class MotionLoss:
         return torch.stack([(errors.square().sum((1, 2, 3)) * weight).sum() for errors, weight in pairs]).sum()
 
     def error_mm(self, model: ResidualForce | None) -> float:
-        """Mean distance of the seen markers, all trials with equal weight [mm]; infinite where a trial diverged."""
+        """Mean distance of the seen markers, all trials with equal weight [mm]; infinite where a trial diverged.
+
+        The distances by frame are kept in `judged`.
+        """
+        seen = [group.replay.trials.seen for group in self._groups]
         try:
             with torch.no_grad():
-                distances = [errors.norm(dim=-1).sum((1, 2)) for errors in self._errors(model)]
+                distances = [errors.norm(dim=-1) for errors in self._errors(model)]
         except ConvergenceError:
+            self.judged.append([np.full(1, np.nan) for one in seen for _ in one])
             return float("inf")
-        seen = [group.replay.trials.seen.sum((1, 2)) for group in self._groups]
-        return 1e3 * float(torch.cat([d / s for d, s in zip(distances, seen, strict=True)]).mean())
+        pairs = [*zip(distances, seen, strict=True)]
+        frames = [(row.sum(1) / s.sum(1))[s.any(1)] for d, shown in pairs for row, s in zip(d, shown, strict=True)]
+        self.judged.append([1e3 * row.double().cpu().numpy() for row in frames])
+        return 1e3 * float(torch.cat([d.sum((1, 2)) / s.sum((1, 2)) for d, s in pairs]).mean())
+
+    def amplitudes_mm(self) -> list[float]:
+        """Amplitudes of the trials [mm]."""
+        return [1e3 * size for group in self._groups for size in group.replay.trials.amplitude.tolist()]
 
 
 class InTheLoop(EpochTrainer[ResidualForce]):
@@ -186,7 +201,7 @@ def cross_validated_epochs(
     parts: Sequence[tuple[MotionLoss, MotionLoss]],
     settings: InTheLoopSettings,
     advance: Callable[[], None],
-) -> int:
+) -> tuple[int, tuple[list[FloatArray], list[FloatArray]]]:
     """Returns the number of epochs with the smallest mean error on held-out motions, by cross-validation.
 
     Args:
@@ -197,7 +212,8 @@ def cross_validated_epochs(
         advance: called after every epoch of every fold.
 
     Returns:
-        The number of epochs; 0 where training never improves on zero force.
+        The number of epochs, 0 where training never improves on zero force, and the mean distances (T,) by frame of all
+        held-out motions [mm], with zero force and after that number.
     """
     settings = settings.changed(rollout_every=1)
     trainers = [InTheLoop(make_model(), train, held_out, settings) for train, held_out in parts]
@@ -207,7 +223,9 @@ def cross_validated_epochs(
         means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
         if trainers[0].finished or len(means) - 1 - best >= settings.patience:
-            return best
+            judged = [held_out.judged for _, held_out in parts]
+            before, after = ([row for of_part in judged for row in of_part[epoch]] for epoch in (0, best))
+            return best, (before, after)
         for trainer in trainers:
             trainer.run_epoch()
             advance()

@@ -1,0 +1,95 @@
+"""Errors of models on held-out motions, and whether one model is clearly closer to them than the one that it corrects.
+
+Nothing that is learned is used unless it is.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Final, TypedDict
+
+import numpy as np
+
+from ..io.arrays import FloatArray
+from .metrics import redundancy
+
+_CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
+_SIGNIFICANT: Final = 2.0  # standard errors by which a law must be closer
+_SPREAD: Final = 1.0  # standard errors by which a network must be closer
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of a simulator on trials: in each frame the mean square over the squared amplitude of the trial."""
+
+    frames: tuple[FloatArray, ...]  # (T,) of each trial
+
+    @classmethod
+    def of(cls, trials: Iterable[tuple[FloatArray, float]]) -> "Score":
+        """Returns the score of trials, each with its mean distances (T,) by frame and its amplitude, in one unit."""
+        return cls(tuple(np.square(np.nan_to_num(away, nan=math.inf) / amplitude) for away, amplitude in trials))
+
+    @property
+    def error(self) -> float:
+        """Root mean square over the amplitude, over all trials; infinite if one failed."""
+        if not self.frames:
+            return math.inf
+        square = fmean(float(of_trial.mean()) for of_trial in self.frames)
+        return math.sqrt(square) if math.isfinite(square) else math.inf
+
+    def beats(self, other: "Score", standard_errors: float = _SIGNIFICANT) -> bool:
+        """Whether the error is at most half, or its mean square smaller by some standard errors.
+
+        Frames are correlated in time, so that a short trial may show no less than a large gain. Of static poses the
+        standard error is that of the trials' mean; one pose has none, and its error must be smaller by 5 %.
+        """
+        if not math.isfinite(self.error) or self.error <= _CLEARLY * other.error:
+            return self.error < other.error
+        less = [theirs - ours for ours, theirs in zip(self.frames, other.frames, strict=True)]
+        means = np.array([d.mean() for d in less])
+        if max(len(d) for d in less) > 1:
+            variance = [float(d.var()) * redundancy((d - d.mean())[:, None]) / len(d) for d in less]
+            doubt = math.sqrt(sum(variance)) / len(less)
+        elif len(less) > 1:
+            doubt = float(means.std(ddof=1)) / math.sqrt(len(less))
+        else:
+            return self.error < _CLOSER * other.error
+        return float(means.mean()) > standard_errors * doubt
+
+
+class HeldOutTest(TypedDict):
+    """Errors on held-out trials of a model that was learned, and of the simulator alone."""
+
+    trials: list[str]
+    split: str  # that they belong to
+    error_mm: float | None  # mean over the trials of their mean errors; None where a roll-out diverged
+    below_mm: float | None  # of the simulator alone
+    used: bool  # whether the model is clearly closer, see `Score.beats`
+
+
+def held_out_test(
+    trials: Sequence[str], split: str, errors: Iterable[FloatArray], below: Iterable[FloatArray], sizes: Iterable[float]
+) -> HeldOutTest:
+    """Compares a model with the one below it on held-out trials.
+
+    Args:
+        trials: their names.
+        split: that they belong to.
+        errors: mean distances (T,) by frame of each trial [mm], NaN where the roll-out diverged.
+        below: those of the model below.
+        sizes: amplitudes of the trials [mm].
+    """
+    rows, others, sizes = [*errors], [*below], [*sizes]
+    scores = [Score.of(zip(some, sizes, strict=True)) for some in (rows, others)]
+    means = [fmean(float(row.mean()) for row in some) for some in (rows, others)]
+    error, alone = (mean if math.isfinite(mean) else None for mean in means)
+    used = scores[0].beats(scores[1], _SPREAD)
+    return HeldOutTest(trials=[*trials], split=split, error_mm=error, below_mm=alone, used=used)
+
+
+def text_of(test: HeldOutTest) -> str:
+    """Returns half a sentence on the errors of a learned model on held-out trials, and of the simulator without it."""
+    error, below = ("diverges" if x is None else f"has {x:.3g} mm" for x in (test["error_mm"], test["below_mm"]))
+    trials = ", ".join(test["trials"])
+    return f"on the {test['split']} trials ({trials}) it {error}, and the simulator without it {below}"

@@ -73,6 +73,8 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
         values |= arrays | {name: _KINDS.get(name, Polynomial)(arrays[name], order) for name, order in orders.items()}
         arguments = {field.name: values[field.name] for field in fields(ReducedModel) if field.name != "force"}
         arguments |= {key: tuple(arguments[key]) for key in ("labels", "filters", "times")}
+        acts = arguments["acts"].items()
+        arguments["acts"] = {word: np.array(value) if isinstance(value, list) else value for word, value in acts}
         if "push" not in orders:
             return ReducedModel(**arguments)
         if learned is None:

@@ -263,7 +263,9 @@ def response_of(quantity: Quantity, parameters: Mapping[str, Any], parts: Sequen
             known[word] = parameters[name]
         if (one := next((value for value in of_parts if value is not None), None)) is not None:
             common = known.get(word, 0.0 * one + (1.0 if word in UNITS else 0.0))
-            known[word] = _library(one).stack([common if value is None else value for value in of_parts], -1)
+            values = [common if value is None else value for value in of_parts]
+            like = _library(one)
+            known[word] = like.stack(like.broadcast_tensors(*values) if like is torch else values, -1)
     return {**known, "lower": quantity.lower, "typical": quantity.typical}
 
 

@@ -5,7 +5,7 @@ parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
@@ -83,11 +83,15 @@ def by_part(simulator: Simulator, values: Mapping[str, T], ranges: Mapping[str, 
     names: dict[str, list[str]] = {}
     for part, (whole, _) in parameters_of_parts(simulator).items():
         names.setdefault(whole, []).append(part)
-    found = dict[str, T]()
-    for name, value in values.items():
-        each = name in ranges and ranges[name].per == "part"
-        found |= dict.fromkeys(names[name] if each else [name], value)
-    return found
+    shared = {name: value for name, value in values.items() if name in ranges and ranges[name].per == "part"}
+    found = {part: value for name, value in shared.items() for part in names.get(name, [name])}
+    return found | {name: value for name, value in values.items() if name not in shared}
+
+
+def replaced(simulator: Simulator, known: Mapping[str, Any], others: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values of parameters with others; a common one takes the place of those of the parts."""
+    of_parts = parameters_of_parts(simulator)
+    return {name: x for name, x in known.items() if of_parts.get(name, ("", 0))[0] not in others} | {**others}
 
 
 def check_names(names: Iterable[str], known: Sequence[str]) -> None:
@@ -123,7 +127,11 @@ def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequ
         check_names(ranges, known)
     of_parts = parameters_of_parts(simulator)
     for name, limits in ranges.items():
-        if (parts := [part for part, (whole, _) in of_parts.items() if whole == name]) and {*parts} <= {*ranges}:
+        parts = [part for part, (whole, _) in of_parts.items() if whole == name]
+        beside = [part for part in parts if part in ranges]
+        if limits.per == "part" and beside:
+            raise InputError(f"parameters.{name}.per is part, but parameters has {beside[0]} as well: take one out.")
+        if parts and {*parts} <= {*ranges}:
             raise InputError(f"parameters names {name} and its parts, {', '.join(parts)}: choose one.")
         if (word := command_of(simulator, name)[1]) in _NOT_NEGATIVE and limits.lower < 0.0:
             raise InputError(

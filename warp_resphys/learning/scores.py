@@ -16,7 +16,10 @@ from .metrics import redundancy
 
 _CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
 _SIGNIFICANT: Final = 2.0  # standard errors by which a law must be closer
-_SPREAD: Final = 1.0  # standard errors by which a network must be closer
+_SPREAD: Final = 1.0  # standard errors by which a network must be closer, of the frames and of the trials
+_LEAST_GAIN: Final = 0.99  # ratio of errors below which a gain may count
+_LEAST_SIZE: Final = 0.1  # of the largest amplitude, below which a trial counts as one of this size
+_NAMED: Final = 5  # trials of a test at most, whose names a sentence has
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ def held_out_test(
 ) -> HeldOutTest:
     """Compares a model with the one below it on held-out trials.
 
+    Besides `Score.beats`, its gain must be larger than its standard error over the trials.
+
     Args:
         trials: their names.
         split: that they belong to.
@@ -80,16 +85,25 @@ def held_out_test(
         below: those of the model below.
         sizes: amplitudes of the trials [mm].
     """
-    rows, others, sizes = [*errors], [*below], [*sizes]
-    scores = [Score.of(zip(some, sizes, strict=True)) for some in (rows, others)]
+    seen = [(*of_trial,) for of_trial in zip(errors, below, sizes, strict=True) if len(of_trial[0])]
+    rows, others, found = [a for a, _, _ in seen], [b for _, b, _ in seen], np.array([size for *_, size in seen])
+    least = _LEAST_SIZE * float(
+        np.nanmax(found, initial=0.0)
+    )  # Trials that hardly move have no amplitude to divide by.
+    amplitudes = np.where(found > least, found, least or 1.0).tolist()
+    scores = [Score.of(zip(some, amplitudes, strict=True)) for some in (rows, others)]
     means = [fmean(float(row.mean()) for row in some) for some in (rows, others)]
     error, alone = (mean if math.isfinite(mean) else None for mean in means)
-    used = scores[0].beats(scores[1], _SPREAD)
+    used = scores[0].beats(scores[1], _SPREAD) and scores[0].error < _LEAST_GAIN * scores[1].error
+    if used and len(rows) > 1 and math.isfinite(scores[1].error):
+        gains = [float(b.mean() - a.mean()) for a, b in zip(scores[0].frames, scores[1].frames, strict=True)]
+        used = fmean(gains) > _SPREAD * float(np.std(gains, ddof=1)) / math.sqrt(len(gains))
     return HeldOutTest(trials=[*trials], split=split, error_mm=error, below_mm=alone, used=used)
 
 
 def text_of(test: HeldOutTest) -> str:
     """Returns half a sentence on the errors of a learned model on held-out trials, and of the simulator without it."""
     error, below = ("diverges" if x is None else f"has {x:.3g} mm" for x in (test["error_mm"], test["below_mm"]))
-    trials = ", ".join(test["trials"])
-    return f"on the {test['split']} trials ({trials}) it {error}, and the simulator without it {below}"
+    trials = ", ".join(test["trials"]) if len(test["trials"]) <= _NAMED else str(len(test["trials"]))
+    clear = "" if test["used"] else ", which it does not clearly beat"
+    return f"on the {test['split']} trials ({trials}) it {error}, and the simulator without it {below}{clear}"

@@ -34,7 +34,7 @@ class KeptWeights(TypedDict):
     selection: str
     epoch: int
     validation_rollout_error_mm: float | None
-    test: HeldOutTest
+    test: HeldOutTest | None  # None: of a network in place of the simulator
 
 
 class UsedLaw(LawContent):
@@ -309,7 +309,8 @@ def unused(metrics: Metrics) -> dict[str, str]:
     tests: dict[str, list[HeldOutTest]] = {}
     for fold in folds_in(metrics):
         for model, kept in fold.get("networks", {}).items():
-            tests.setdefault(model, []).append(kept["test"])
+            if (test := kept.get("test")) is not None:
+                tests.setdefault(model, []).append(test)
     return {
         model: text_of(found[0]) if len(found) == 1 else f"it is clearly closer in none of the {len(found)} folds"
         for model, found in tests.items()

@@ -81,7 +81,7 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
 
     Of the models without physics, the best one of each column is shown. The metrics are of a split or of folds.
     """
-    groups, idle = grouped_errors(metrics, settings), not_used(metrics)
+    groups, idle = grouped_errors(metrics, settings), unused(metrics)
     columns = {
         title: {model: error_cell(by_model) for model, by_model in errors.items()} for title, errors in groups.items()
     }
@@ -140,20 +140,19 @@ def less_error(best: str, second: str, share: float) -> str:
 
 def verdict(metrics: Metrics, settings: RunSettings) -> list[str]:
     """Returns a sentence on what is best, by how much and on how many trials, and at most two sentences of advice."""
-    groups, learned = [*grouped_errors(metrics, settings).values()], unused(metrics)
-    idle = not_used(metrics)
+    groups, idle = [*grouped_errors(metrics, settings).values()], unused(metrics)
     if not groups or not {*_RANKED} & groups[-1].keys():
         return []
     known = known_errors(groups[-1], idle)
     beyond = "beyond the training loads, " if len(groups) > 1 else ""
     texts = [f"{beyond}{_best_text(known)}"] if known else ["all models diverged"]
-    texts += [f"{model_words(model)} is not used: {idle[model]}" for model in CORRECTED if model in idle]
+    texts += [f"{model_words(model)} is not used: {idle[model]}" for model in idle]
     inside = best_of(known_errors(groups[0], idle), _RANKED) if len(groups) > 1 else ""
     advice = [f"within them, {model_words(inside)} is {'enough' if inside in BASELINES else 'best'}"] if inside else []
     if doubts := [*_failed(groups[-1], known), *_doubts(metrics, settings, known, len(groups))]:
         advice += [f"check before use: {'; '.join(doubt.fact for doubt in doubts[:_MOST_DOUBTS])}", doubts[0].remedy]
     elif not inside:
-        advice += _use(known, learned)
+        advice += _use(known)
     return [unbroken(f"{text[0].upper()}{text[1:]}.") for text in [*texts, *advice[:2]] if text]
 
 
@@ -190,19 +189,13 @@ def is_clear(gain: Gain) -> bool:
     return gain.trials < LEAST_TRIALS or gain.lower > 0.0
 
 
-def not_used(metrics: Metrics) -> dict[str, str]:
-    """Returns why learned corrections of the simulator are not used, by model; their roll-outs are the simulator's."""
-    return {model: why for model, why in unused(metrics).items() if model in CORRECTED}
-
-
-def _use(known: Known, without: Collection[str]) -> Iterator[str]:
+def _use(known: Known) -> Iterator[str]:
     """Yields which model to use: of those that are not clearly worse than the best one, the simplest simulator."""
     best = best_of(known, _RANKED)
     if best in BASELINES:
         yield f"{model_words(best)} is enough for trials like these; to judge the simulator, test it on others"
     elif best:
-        usable = [model for model in _RANKED if model in known and model not in (*BASELINES, *without)]
-        chosen = next(model for model in usable if _as_good(known[model], known[best]))
+        chosen = next(m for m in _RANKED if m in known and m not in BASELINES and _as_good(known[m], known[best]))
         simpler = f", which is simpler than {model_words(best)} and not significantly worse"
         yield f"use {model_words(chosen)}{simpler * (chosen != best)}"
 

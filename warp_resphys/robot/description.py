@@ -16,7 +16,7 @@ from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
-from ..experiment.experiment import LEARNED, SIMFREE, Experiment, network_of
+from ..experiment.experiment import SIMFREE, Experiment, network_of
 from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
 from ..io.arrays import FloatArray
 from ..io.classes import check_packages
@@ -274,7 +274,7 @@ def describe(folder: Path, model: str) -> Description:
         placement=identified.placement,
         learned=learned,
         filters=actuation.filter_time_constants,
-        sees_payload=model in LEARNED and (actuation.sees_payload or model == SIMFREE),
+        sees_payload=learned is not None and (actuation.sees_payload or model == SIMFREE),
         told_of_base=None if base is None else tuple(base.tolist()),
         seen={
             name: (tuple(x.min((0, 1)).tolist()), tuple(x.max((0, 1)).tolist()))

@@ -173,9 +173,10 @@ def _commands(
     for key, series in inputs.items():
         quantity, parts = robot.simulator.inputs[key], robot.simulator.parts.get(key, ())
         here, there = (response_of(quantity, known, parts) for known in (of_trial, values))
-        if "zero" in here:
+        same = [word for word in here if here[word] is there.get(word)]
+        if "zero" in here and "zero" not in same:
             commands[key] = (series - _column(here["zero"]) + _column(there["zero"])).clamp_min(quantity.lower)
-        if "factor" in here:
+        if "factor" in here and "factor" not in same:
             beyond = commands[key] - sum(_column(there[word]) for word in ("zero", "dead_band") if word in there)
             beyond = beyond.clamp_min(0.0) if "dead_band" in there else beyond
             commands[key] = commands[key] + beyond * (_column(here["factor"]) / _column(there["factor"]) - 1.0)

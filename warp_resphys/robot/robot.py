@@ -18,7 +18,7 @@ from ..dynamics.trajectory import Motion
 from ..energies.materials import MASS_DAMPING
 from ..io.errors import ConvergenceError, InputError
 from ..learning.evaluation import POSE_STEPS
-from ..learning.parameters import check_names, constants_of, identifiable_parameters
+from ..learning.parameters import check_names, constants_of, identifiable_parameters, replaced
 from ..learning.residuals.correction import (
     DIVERGENCE_DISTANCE,
     CorrectedSimulator,
@@ -85,7 +85,7 @@ class Robot:
 
     def _set_parameters(self, parameters: Mapping[str, torch.Tensor | float]) -> None:
         check_names(parameters, identifiable_parameters(self.simulator))
-        known = {**self.description.parameters, **parameters}
+        known = replaced(self.simulator, self.description.parameters, parameters)
         values = {name: self.simulator.tensor(value).reshape(-1) for name, value in known.items()}
         count = max((len(value) for value in values.values()), default=1)
         for name, value in values.items():
@@ -105,7 +105,7 @@ class Robot:
         Raises:
             InputError: an unknown name, or a value out of range.
         """
-        return self._changed(self.simulator, {**self.parameters, **parameters})
+        return self._changed(self.simulator, replaced(self.simulator, self.parameters, parameters))
 
     def integrated_by(self, integrator: str) -> "Robot":
         """Returns the robot, stepped by another time integrator."""

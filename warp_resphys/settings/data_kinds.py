@@ -82,7 +82,9 @@ class TableSettings(Settings):
     names: dict[str, Word] = setting({}, "such headers by those of the file, in place of columns")
     header_lines: Count = setting(0, "lines before the numbers, or before the header")
     rate: Positive | None = setting(
-        None, "rate at which uneven times are sampled again, linearly, with inputs that hold; null: even times", "Hz"
+        None,
+        "rate at which uneven times are sampled again (linearly; inputs hold), or of frames without times; null: even",
+        "Hz",
     )
 
     @model_validator(mode="after")

@@ -139,7 +139,7 @@ class IdentifySettings(Settings):
     @model_validator(mode="after")
     def _guesses_lie_within(self) -> Self:
         for name, value in self.first_guess.items():
-            bounds = self.parameters.get(name)
+            bounds = self.parameters.get(self.key_of(name))
             if bounds is not None and not bounds.lower <= value <= bounds.upper:
                 raise ValueError(
                     f"first_guess.{name} is {value:g}: it must be a number from {bounds.lower:g} to {bounds.upper:g}, "

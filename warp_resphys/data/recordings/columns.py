@@ -86,6 +86,13 @@ class Layout:
         if self.clock is not None:
             stamps = values[:, self.clock] * (self.seconds or 1.0)
         if self.seconds is not None and self.rate is not None:
+            if turned:
+                body = markers[next(iter(turned))]
+                raise DataFileError(
+                    f"{path}: {body} is a rigid body, whose rotations are not sampled again at data.table.rate: export "
+                    "the recording at a constant frame rate."
+                )
+            _check_rise(stamps, lines, path)
             values, stamps, lines = self._even(values, stamps, lines, self.rate, path)
         frames, measured_rate = _frames(stamps, self.seconds is not None, lines, path)
         actuation = None
@@ -118,19 +125,29 @@ class Layout:
     ) -> tuple[FloatArray, FloatArray, list[int]]:
         """Returns values, times [s] and lines at a rate [Hz], from times that rise.
 
-        Channels hold their values; coordinates are interpolated linearly, and are NaN between lines that are further
-        apart than three in the median.
+        Channels hold their last known values; coordinates are interpolated linearly between lines that have them, and
+        are NaN where these are further apart than three in the median.
         """
-        _check_rise(stamps, lines, path)
+        _check_span(stamps, float(np.median(np.diff(stamps))), lines, path)
         times = stamps[0] + np.arange(int((stamps[-1] - stamps[0]) * rate + 1e-6) + 1) / rate
-        before = (np.searchsorted(stamps, times + 1e-9, side="right") - 1).clip(0, len(stamps) - 2)
-        share = ((times - stamps[before]) / (stamps[before + 1] - stamps[before])).clip(0.0, 1.0)[:, None]
-        even = np.where(share > 0.0, (1.0 - share) * values[before] + share * values[before + 1], values[before])
-        apart = np.diff(stamps)[before] > _LONGEST_GAP * np.median(np.diff(stamps))
-        even[apart & (share[:, 0] > 0.0) & (share[:, 0] < 1.0)] = np.nan
-        last = np.where(share[:, 0] < 1.0, before, before + 1)
-        even[:, [*self.channels]], even[:, -1] = values[last][:, [*self.channels]], 0.0
-        return even, times, [lines[row] for row in last]
+        if len(times) < _LEAST_FRAMES:
+            raise DataFileError(f"{path} has less than two frames at {rate:g} Hz: raise data.table.rate.")
+        even = np.zeros((len(times), values.shape[1]))
+        for column in range(values.shape[1] - 1):
+            known = np.isfinite(values[:, column])
+            at, series = stamps[known], values[known, column]
+            after = np.searchsorted(at, times + 1e-9, side="right")
+            if column in self.channels:
+                even[:, column] = np.where(after > 0, series[after - 1], np.nan) if len(at) else np.nan
+            elif len(at) > 1:
+                even[:, column] = np.interp(times, at, series, left=np.nan, right=np.nan)
+                gaps = np.diff(at)[after.clip(1, len(at) - 1) - 1]
+                apart = np.abs(times[:, None] - at[np.stack([after - 1, after], 1).clip(0, len(at) - 1)]).min(1)
+                even[(gaps > _LONGEST_GAP * np.median(np.diff(at))) & (apart > 1e-6), column] = np.nan
+            else:
+                even[:, column] = np.nan
+        before = np.searchsorted(stamps, times + 1e-9, side="right") - 1
+        return even, times, [lines[row] for row in before]
 
     def _markers(self, path: Path) -> tuple[list[str], list[int], dict[int, list[int]]]:
         """Returns labels, the columns of their x, y and z, and those of rotations by the index of the rigid body.
@@ -165,7 +182,8 @@ class Layout:
         for line, row in enumerate(rows[self.first :], start=self.first + 1):
             if not any(row):
                 continue
-            if self.rate is not None and len(row) < self.width and not any(map(any, rows[line:])):
+            sampled = self.seconds is not None and self.rate is not None
+            if sampled and len(row) < self.width and not any(map(any, rows[line:])):
                 log.warning("%s: the last line, %d, is cut off, and left out.", path.name, line)
                 break
             if len(row) < self.width or any(row[self.width :]):
@@ -234,20 +252,27 @@ def _check_rise(stamps: FloatArray, lines: Sequence[int], path: Path) -> None:
         )
 
 
+def _foreign(stamps: FloatArray, row: int, lines: Sequence[int], path: Path) -> DataFileError:
+    """Returns the error of two lines that do not belong together."""
+    return DataFileError(
+        f"{path}, line {lines[row]}: from the line before on, time or frame passes from {stamps[row - 1]:g} to "
+        f"{stamps[row]:g}, so that both do not belong to one recording; check that column."
+    )
+
+
+def _check_span(stamps: FloatArray, interval: float, lines: Sequence[int], path: Path) -> None:
+    """Refuses times or frame numbers of which few were recorded, from their usual interval."""
+    if _LEAST_RECORDED * float(stamps[-1] - stamps[0]) > interval * len(stamps):
+        raise _foreign(stamps, int(np.argmax(np.diff(stamps))) + 1, lines, path)
+
+
 def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -> tuple[IntArray, float | None]:
     """Returns the frame index of every row from its frame number or time [s], and the rate [Hz] from times."""
     _check_rise(stamps, lines, path)
     steps = np.diff(stamps)
     interval, span = float(np.median(steps)) if timed else 1.0, float(stamps[-1] - stamps[0])
 
-    def foreign(row: int) -> DataFileError:
-        return DataFileError(
-            f"{path}, line {lines[row]}: from the line before on, time or frame passes from {stamps[row - 1]:g} to "
-            f"{stamps[row]:g}, so that both do not belong to one recording; check that column."
-        )
-
-    if _LEAST_RECORDED * span > interval * len(stamps):
-        raise foreign(int(np.argmax(steps)) + 1)
+    _check_span(stamps, interval, lines, path)
     if timed:  # Times may be rounded, and frames may be missing.
         single = float(steps[steps < _NEXT * interval].mean())
         interval = span / float(np.round(steps / single).sum())
@@ -261,7 +286,7 @@ def _frames(stamps: FloatArray, timed: bool, lines: Sequence[int], path: Path) -
             "at a constant frame rate."
         )
     if (np.diff(frames) < 1).any():
-        raise foreign(int(np.argmax(np.diff(frames) < 1)) + 1)
+        raise _foreign(stamps, int(np.argmax(np.diff(frames) < 1)) + 1, lines, path)
     if not timed:
         return frames, None
     rate = 1.0 / interval

@@ -127,8 +127,8 @@ def check_pictures(run: RunSettings) -> None:
     for name, limits in wanted.parameters.items():
         if name not in known:
             raise InputError(f"identify.parameters names '{name}': choose from {', '.join(known)}.")
-        if limits.per == "session":
-            raise InputError(f"identify.parameters.{name}.per is session: pictures have all, material, lens and trial.")
+        if limits.per in ("session", "part"):
+            raise InputError(f"identify.parameters.{name}.per is {limits.per}: choose all, material, lens or trial.")
         if limits.per == "lens" and name not in CORRECTIONS:
             raise InputError(f"identify.parameters.{name}.per is lens, and is not of a camera: take all or material.")
         if limits.per == "trial" and name not in _PLACED:

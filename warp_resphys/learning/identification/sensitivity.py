@@ -26,7 +26,7 @@ from ...io.parts import cut
 from ...io.progress import Progress
 from ..metrics import mean_distance
 from ..observed_motions import ObservedMotions
-from ..parameters import HUNG, configured_parameters, split_name, value_name
+from ..parameters import HUNG, configured_parameters, parameters_of_parts, split_name, value_name
 from ..placement import DisplacedMarkers, Placement, by_placement, placement_of
 from ..replay import exact
 from .search import Identification
@@ -110,10 +110,13 @@ def _of_batch(
         replay, start = DisplacedMarkers.replay(motions.replay(simulator, names), start)
     configured = {name: simulator.tensor([x]) for name, x in configured_parameters(simulator, moved).items()}
     sets = {name: x.repeat(1 + len(moved)) for name, x in {**configured, **identified.values(simulator)}.items()}
-    rows = {parameter: row for row, parameter in enumerate(moved, 1)}
+    rows, of_parts = {parameter: row for row, parameter in enumerate(moved, 1)}, parameters_of_parts(simulator)
     for name in sets:
         if (parameter := split_name(name)[0]) in moved:
             sets[name][rows[parameter]] += moved[parameter]
+        elif (whole := of_parts.get(parameter, ("", 0))[0]) in moved and whole not in identified.parameters:
+            # What moves all parts moves each: factors relatively.
+            sets[name][rows[whole]] += moved[whole] * (sets[name][0] if whole.endswith("_factor") else 1.0)
     points = (replay.varied if moved and not replay.is_static else replay)(start, sets)
     slopes: Any = [None] * len(names)
     if placement is not None:

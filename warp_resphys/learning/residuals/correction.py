@@ -296,7 +296,7 @@ class Learned(Brief):
         tensors, description = read_checkpoint(path, _KINDS[network_type])
         network, limits = restore(network_type, tensors, description).to(device), description["range"]
         range_ = None if limits is None else Range.restore(limits, network.linear)
-        return cls(network, range_, str(description["force_frame"]), test=description["test"])
+        return cls(network, range_, str(description["force_frame"]), test=description.get("test"))
 
 
 def force_frames(simulator: Simulator, kind: str) -> VertexFrames | None:

@@ -5,7 +5,6 @@ On single steps of reconstructed trials, or through the simulator on whole motio
 
 import logging
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -28,14 +27,12 @@ from .correction import Learned, Range, force_frames
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model
 from .reconstruction import ReconstructedTrials
-from .training import EpochTrainer, Samples, SequenceTrainer, Trainer
+from .training import EpochTrainer, Samples, SequenceTrainer, Snapshot, Trainer, run_epochs
 
 log = logging.getLogger(__name__)
-_SAVE_SECONDS = 10.0
 _FOLDS: Final = 3  # of the training trials, without validation trials
 HELD_OUT: Final = "left-out training"
 
-Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
 
 
@@ -102,6 +99,7 @@ class Fitting:
         range_guard: whether roll-outs clamp the network's inputs to their range in training.
         fades: whether the force fades out beyond that range.
         device: of the training.
+        coded: names of the trials whose states and forces give the modes of the network; those of `train` if None.
     """
 
     simulator: Simulator
@@ -115,6 +113,7 @@ class Fitting:
     range_guard: bool = False
     fades: bool = False
     device: torch.device | str = "cpu"
+    coded: tuple[str, ...] | None = None
 
     def samples(self, names: Sequence[str]) -> Samples:
         """Collects the single steps of trials; a static pose is one step without motion.
@@ -194,7 +193,8 @@ class Fitting:
     def new_network(self, train: Samples, settings: TrainingSettings) -> StateMap:
         """Makes an untrained network with coders fitted to the training steps, deterministic for a seed."""
         rest, network = self.simulator.rest_positions.to(train.q.device), settings.network
-        if not self.motions.trials.moving(self.train):
+        train = train if self.coded is None else self.samples(self.coded)
+        if not self.motions.trials.moving(self.coded or self.train):
             network = self._limited(network, len(train.q))
         torch.manual_seed(settings.seed)
         by_displacement = not self.data_driven and network.kind == "reduced" and network.force_basis == "displacement"
@@ -294,29 +294,26 @@ class Fitting:
     def test(self, learned: Learned, settings: TrainingSettings, name: str) -> HeldOutTest:
         """Tests a network beside the simulator alone: on the validation trials, or on training trials in turn.
 
-        Without validation trials, a third of the training trials is left out of a fit each time; a single trial is
-        tested on itself.
+        Without validation trials, a third of the training trials that begin alike is left out of a fit each time, with the
+        modes of all; a single one is tested on itself.
         """
-        if self.validation or len(self.train) == 1:
-            parts = [(learned, self.validation or self.train)]
-        else:
-            parts, count = [], min(len(self.train), _FOLDS)
+        alike = [batch for batch in self.motions.trials.batches(self.train) if len(batch) > 1]
+        parts, count = [(learned, self.validation or self.train)], min(max(map(len, alike), default=0), _FOLDS)
+        if not self.validation and count:
+            parts = []
             for number in range(count):
-                left_out = self.train[number::count]
+                left_out = tuple(name for batch in alike for name in batch[number::count])
                 rest = tuple(name for name in self.train if name not in left_out)
-                trainer, fitted = replace(self, train=rest).trainer(settings, name)
+                trainer, fitted = replace(self, train=rest, coded=self.train).trainer(settings, name)
                 run_epochs(f"{name}: without {number + 1} of {count}", trainer)
                 parts.append((replace(fitted, network=trainer.use_best()), left_out))
         counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
         names, errors, below, sizes = list[str](), list[FloatArray](), list[FloatArray](), list[float]()
         for fitted, trials in parts:
-            common = (counting, self.motions, trials, self.identified)
-            runs = [HeldOutRollouts(*common, data_driven=kind) for kind in (self.data_driven, False)]
-            names += runs[0].names
-            sizes += runs[0].amplitudes_mm()
-            errors += runs[0].errors(fitted)
-            below += runs[1].errors(None)
-        split = "validation" if self.validation else HELD_OUT if len(self.train) > 1 else "training"
+            runs = HeldOutRollouts(counting, self.motions, trials, self.identified)
+            names, sizes = names + runs.names, sizes + runs.amplitudes_mm()
+            errors, below = errors + runs.errors(fitted), below + runs.errors(None)
+        split = "validation" if self.validation else HELD_OUT if count else "training"
         return held_out_test(names, split, errors, below, sizes)
 
     def _group(
@@ -366,49 +363,8 @@ def fit(
     if error is None:
         log.warning("%s: the selected weights diverge on the validation split", name)
     learned = replace(learned, network=best)
-    test = learned.test or fitting.test(learned, settings, name)
-    if not test["used"]:
+    test = learned.test if fitting.data_driven or learned.test else fitting.test(learned, settings, name)
+    if test is not None and not test["used"]:
         log.warning("%s: the network is no clear gain: %s", name, text_of(test))
     kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
     return replace(learned, training={"kept": {**kept, "test": test}, "epochs": trainer.history}, test=test)
-
-
-def run_epochs(
-    name: str,
-    trainer: EpochTrainer[Any],
-    save: Callable[[Snapshot], None] = lambda kept: None,
-    watch: Callable[[Mapping[str, float]], None] | None = None,
-) -> None:
-    """Trains to the end; saves the last complete epoch regularly, and whenever training ends or is interrupted.
-
-    Args:
-        name: description of the progress bar.
-        trainer: trainer, possibly resumed.
-        save: saves a snapshot.
-        watch: is called with the record of every epoch; an exception raised by it ends the training.
-    """
-    saved = time.monotonic()
-    kept = _copy(trainer.snapshot())
-    with Progress(name, trainer.settings.epochs, "epochs", trainer.epoch) as progress:
-        try:
-            while not trainer.finished:
-                record = trainer.run_epoch()
-                kept = _copy(trainer.snapshot())
-                if time.monotonic() - saved > _SAVE_SECONDS:
-                    save(kept)
-                    saved = time.monotonic()
-                shown: dict[str, object] = {"loss": f"{record['train_loss']:.2e}"}
-                if not math.isnan(trainer.best_error):
-                    shown["rollout"] = f"{trainer.best_error:.2g} mm"
-                progress.advance(1, **shown)
-                if watch is not None:
-                    watch(record)
-        finally:
-            save(kept)
-
-
-def _copy(snapshot: Snapshot) -> Snapshot:
-    """Copies a snapshot, whose tensors the next epoch changes in place."""
-    tensors, metadata = snapshot
-    copies = {name: tensor.detach().clone() for name, tensor in tensors.items()}
-    return copies, {**metadata, "history": list(metadata["history"])}

@@ -223,7 +223,7 @@ def cross_validated_epochs(
         means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
         if trainers[0].finished or len(means) - 1 - best >= settings.patience:
-            judged = [held_out.judged for _, held_out in parts]
+            judged = [held_out.judged[-len(means) :] for _, held_out in parts]
             before, after = ([row for of_part in judged for row in of_part[epoch]] for epoch in (0, best))
             return best, (before, after)
         for trainer in trainers:

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,8 +12,13 @@ import torch
 from typing_extensions import override
 
 from ...io.errors import InputError
+from ...io.progress import Progress
 from ...settings.learning import EpochSettings, TrainerSettings
 from .networks import Model, StateMap
+
+_SAVE_SECONDS = 10.0
+
+Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -329,3 +335,44 @@ def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:
 def with_prefix(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Returns the tensors whose names start with a prefix, without the prefix."""
     return {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+
+
+def run_epochs(
+    name: str,
+    trainer: EpochTrainer[Any],
+    save: Callable[[Snapshot], None] = lambda kept: None,
+    watch: Callable[[Mapping[str, float]], None] | None = None,
+) -> None:
+    """Trains to the end; saves the last complete epoch regularly, and whenever training ends or is interrupted.
+
+    Args:
+        name: description of the progress bar.
+        trainer: trainer, possibly resumed.
+        save: saves a snapshot.
+        watch: is called with the record of every epoch; an exception raised by it ends the training.
+    """
+    saved = time.monotonic()
+    kept = _copy(trainer.snapshot())
+    with Progress(name, trainer.settings.epochs, "epochs", trainer.epoch) as progress:
+        try:
+            while not trainer.finished:
+                record = trainer.run_epoch()
+                kept = _copy(trainer.snapshot())
+                if time.monotonic() - saved > _SAVE_SECONDS:
+                    save(kept)
+                    saved = time.monotonic()
+                shown: dict[str, object] = {"loss": f"{record['train_loss']:.2e}"}
+                if not math.isnan(trainer.best_error):
+                    shown["rollout"] = f"{trainer.best_error:.2g} mm"
+                progress.advance(1, **shown)
+                if watch is not None:
+                    watch(record)
+        finally:
+            save(kept)
+
+
+def _copy(snapshot: Snapshot) -> Snapshot:
+    """Copies a snapshot, whose tensors the next epoch changes in place."""
+    tensors, metadata = snapshot
+    copies = {name: tensor.detach().clone() for name, tensor in tensors.items()}
+    return copies, {**metadata, "history": list(metadata["history"])}

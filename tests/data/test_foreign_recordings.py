@@ -185,3 +185,19 @@ def test_uneven_times_are_sampled_again(tmp_path, caplog):
     path.write_text("\n".join([*lines[:3], lines[1], *lines[3:]]))
     sampled = TableSettings(names=names, rate=20.0)
     refuses(DataFileError, "line 4: the time or frame does not rise", read_recording, path, table=sampled)
+
+
+def test_unseen_cells_of_uneven_times_stay_where_they_are(tmp_path):
+    """Each coordinate is linear between the lines that have it, and inputs hold where a line has none."""
+    rows = [(0.0, 0.0, 1), (0.03, "", 2), (0.05, 50.0, ""), (0.11, "", ""), (0.15, "", 3), (0.2, 200.0, 4)]
+    path = tmp_path / "loop.csv"
+    path.write_text("\n".join(["t, X, Y, Z, p", *(f"{t}, {x}, 0, 0, {p}" for t, x, p in rows)]))
+    names = {"t": "time [s]", "X": "a.x [mm]", "Y": "a.y [mm]", "Z": "a.z [mm]", "p": "p [kPa]"}
+    read = read_recording(path, table=TableSettings(names=names, rate=20.0))
+    np.testing.assert_allclose(read.positions[:, 0, 0], [0.0, 0.05, 0.1, 0.15, 0.2], atol=1e-12)
+    np.testing.assert_allclose(read.actuation[:, 0], [1e3, 2e3, 2e3, 3e3, 4e3])
+    few = TableSettings(names=names, rate=1.0)
+    refuses(DataFileError, "has less than two frames at 1 Hz: raise data.table.rate", read_recording, path, table=few)
+    path.write_text("\n".join(["t, X, Y, Z, p", *(f"{t}, 0, 0, 0, 1" for t in (0, 0.05, 0.1, 1732886400.0))]))
+    foreign = "line 5: from the line before on, time or frame passes from 0.1 to"
+    refuses(DataFileError, foreign, read_recording, path, table=TableSettings(names=names, rate=20.0))

@@ -10,6 +10,7 @@ from warp_resphys.data.driving import phases, time_since_change
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning import metrics
 from warp_resphys.learning.intervals import Intervals, Predicted, coverage
+from warp_resphys.learning.scores import held_out_test, text_of
 
 
 def two_vertices(*distances: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -260,3 +261,32 @@ def test_intervals_grow_with_the_uncertainty_of_the_parameters():
     )
     assert covered(Intervals.calibrated(known, REST), new)["coverage"] < 0.1
     assert 1.0 <= intervals.variance[-1] < 2.0
+
+
+class TestHeldOut:
+    """A model beside the simulator alone, by mean distances of frames [mm]."""
+
+    FRAMES = np.full(50, 1.0)
+
+    def used(self, errors, below, sizes):
+        trials = [str(number) for number in range(len(sizes))]
+        rows = ([x * self.FRAMES for x in some] for some in (errors, below))
+        return held_out_test(trials, "validation", *rows, sizes)["used"]
+
+    def test_a_gain_counts_if_it_is_larger_than_its_spread_over_the_trials(self):
+        assert self.used([0.8, 0.7, 0.9], [1.0, 1.0, 1.0], [20.0] * 3)
+        assert not self.used([1.05] * 5 + [1.0], [1.0] * 5 + [2.0], [20.0] * 6)  # It gains on one trial alone.
+        assert not self.used([0.9999], [1.0], [20.0])
+        assert not self.used([1.0], [0.0], [20.0])
+
+    def test_a_trial_that_hardly_moves_decides_nothing(self):
+        assert self.used([0.1, 0.1, 0.1, 0.05], [0.3, 0.3, 0.3, 0.04], [20.0, 20.0, 20.0, 0.02])
+        assert self.used([0.1, 0.1], [0.9, 0.9], [20.0, np.nan])
+
+    def test_what_diverged_is_not_used_and_said_to(self):
+        lost = held_out_test(["a"], "validation", [np.full(1, np.nan)], [self.FRAMES], [20.0])
+        assert (lost["used"], lost["error_mm"]) == (False, None)
+        assert text_of(lost).startswith(
+            "on the validation trials (a) it diverges, and the simulator without it has 1 mm"
+        )
+        assert held_out_test(["a"], "validation", [self.FRAMES], [np.full(1, np.nan)], [20.0])["used"]

@@ -18,7 +18,7 @@ _CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
 _SIGNIFICANT: Final = 2.0  # standard errors by which a law must be closer
 _SPREAD: Final = 1.0  # standard errors by which a network must be closer, of the frames and of the trials
 _LEAST_GAIN: Final = 0.99  # ratio of errors below which a gain may count
-_LEAST_SIZE: Final = 0.1  # of the largest amplitude, below which a trial counts as one of this size
+_LEAST_SIZE: Final = 0.3  # of the largest amplitude, below which a trial counts as one of this size
 _NAMED: Final = 5  # trials of a test at most, whose names a sentence has
 
 

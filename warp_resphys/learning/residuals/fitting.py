@@ -294,8 +294,8 @@ class Fitting:
     def test(self, learned: Learned, settings: TrainingSettings, name: str) -> HeldOutTest:
         """Tests a network beside the simulator alone: on the validation trials, or on training trials in turn.
 
-        Without validation trials, a third of the training trials that begin alike is left out of a fit each time, with the
-        modes of all; a single one is tested on itself.
+        Without validation trials, a third of the training trials that begin alike is left out of a fit each time, with
+        the modes of all; a single one is tested on itself.
         """
         alike = [batch for batch in self.motions.trials.batches(self.train) if len(batch) > 1]
         parts, count = [(learned, self.validation or self.train)], min(max(map(len, alike), default=0), _FOLDS)

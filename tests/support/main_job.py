@@ -34,7 +34,12 @@ DRIVEN = [  # a driven robot with a laboratory, in seconds
     *("data.sequences=5", "data.train=3", "data.validation=1", "data.test=1", "data.horizons=[]"),
     *("data.rest_seconds=0.01", "data.cutoff=20.0", "parallel={processes:1,batch:3}", "timing=false"),
     *("laboratory.sequences.rest=0.01", "laboratory.sequences.correlation_time=0.06"),
-    *("identify.trials=1", "identify.seconds=0.1", "identify.max_evaluations=3", "trainer={epochs:4,rollout_every:2}"),
+    *(
+        "identify.trials=1",
+        "identify.seconds=0.1",
+        "identify.max_evaluations=3",
+        "trainer={epochs:4,rollout_every:2,gate:false}",
+    ),
     *("network={position_modes:2,velocity_modes:2,force_modes:2,width:8}", "trainer.batch_size=16"),
     "actuation.filter_time_constants=[0.1]",
 ]

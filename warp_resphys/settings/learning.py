@@ -243,6 +243,9 @@ class TrainerSettings(EpochSettings):
         "rollout", "keep the weights of the least validation roll-out error, or loss"
     )
     sequence: Natural | None = setting(None, "steps of back-propagation through time, for recurrent networks")
+    gate: bool = setting(
+        True, "use the force only if it is clearly closer to held-out trials than the simulator; false: always"
+    )
 
 
 class InTheLoopSettings(EpochSettings):

@@ -363,7 +363,8 @@ def fit(
     if error is None:
         log.warning("%s: the selected weights diverge on the validation split", name)
     learned = replace(learned, network=best)
-    test = learned.test if fitting.data_driven or learned.test else fitting.test(learned, settings, name)
+    tested = fitting.data_driven or learned.test is not None or not settings.trainer.gate
+    test = learned.test if tested else fitting.test(learned, settings, name)
     if test is not None and not test["used"]:
         log.warning("%s: the network is no clear gain: %s", name, text_of(test))
     kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}

@@ -19,7 +19,7 @@ parallel: {processes: 1, batch: 2}
 identify:
   {trials: 1, seconds: 0.05, max_evaluations: 3}
 network: {position_modes: 2, velocity_modes: 0, force_modes: 2, width: 8}
-trainer: {epochs: 4, rollout_every: 2, batch_size: 16}
+trainer: {epochs: 4, rollout_every: 2, batch_size: 16, gate: false}
 laboratory:
   mesh: {chamber_lengths: [0.09], caps: [0.005, 0.005], radii: [0.0222, 0.0222], chambers: 2, outline: round,
     size: 0.02, layers: 0.03, wall: 0.003, web: 0.003}

@@ -281,8 +281,8 @@ class Fitting:
             with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
                 epochs, (below, errors) = cross_validated_epochs(make_network, parts, loop, progress.advance)
             sizes = [size for _, held_out in parts for size in held_out.amplitudes_mm()]
-            test = held_out_test(train, HELD_OUT, errors, below, sizes)
-            epochs = epochs if test["used"] else 0
+            test = held_out_test(train, HELD_OUT, errors, below, sizes) if settings.trainer.gate else None
+            epochs = epochs if test is None or test["used"] else 0
             log.debug("%s: %d epochs are best for held-out trials", name, epochs)
             network = make_network()
         else:

@@ -1,4 +1,4 @@
-"""What must never pass in silence: masks for indices, failures for results, and derivatives that there are not."""
+"""Safeguards: masks for indices, failures for results, and derivatives that there are not must not pass in silence."""
 
 import dataclasses
 import re
@@ -132,7 +132,7 @@ CASES = [
 
 @pytest.mark.parametrize(("energies", "function"), CASES)
 def test_second_derivatives_are_refused(energies, function):
-    """Of losses that are linear in the solution, too, whose gradient does not depend on an incoming one."""
+    """Losses that are linear in the solution are refused, too: their gradient does not depend on an incoming one."""
     sim = simulator(*energies)
     loss = lambda scale: function(sim, scale)  # noqa: E731
     scale = ONE.clone().requires_grad_()

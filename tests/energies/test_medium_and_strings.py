@@ -42,7 +42,7 @@ def coasting(sim, speed):
 
 @pytest.mark.parametrize("mesh", MESHES)
 def test_a_body_that_sinks_reaches_its_terminal_velocity(mesh):
-    """Where its weight, less that of what it displaces, is rho / 2 v^2 times its drag coefficients and areas."""
+    """Weight less buoyancy is rho / 2 v^2 times the drag coefficients and areas of the body."""
     normal, tangential, density = 1.1, 0.3, 800.0
     sim = simulator(Medium(density, normal=normal, tangential=tangential), MESHES[mesh], gravity=9.81)
     speeds = sim.rollout(sim.rest_state(), 200).v[-1, 0, :, 2]
@@ -200,7 +200,7 @@ def test_an_equilibrium_stays(integrator, compliance):
 
 @pytest.mark.parametrize(("integrator", "start"), [*zip(INTEGRATORS, POSES, strict=True)])
 def test_gradients_of_strings(integrator, start, device):
-    """Of weights, lengths and compliances: taut and slack strings, and on the way between."""
+    """Gradients by weights, lengths and compliances: taut and slack strings, and on the way between."""
     strings = Strings([TIP, select_vertices(BEAM, x=0.05, z=0.0)[:1]], [0.2, 0.1], 1e-2, toe=2e-2)
     body = clamped(BEAM, energies=(strings,))
     material = replace(SOFT, mass_damping=0.5)

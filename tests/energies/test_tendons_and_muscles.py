@@ -163,7 +163,7 @@ def contracting(*muscles, mesh=BEAM, ratio=0.0, solver=TIGHT, **more):
 
 
 def stretch(sim, inputs):
-    """Of the whole bar along x, and how far its vertices are from a uniform one [m]."""
+    """Stretch of the whole bar along x, and how far its vertices are from a uniform one [m]."""
     q = sim.static_equilibrium(inputs).q[0].numpy()
     ratio = q[:, 0].max() / SIZE[0]
     return ratio, np.abs(q[:, 0] - ratio * sim.body.mesh.vertices[:, 0]).max()

@@ -184,7 +184,7 @@ def test_intervals_have_their_coverage_on_other_trials_of_any_amplitude(noise, c
 
 
 def test_intervals_are_as_wide_as_the_errors_are_large():
-    """Of the growing ones of Gaussian errors 90 % lie within 1.64 deviations."""
+    """Intervals that grow with time hold 90 % of Gaussian errors, which lie within 1.64 deviations."""
     intervals = Intervals.calibrated(trials(30, 3, transient), REST)
     x = REST + np.array([0.02, 0.0, 0.0])
     for since in (0.05, 0.5, 3.0):
@@ -282,6 +282,10 @@ class TestHeldOut:
     def test_a_trial_that_hardly_moves_decides_nothing(self):
         assert self.used([0.1, 0.1, 0.1, 0.05], [0.3, 0.3, 0.3, 0.04], [20.0, 20.0, 20.0, 0.02])
         assert self.used([0.1, 0.1], [0.9, 0.9], [20.0, np.nan])
+
+    def test_trials_without_a_marker_are_refused(self):
+        with pytest.raises(InputError, match=r"none of the validation trials shows a marker: a; take others"):
+            held_out_test(["a"], "validation", [np.zeros(0)], [np.zeros(0)], [20.0])
 
     def test_what_diverged_is_not_used_and_said_to(self):
         lost = held_out_test(["a"], "validation", [np.full(1, np.nan)], [self.FRAMES], [20.0])

@@ -12,6 +12,7 @@ from typing import Final, TypedDict
 import numpy as np
 
 from ..io.arrays import FloatArray
+from ..io.errors import InputError
 from .metrics import redundancy
 
 _CLEARLY, _CLOSER = 0.5, 0.95  # ratios of errors
@@ -84,13 +85,17 @@ def held_out_test(
         errors: mean distances (T,) by frame of each trial [mm], NaN where the roll-out diverged.
         below: those of the model below.
         sizes: amplitudes of the trials [mm].
+
+    Raises:
+        InputError: no marker was seen in any of them.
     """
-    seen = [(*of_trial,) for of_trial in zip(errors, below, sizes, strict=True) if len(of_trial[0])]
-    rows, others, found = [a for a, _, _ in seen], [b for _, b, _ in seen], np.array([size for *_, size in seen])
-    least = _LEAST_SIZE * float(
-        np.nanmax(found, initial=0.0)
-    )  # Trials that hardly move have no amplitude to divide by.
-    amplitudes = np.where(found > least, found, least or 1.0).tolist()
+    seen = [of_trial for of_trial in zip(errors, below, sizes, strict=True) if len(of_trial[0])]
+    if not seen:
+        raise InputError(f"none of the {split} trials shows a marker: {', '.join(trials)}; take others.")
+    rows, others, found = ([*column] for column in zip(*seen, strict=True))
+    least = _LEAST_SIZE * float(np.nanmax(found, initial=0.0))
+    # Trials that hardly move, or of which it is not known, count as ones of the least size.
+    amplitudes = [size if size > least else least or 1.0 for size in found]
     scores = [Score.of(zip(some, amplitudes, strict=True)) for some in (rows, others)]
     means = [fmean(float(row.mean()) for row in some) for some in (rows, others)]
     error, alone = (mean if math.isfinite(mean) else None for mean in means)

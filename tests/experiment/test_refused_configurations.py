@@ -154,7 +154,7 @@ CASES = {
         ("tendon_offset_1_first.upper: guide 1 .* outside of", f"{OFFSET}_first.upper=0.03"),
         ("and its parts, tendon_offset_1_first, tendon_offset_1_second", f"+{OFFSET}={{lower: -1e-3, upper: 1e-3}}"),
         (
-            r"per is session, but no trial names one: set data\.trials\.NAME\.session",
+            r"per names session, but the trial '(.*)' has none: set data\.trials\.\1\.session",
             f"+identify.parameters.tendon_tension_factor={{lower: 0.8, upper: 1.2, per: session, {PRIOR}}}",
         ),
     ],

@@ -129,7 +129,7 @@ def test_no_parameters_and_a_motion_that_stands_still_are_refused():
             {"lower": 0.0, "upper": 1.0, "prior": Prior(mean=2.0, deviation=1.0)},
             "prior.mean is 2, outside of the range",
         ),
-        ({"lower": 0.0, "upper": 1.0, "per": "trial"}, "per is trial, but there is no prior"),
+        ({"lower": 0.0, "upper": 1.0, "per": "trial"}, "per names trial, but there is no prior"),
     ],
 )
 def test_bounds_leave_a_range_and_values_of_trials_have_a_prior(limits, sentence):

@@ -146,9 +146,9 @@ def test_each_tendon_may_have_a_factor_of_its_own():
     alone = {"tendon_tension_factor_left": Bounds(lower=0.5, upper=2.0)}
     assert identify(simulator, motions, alone).parameters["tendon_tension_factor_left"] > 1.2
     beside = {"tendon_tension_factor_left": (0.9, 1.1), **ranges}
-    with pytest.raises(InputError, match=r"per is part, but parameters has tendon_tension_factor_left as well"):
+    with pytest.raises(InputError, match=r"per names part, but parameters has tendon_tension_factor_left as well"):
         identify(simulator, motions, beside)
-    with pytest.raises(InputError, match=r"youngs_modulus.per is part, but the body has no parts with a young"):
+    with pytest.raises(InputError, match=r"youngs_modulus.per names part, but the body has no parts with a young"):
         identify(simulator, motions, {"youngs_modulus": Bounds(lower=1e5, upper=1e6, per="part")})
     with pytest.raises(InputError, match=r"no parameter 'slack'.*or those of a part, such as tendon_"):
         identify(simulator, motions, {"slack": (0.1, 1.0)})

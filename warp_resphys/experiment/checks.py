@@ -3,7 +3,7 @@
 The values of settings and their relations are checked when settings are made, see `settings.run`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -117,7 +117,7 @@ def _check_learning(run: RunSettings, simulator: Simulator, trials: Sequence[Tri
     make_reconstructor(simulator, run.reconstruction, WHOLE_STATE if run.markers is None else marker)
     if run.identify is not None:
         with naming("identify."):
-            _check_identification(run, run.identify, simulator, any(trial.session for trial in trials))
+            _check_identification(run, run.identify, simulator, {trial.name: trial.session for trial in trials})
 
 
 def _check_begins(run: RunSettings, data: RecordedData, begins: set[str]) -> None:
@@ -138,7 +138,9 @@ def _check_begins(run: RunSettings, data: RecordedData, begins: set[str]) -> Non
             )
 
 
-def _check_identification(run: RunSettings, identify: IdentifySettings, simulator: Simulator, sessions: bool) -> None:
+def _check_identification(
+    run: RunSettings, identify: IdentifySettings, simulator: Simulator, sessions: Mapping[str, str | None]
+) -> None:
     if identify.integrator is not None:
         build_simulator(run.changed(integrator=identify.integrator), run.simulation, simulator.body)
     known = [name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR]

@@ -150,7 +150,7 @@ class Experiment:
             return identified[key]
         sysid, parameters = identified.get("sysid", Identification()), read_json(self.folder / LAW_FILE)["others"]
         of_trials = {name: value for name, value in sysid.of_trials.items() if split_name(name)[0] in parameters}
-        return Identification(parameters, of_trials, sysid.placement)
+        return Identification(parameters, of_trials, sysid.placement, sysid.first_frames)
 
     def parameters(self, model: str) -> dict[str, torch.Tensor]:
         """(1,) identified parameters of a model's simulator, by name, and those of trials; empty without any."""

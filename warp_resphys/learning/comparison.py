@@ -13,7 +13,7 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.parts import Parts, TrialPart
 from .error_tables import ComparedModels, ErrorTables, amplitudes, counted
-from .evaluation import rollout_parts
+from .evaluation import rollout_parts, used_frames
 from .identification.identification import Identification
 from .identification.sensitivity import (
     FreeFit,
@@ -115,9 +115,14 @@ class Comparison:
             return self.parts.joined(parts, name, self.motions.trials.observed.shape[1])[rows]
         return np.concatenate([self.parts.read(part, name) for part in parts])[rows]
 
+    @property
+    def _first_frames(self) -> Mapping[str, Mapping[str, float]]:
+        """First frames of trials from which values of some model were estimated, see `Identified`."""
+        return {o: shown for model in self.models.values() for o, shown in model.identified.first_frames.items()}
+
     @cached_property
     def _without_physics(self) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
-        return without_physics(self.motions, self.names, self.train)
+        return without_physics(self.motions, self.names, self.train, self._first_frames)
 
     @cached_property
     def simulated(self) -> dict[str, FloatArray]:
@@ -172,9 +177,12 @@ class Comparison:
         networks = {name: model.learned for name, model in self.models.items() if model.learned is not None}
         left = {name: self._in_order(name, "left") for name, learned in networks.items() if learned.range_ is not None}
         compared = ComparedModels(
-            self.motions, self.train, self.groups, self.simulated, left, self.reconstructed, self.horizons
+            *(self.motions, self.train, self.groups, self.simulated, left, self.reconstructed, self.horizons),
+            first_frames=self._first_frames,
         )
         content = compared.errors()
+        if self._first_frames:
+            content["first_frames"] = self._first_frames
         content["baselines"] = plain
         if missing:
             content["missing_baselines"] = missing
@@ -190,7 +198,7 @@ class Comparison:
     def _free_fits(self) -> dict[str, list[FreeFit]]:
         """Returns what would remain of the errors if something were free, by model."""
         names, fits = self.groups["1"], {}
-        observed = dict(zip(names, counted(self.motions, self.train, names), strict=True))
+        observed = dict(zip(names, counted(self.motions, self.train, names, self._first_frames), strict=True))
         for model, linear in self._linear.items():
             predicted = dict(zip(names, self.simulated[model][: len(names)], strict=True))
             fits[model] = free_fits(self.motions.trials, observed, predicted, linear)
@@ -204,13 +212,14 @@ class Comparison:
         """
         motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
         names = [*chain(*trials.batches(self.calibration))]
-        observed, target = trials.observed[trials.rows(names)], counted(motions, self.train, test)
+        observed, target = trials.observed[trials.rows(names)], counted(motions, self.train, test, self._first_frames)
         rest = rest_places(trials)
         learned = [row for row, name in enumerate(names) if name in self.train]
         observed[learned, motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
+        observed[used_frames(trials, names, self._first_frames)] = np.nan
         linear = self._linearised(names, uncertain=True)
         changes = {m: left_out_changes(trials, names, self.models[m].identified, x) for m, x in linear.items()}
-        simulated, *_ = without_physics(motions, names, self.train, left_out=True)
+        simulated, *_ = without_physics(motions, names, self.train, self._first_frames, left_out=True)
         for model, parts in self._rolled_out[1].items():
             change = changes.get(model)
             simulated[model] = self.parts.joined(parts, "observed", trials.observed.shape[1])

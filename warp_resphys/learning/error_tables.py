@@ -10,7 +10,8 @@ from ..data.driving import PHASES, phases_of
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
 from ..data.trials import STATIC, Trials
 from ..io.arrays import FloatArray, IntArray
-from .evaluation import first_frame
+from ..io.errors import InputError
+from .evaluation import first_frame, used_frames
 from .identification.sensitivity import FreeFit
 from .intervals import IntervalTable
 from .metrics import ErrorSummary, TrialErrors, errors_per_marker, marker_errors, summarise, summarise_trajectories
@@ -41,6 +42,7 @@ class ErrorTables(TypedDict, total=False):
     missing_baselines: dict[str, str]  # why one is missing
     sideways_mm: dict[str, float]  # of the markers at first, by trial
     free_fits: dict[str, list[FreeFit]]  # by model
+    first_frames: Mapping[str, Mapping[str, float]]  # see `Identified`
     intervals: IntervalTable
 
 
@@ -56,6 +58,7 @@ class ComparedModels:
         left: (R,) steps at which trials left the training range, or -1, by model with a network.
         reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m]; None without any.
         horizons: durations of whose errors there is a table [s].
+        first_frames: that do not count, see `Identified`.
     """
 
     motions: ObservedMotions
@@ -65,12 +68,13 @@ class ComparedModels:
     left: Mapping[str, IntArray] = field(default_factory=dict)
     reconstructed: FloatArray | None = None
     horizons: Sequence[float] = ()
+    first_frames: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def errors(self) -> ErrorTables:
         """Returns the tables that depend on the roll-outs alone."""
         trials, names = self.motions.trials, self.groups["1"]
         every, count = [name for group in self.groups.values() for name in group], len(names)
-        points = counted(self.motions, self.train, every)
+        points = counted(self.motions, self.train, every, self.first_frames)
         observed = as_markers(points, trials.labels)
         first = [first_frame(trials, [name]) for name in every]
         models = {model: as_markers(values, trials.labels) for model, values in self.simulated.items()}
@@ -104,12 +108,13 @@ class ComparedModels:
         return content | self._by_scale(models, observed)
 
     def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
-        """Returns the errors of the first seconds by duration and model."""
+        """Returns the errors of the first seconds by duration and model, if frames of all trials count in them."""
         found = {}
         for seconds in self.horizons:
             frames = slice(round(seconds / self.motions.trials.time_step) + 1)
             errors = {m: _errors(x[:, frames], observed[:, frames], [0] * len(observed)) for m, x in test.items()}
-            found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
+            if all(len(row) for rows in errors.values() for row in rows):
+                found[f"{seconds:g}"] = {model: summarise(rows) for model, rows in errors.items()}
         return found
 
     def _by_phase(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
@@ -148,12 +153,29 @@ class ComparedModels:
         return content
 
 
-def counted(motions: ObservedMotions, train: Sequence[str], names: Sequence[str]) -> FloatArray:
-    """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training."""
+def counted(
+    motions: ObservedMotions,
+    train: Sequence[str],
+    names: Sequence[str],
+    first_frames: Mapping[str, Mapping[str, float]],
+) -> FloatArray:
+    """(R, T, M, 3) observed points of tested trials [m], NaN in frames that were used for training or first values.
+
+    Raises:
+        InputError: nothing is left of a trial after the frames from which values were estimated.
+    """
     observed = motions.trials.observed[motions.trials.rows(names)]
     for row, name in enumerate(names):
         if name in train:
             observed[row, : motions.learned_steps(observed.shape[1] - 1) + 1] = np.nan
+    used = used_frames(motions.trials, names, first_frames)
+    for name, frames in zip(names, used, strict=True):
+        if frames.all():
+            raise InputError(
+                f"values of {name!r} are estimated from all of it, so that nothing is left to test: shorten "
+                "release.window."
+            )
+    observed[used] = np.nan
     return observed
 
 

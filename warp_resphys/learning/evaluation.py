@@ -13,7 +13,7 @@ import torch
 
 from ..data.trials import GIVEN, Trials
 from ..dynamics.simulator import Simulator
-from ..io.arrays import FloatArray
+from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import ConvergenceError, InputError, checks_types
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..stepping.rollout import states
@@ -48,8 +48,8 @@ def evaluate(
         parts: workers and files of the work; this process and its memory if None.
 
     Returns:
-        (T, R) mean distance of the observed points in the unit of the observation, such as m; NaN where none was seen,
-        infinite after a simulation diverged.
+        (T, R) mean distance of the observed points in the unit of the observation, such as m; NaN where none was seen
+        or parameters were estimated (`Identified.first_frames`), infinite after a simulation diverged.
 
     Raises:
         InputError: an input that the body does not take.
@@ -63,7 +63,8 @@ def evaluate(
     points = parts.joined(cut_up, "observed", trials.observed.shape[1])[[order.index(name) for name in names]]
     shown, observed = simulator.tensor(points), simulator.tensor(trials.observed[trials.rows(names)])
     away = motions.observe.residual(shown.nan_to_num(math.inf), observed).norm(dim=-1).nan_to_num(math.inf)
-    seen = torch.isfinite(observed).all(-1)
+    used = torch.from_numpy(used_frames(trials, names, Identified.of(parameters).first_frames)).to(away.device)
+    seen = torch.isfinite(observed).all(-1) & ~used[..., None]
     return np.asarray(torch.where(seen, away, torch.nan).nanmean(2).T.cpu().numpy())
 
 
@@ -259,6 +260,13 @@ class TrialRollout:
 def first_frame(trials: Trials, names: Sequence[str]) -> int:
     """First frame that counts in errors: 1 if the roll-out starts from the given state, else 0."""
     return int(trials.begin_of(names[0]) == GIVEN)
+
+
+def used_frames(trials: Trials, names: Sequence[str], first_frames: Mapping[str, Mapping[str, float]]) -> BoolArray:
+    """(R, T) whether values were estimated from a frame of some trials, see `Identified.first_frames`."""
+    seconds = {name: until for shown in first_frames.values() for name, until in shown.items()}
+    last = np.array([seconds.get(name, -math.inf) for name in names])
+    return np.asarray(trials.times[trials.rows(names)] <= last[:, None] + 1e-9)
 
 
 class HeldOutRollouts:

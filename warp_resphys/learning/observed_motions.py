@@ -41,11 +41,14 @@ class Identified(Brief):
         parameters: values that all trials share, by name.
         of_trials: values of single trials and sessions, by `parameters.value_name`.
         placement: of the markers, see `placement.placement_of`; None if it is exact.
+        first_frames: first seconds of the trials from which values of a trial or session were estimated that nothing
+            else was identified from, by its name and that of the trial [s]; these frames count in no error.
     """
 
     parameters: Mapping[str, float] = field(default_factory=dict)
     of_trials: Mapping[str, float] = field(default_factory=dict)
     placement: PlainPlacements | None = None
+    first_frames: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, parameters: "Identified | Mapping[str, float] | None") -> "Identified":

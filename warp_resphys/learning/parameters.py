@@ -83,7 +83,7 @@ def by_part(simulator: Simulator, values: Mapping[str, T], ranges: Mapping[str, 
     names: dict[str, list[str]] = {}
     for part, (whole, _) in parameters_of_parts(simulator).items():
         names.setdefault(whole, []).append(part)
-    shared = {name: value for name, value in values.items() if name in ranges and ranges[name].per == "part"}
+    shared = {name: value for name, value in values.items() if name in ranges and ranges[name].by_part}
     found = {part: value for name, value in shared.items() for part in names.get(name, [name])}
     return found | {name: value for name, value in values.items() if name not in shared}
 
@@ -108,18 +108,20 @@ def check_names(names: Iterable[str], known: Sequence[str]) -> None:
             raise InputError(f"there is no parameter {name!r} to identify: choose from {shown}{also}.")
 
 
-def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequence[str], sessions: bool) -> None:
+def check_ranges(
+    simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequence[str], sessions: Mapping[str, str | None]
+) -> None:
     """Checks the ranges of parameters that are to be identified from trials.
 
     Args:
         simulator: of the body.
         ranges: ranges by name.
         known: names that may be identified.
-        sessions: whether trials name their sessions.
+        sessions: session of each trial, by its name.
 
     Raises:
         InputError: there is no range, a name is unknown, a parameter stands beside those of its parts, a time or a
-            slope may be negative, tendons leave the body at a bound, or nothing shares a value as `per` says.
+            slope may be negative, tendons leave the body at a bound, or `per` names what the body or a trial lacks.
     """
     if not ranges:
         raise InputError(f"parameters is empty: give a range for at least one of {', '.join(known)}.")
@@ -129,8 +131,8 @@ def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequ
     for name, limits in ranges.items():
         parts = [part for part, (whole, _) in of_parts.items() if whole == name]
         beside = [part for part in parts if part in ranges]
-        if limits.per == "part" and beside:
-            raise InputError(f"parameters.{name}.per is part, but parameters has {beside[0]} as well: take one out.")
+        if limits.by_part and beside:
+            raise InputError(f"parameters.{name}.per names part, but parameters has {beside[0]} as well: take one out.")
         if parts and {*parts} <= {*ranges}:
             raise InputError(f"parameters names {name} and its parts, {', '.join(parts)}: choose one.")
         if (word := command_of(simulator, name)[1]) in _NOT_NEGATIVE and limits.lower < 0.0:
@@ -138,12 +140,16 @@ def check_ranges(simulator: Simulator, ranges: Mapping[str, Bounds], known: Sequ
                 f"parameters.{name}.lower is {limits.lower:g}: a {word.replace('_', ' ')} is not negative: set it to "
                 "zero or more."
             )
-        if limits.per == "part" and not any(whole == name for whole, _ in of_parts.values()):
-            raise InputError(f"parameters.{name}.per is part, but the body has no parts with a {name}: leave it out.")
-        if limits.per in ("material", "lens"):
+        if limits.by_part and not parts:
+            raise InputError(
+                f"parameters.{name}.per names part, but the body has no parts with a {name}: leave it out."
+            )
+        if limits.owner in ("material", "lens"):
             raise InputError(f"parameters.{name}.per is {limits.per}, which is for data.kind pictures: leave it out.")
-        if limits.per == "session" and not sessions:
-            raise InputError(f"parameters.{name}.per is session, but no trial names one: set data.trials.NAME.session.")
+        if limits.owner == "session" and (lost := next((trial for trial, of in sessions.items() if not of), None)):
+            raise InputError(
+                f"parameters.{name}.per names session, but the trial {lost!r} has none: set data.trials.{lost}.session."
+            )
         whole, part = of_parts.get(name, (name, None))
         for end, value in (("lower", limits.lower), ("upper", limits.upper)):
             with naming(f"parameters.{name}.{end}: "):

@@ -1,6 +1,6 @@
 """Predictions without physics of observed trials."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -12,6 +12,7 @@ from ..data.trials import GIVEN, RESTING, Trials
 from ..io.arrays import BoolArray, FloatArray
 from ..stepping.rollout import sample
 from .baselines import BASELINES, REST, PlainTrials, at_rest, predictions
+from .evaluation import used_frames
 from .observed_motions import ObservedMotions, at_steps
 from .release import least_delays
 from .trial_batch import TrialBatch
@@ -25,18 +26,25 @@ _LACKING: Final = {  # why a model is missing although trials were learned from
 
 
 def without_physics(
-    motions: ObservedMotions, names: Sequence[str], train: Sequence[str], *, left_out: bool = False
+    motions: ObservedMotions,
+    names: Sequence[str],
+    train: Sequence[str],
+    first_frames: Mapping[str, Mapping[str, float]] | None = None,
+    *,
+    left_out: bool = False,
 ) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, str]]:
     """Predicts trials with `learning.baselines`, from the training trials that begin in the same way.
 
     Coordinates that no training trial shows stay at rest. Released bodies are compared at the time steps, as each
     recording has its own frames. Where simulators estimate the delay of a trial's inputs from its first frames
-    (`learning.release.begin_inputs`), so do these.
+    (`learning.release.begin_inputs`), so do these; where simulators estimate values of a session, these predictions are
+    shifted by their mean error in the same frames of its trials.
 
     Args:
         motions: observed motions.
         names: names of the R trials.
         train: names of the training trials.
+        first_frames: from which values of simulators were estimated, see `Identified`.
         left_out: whether a trial is predicted without itself if it is a training trial.
 
     Returns:
@@ -70,7 +78,22 @@ def without_physics(
             reason = _LACKING[model] if len(plain.values) else f"no other training trial begins like {batch[0]}"
             missing.setdefault(model, reason)
     whole = [model for model in BASELINES if model in values and model not in missing]
+    for model in whole:
+        values[model] = _shifted(trials, names, values[model], first_frames or {})
     return {model: values[model] for model in whole}, {model: settings[model] for model in whole}, missing
+
+
+def _shifted(
+    trials: Trials, names: Sequence[str], predicted: FloatArray, first_frames: Mapping[str, Mapping[str, float]]
+) -> FloatArray:
+    """Predictions (R, T, M, 3), those of a session less their mean error in the first frames of its trials [m]."""
+    shifted, observed = predicted.copy(), trials.observed[trials.rows(names)]
+    errors = np.where(used_frames(trials, names, first_frames)[..., None, None], observed - predicted, np.nan)
+    for shown in (shown for owner, shown in first_frames.items() if owner not in shown):  # of sessions
+        rows = [row for row, name in enumerate(names) if name in shown]
+        seen = np.isfinite(errors[rows])
+        shifted[rows] += np.where(seen, errors[rows], 0.0).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
+    return shifted
 
 
 def _at_steps(trials: Trials, learned: Sequence[str], asked: Sequence[str]) -> Trials:

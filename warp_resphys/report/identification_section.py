@@ -120,21 +120,35 @@ def parameter_rows(identified: Identification, start: Mapping[str, float], truth
 
 
 def trials_table(identified: Identification) -> PageTable | None:
-    """Returns the values of single trials and sessions, with their standard deviations; None if there are none."""
+    """Returns the values of single trials and sessions, with their standard deviations; None if there are none.
+
+    The parameters are the rows if they are more than the trials and sessions, as those of chambers in two sessions.
+    """
     values, deviations = identified.of_trials, identified.of_trials_deviation
     if not values:
         return None
-    parameters = list(dict.fromkeys(split_name(name)[0] for name in values))
+    parameters = {parameter: parameter_wording(parameter) for parameter in (split_name(name)[0] for name in values)}
     owners = list(dict.fromkeys(split_name(name)[1] for name in values))
-    wording = {parameter: parameter_wording(parameter) for parameter in parameters}
-    rows = []
-    for owner in owners:
-        names = {value_name(parameter, owner): factor for parameter, (_, _, factor) in wording.items()}
-        cells = [identified_cell(values.get(name), factor, deviations.get(name)) for name, factor in names.items()]
-        rows.append(Row(owner, cells))
-    columns = [f"{words} [{unit}]" if unit else words for words, unit, _ in wording.values()]
-    note = "Identified with the prior; of validation and test trials, from their first frames."
-    return PageTable("Trial or session", columns, rows, note)
+    heads = [f"{words} [{unit}]" if unit else words for words, unit, _ in parameters.values()]
+
+    def cell(parameter: str, owner: str) -> Cell:
+        name = value_name(parameter, owner)
+        return identified_cell(values.get(name), parameters[parameter][2], deviations.get(name))
+
+    note = " ".join(filter(None, ("Identified with the prior.", first_frames_text(identified.first_frames))))
+    if len(parameters) > len(owners):
+        rows = [Row(head, [cell(p, o) for o in owners]) for p, head in zip(parameters, heads, strict=True)]
+        return PageTable("Value by trial or session", owners, rows, note)
+    return PageTable("Trial or session", heads, [Row(o, [cell(p, o) for p in parameters]) for o in owners], note)
+
+
+def first_frames_text(first_frames: Mapping[str, Mapping[str, float]]) -> str:
+    """Returns sentences on sessions and trials of which first frames give the values; empty without any."""
+    sessions = {owner: max(shown.values()) for owner, shown in first_frames.items() if owner not in shown}
+    alone = [shown[owner] for owner, shown in first_frames.items() if owner in shown]
+    parts = [f"session {name} are estimated from the first {seconds:g} s of its" for name, seconds in sessions.items()]
+    parts += [f"held-out trials are estimated from the first {max(alone):g} s of these"] if alone else []
+    return " ".join(f"Values of {part} trials, which do not count in the errors." for part in parts)
 
 
 def parameter_wording(parameter: str) -> Wording:
@@ -221,7 +235,7 @@ def uncertainty_text(name: str, identified: Identification, settings: IdentifySe
     unknown = list[str]()
     for parameter, deviation in uncertainty.deviation.items():
         limits = None if settings is None else settings.parameters.get(settings.key_of(parameter))
-        prior = None if limits is None or limits.per in ("session", "trial") else limits.prior
+        prior = None if limits is None or limits.owner else limits.prior
         if prior is not None and deviation > _UNINFORMED * prior.deviation:
             _, unit, factor = parameter_wording(parameter)
             where = f"{digits(prior.mean, factor)} ± {digits(prior.deviation, factor)} {unit}".rstrip()

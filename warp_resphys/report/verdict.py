@@ -15,7 +15,7 @@ from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
 from .data import Errors, Metrics, folds_in, grouped_errors, missing_baselines, unused
-from .identification_section import in_sentence, with_unit
+from .identification_section import first_frames_text, in_sentence, with_unit
 from .page import Cell, PageTable, Row
 from .wording import mm_text, model_words, number_text, share_text, unbroken
 
@@ -106,6 +106,8 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
     of = "vertices" if settings.markers is None else "markers"
     lacking = [f"{model_words(model)} ({why})" for model, why in missing_baselines(metrics).items()]
     note = f"Missing: {'; '.join(lacking)}." if lacking else ""
+    first = {owner: shown for fold in folds_in(metrics) for owner, shown in fold.get("first_frames", {}).items()}
+    note = " ".join(filter(None, (note, first_frames_text(first))))
     return PageTable(f"{settings.heading}: mean error of the {of} [mm]", list(columns), rows, note)
 
 

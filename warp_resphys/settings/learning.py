@@ -3,7 +3,7 @@
 import math
 from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, model_validator
 
 from ..io.classes import ClassSettings
 from ..io.settings import (
@@ -35,6 +35,13 @@ Term = Annotated[
     ),
 ]
 
+Shared = Literal["all", "part", "session", "trial", "material", "lens"]
+SharedByPart = Annotated[
+    tuple[Literal["part"], Literal["session", "trial"]],
+    Strict(False),
+    Field(json_schema_extra={"wanted": "[part, session] or [part, trial]"}),
+]
+
 
 class Prior(Settings):
     """Normal prior of a parameter, or of its logarithm where that is searched."""
@@ -50,7 +57,7 @@ class Bounds(Settings):
     upper: float = setting(description="upper bound, in the parameter's unit")
     logarithmic: bool = setting(False, "whether the scale is logarithmic")
     prior: Prior | None = setting(None, "prior knowledge")
-    per: Literal["all", "part", "session", "trial", "material", "lens"] = setting(
+    per: Shared | SharedByPart = setting(
         "all",
         "what shares a value; part: one for each chamber, tendon or muscle; session, trial: near the mean of the "
         "prior; material, lens: for pictures",
@@ -62,14 +69,25 @@ class Bounds(Settings):
             raise ValueError(f"lower is {self.lower:g}: it must be below upper, {self.upper:g}.")
         if self.logarithmic and not self.lower > 0.0:
             raise ValueError(f"lower is {self.lower:g}: it must be positive, as the scale is logarithmic.")
-        if self.per in ("session", "trial") and self.prior is None:
-            raise ValueError(f"per is {self.per}, but there is no prior, which holds the values: add one.")
+        if self.owner in ("session", "trial") and self.prior is None:
+            raise ValueError(f"per names {self.owner}, but there is no prior, which holds the values: add one.")
         if self.prior is not None and not self.lower <= self.prior.mean <= self.upper:
             raise ValueError(
                 f"prior.mean is {self.prior.mean:g}, outside of the range from {self.lower:g} to {self.upper:g}: widen "
                 "the range, or correct the prior."
             )
         return self
+
+    @property
+    def by_part(self) -> bool:
+        """Whether each part has a value."""
+        return self.per == "part" or not isinstance(self.per, str)
+
+    @property
+    def owner(self) -> str:
+        """What has a value of its own beside parts: session, trial, material or lens; empty if all share one."""
+        word = self.per if isinstance(self.per, str) else self.per[1]
+        return "" if word in ("all", "part") else word
 
     def unit_prior(self) -> tuple[float, float] | None:
         """Mean and standard deviation of the prior, as fractions of the range; None without a prior."""
@@ -132,7 +150,7 @@ class IdentifySettings(Settings):
 
     def key_of(self, parameter: str) -> str:
         """Returns the key of the range of a parameter, which may be that of all parts; empty if it has none."""
-        shared = [name for name, limits in self.parameters.items() if limits.per == "part"]
+        shared = [name for name, limits in self.parameters.items() if limits.by_part]
         whole = max((name for name in shared if parameter.startswith(f"{name}_")), key=len, default="")
         return parameter if parameter in self.parameters else whole
 
@@ -304,7 +322,10 @@ class ReleaseSettings(Settings):
 
     hold_modes: Natural = setting(6, "vibration modes that hold it")
     window: Positive = setting(
-        0.13, "duration after the release for estimating delay and sideways displacement: about a period", "s"
+        0.13,
+        "duration after the release for estimating delay and sideways displacement: about a period; and at the "
+        "beginning of trials for their values and those of their session",
+        "s",
     )
     noise: Positive = setting(3.0e-4, "standard deviation of markers that the release does not explain", "m")
     delay: NotNegative = setting(0.0, "expected deviation from the detected time; 0 uses that", "s")

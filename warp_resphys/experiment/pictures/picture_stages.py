@@ -127,7 +127,7 @@ def check_pictures(run: RunSettings) -> None:
     for name, limits in wanted.parameters.items():
         if name not in known:
             raise InputError(f"identify.parameters names '{name}': choose from {', '.join(known)}.")
-        if limits.per in ("session", "part"):
+        if limits.by_part or limits.owner == "session":
             raise InputError(f"identify.parameters.{name}.per is {limits.per}: choose all, material, lens or trial.")
         if limits.per == "lens" and name not in CORRECTIONS:
             raise InputError(f"identify.parameters.{name}.per is lens, and is not of a camera: take all or material.")
@@ -171,7 +171,8 @@ class _Plan:
                 "trial": [pose.name for pose in poses],
                 "lens": [lens for pose in poses for lens in pose.lenses],
             }
-            for owner in dict.fromkeys(owners[limits.per]) if chosen(name, limits.per) else ():
+            shared = limits.owner or "all"
+            for owner in dict.fromkeys(owners[shared]) if chosen(name, shared) else ():
                 mine = [pose for pose in poses if owner in (*pose.owners, *pose.lenses)]
                 if any(name in pose.parameter_names and (pose.deforms or name in CORRECTIONS) for pose in mine):
                     result[value_name(name, owner) if owner else name] = limits

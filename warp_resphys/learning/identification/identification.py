@@ -1,7 +1,8 @@
 """System identification: the physical parameters with which a simulator comes closest to observed motions.
 
-A parameter may have a value for each trial or session, near the mean of a prior. Marker places on the body, the frame
-of the recordings and delays of inputs are fitted with the parameters (`nuisances`).
+A parameter may have a value for each trial or session, near the mean of a prior. Those of a test trial, and of a new
+session, follow from their first frames. Marker places on the body, the frame of the recordings and delays of inputs are
+fitted with the parameters (`nuisances`).
 """
 
 import logging
@@ -9,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import torch
@@ -16,7 +18,7 @@ import torch
 from ...data.rigid_bodies import independent
 from ...data.trials import RELEASED, RESTING, Trials
 from ...dynamics.simulator import Simulator
-from ...io.errors import ConvergenceError, checks_types, naming
+from ...io.errors import ConvergenceError, InputError, checks_types, listed, naming
 from ...io.parts import Checkpoint
 from ...io.settings import parse
 from ...settings.learning import Bounds, IdentifySettings
@@ -61,8 +63,9 @@ def identify(
     """Finds the parameters with which a simulator comes closest to observed motions.
 
     A parameter with ``per`` part has a value for each chamber, tendon or muscle, such as ``pressure_factor_1``; with
-    ``per`` trial or session it has one for each, near the mean of its prior. That of trials whose motion inputs begin
-    can also be identified from their first frames (`ReleaseSettings.window`).
+    ``per`` trial or session it has one for each, near the mean of its prior; with ``("part", "session")``, each part in
+    each session. Values of held-out trials whose motion inputs begin, and of a session of which all trials are held
+    out, follow from their first frames (`ReleaseSettings.window`), which then count in no error.
 
     Args:
         simulator: gives all other parameters.
@@ -71,7 +74,7 @@ def identify(
             positive numbers is searched on a logarithmic scale.
         first_guess: start of the search, which is brought into the ranges; the simulator's own values where left out.
         names: trials to identify from; all by default.
-        held_out: other trials, whose own values follow from their first frames.
+        held_out: other trials, whose own values, and those of their session, follow from their first frames.
         accuracy: of marker places and the recording's frame, which are identified; None: they are exact.
         seconds: duration of each motion that is used [s]; None for the part that `motions` learns from.
         starts: number of searches; those after the first start at the best of random candidates.
@@ -83,14 +86,16 @@ def identify(
             anything that they depend on has changed. None: nothing is kept.
 
     Raises:
-        InputError: an unknown parameter, an empty range, a number out of range, or a motion in which nothing moves.
+        InputError: an unknown parameter, an empty range, a number out of range, a motion in which nothing moves, or
+            first frames without a marker.
         ConvergenceError: the simulation fails at every start.
     """
     trials = motions.trials.chosen(names)
     motions.trials.rows(held_out)
     wanted, identifiable = ranges_of(parameters), identifiable_parameters(simulator)
-    check_ranges(simulator, wanted, identifiable, bool(motions.trials.sessions))
+    check_ranges(simulator, wanted, identifiable, {name: motions.trials.session(name) for name in (*trials, *held_out)})
     ranges = by_part(simulator, wanted, wanted)
+    shown_first = _shown_first(motions, trials, held_out, ranges)
     with naming("first_guess: "):
         check_names(first_guess or {}, identifiable)
     many = 4 * starts if candidates is None else candidates
@@ -117,7 +122,9 @@ def identify(
         released=RELEASED in map(motions.trials.begin_of, trials),
     )
     found = _separated(_joined(rounds, guess, accuracy), ranges)
-    return _with_first_frames(found, simulator, motions, held_out, ranges, max_evaluations)
+    for some, limits in shown_first:
+        found = _with_first_frames(found, simulator, motions, some, limits, max_evaluations)
+    return found
 
 
 def _misfit(
@@ -146,7 +153,7 @@ def _bounds_of_owners(ranges: Mapping[str, Bounds], trials: Trials, names: Seque
     return {
         full: limits
         for name, limits in ranges.items()
-        for full in ([value_name(name, owner) for owner in owners[limits.per]] if limits.per in owners else [name])
+        for full in ([value_name(name, owner) for owner in owners[limits.owner]] if limits.owner else [name])
     }
 
 
@@ -175,11 +182,15 @@ def _joined(rounds: Sequence[Identification], guess: Mapping[str, float], accura
 def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identification:
     """An identification with the values of trials and sessions in `of_trials`, apart from those of all trials.
 
-    Other trials have the mean of the prior, and its deviation as their uncertainty, before `_with_first_frames`.
+    The common value, which other trials and sessions have before `_with_first_frames`, is the mean of the prior for
+    trials and of the identified ones for sessions; its uncertainty is the deviation of the prior.
     """
-    priors = {name: one.prior for name, one in ranges.items() if one.per in ("session", "trial") and one.prior}
+    priors = {name: one.prior for name, one in ranges.items() if one.owner and one.prior}
     if not priors:
         return found
+    for name in (name for name in priors if ranges[name].owner == "session"):
+        of_sessions = [value for full, value in found.parameters.items() if split_name(full)[0] == name]
+        priors[name] = priors[name].changed(mean=fmean(of_sessions))
     names = [*found.parameters]
     common = [name for name in names if not split_name(name)[1]]
     of_trials = {name: value for name, value in found.parameters.items() if split_name(name)[1]}
@@ -203,34 +214,66 @@ def _separated(found: Identification, ranges: Mapping[str, Bounds]) -> Identific
     )
 
 
+def _shown_first(
+    motions: ObservedMotions, train: Sequence[str], held_out: Sequence[str], ranges: Mapping[str, Bounds]
+) -> list[tuple[list[str], dict[str, Bounds]]]:
+    """Held-out trials, all of a new session or one, and the bounds of the values that their first frames show.
+
+    Raises:
+        InputError: these frames show no marker.
+    """
+    trials, seconds, groups = motions.trials, motions.release.window, dict[tuple[str, str], list[str]]()
+    known = {*map(trials.session, train)}
+    for name in (name for name in held_out if trials.begin_of(name) in RESTING):
+        session = trials.session(name)
+        groups.setdefault((session, name if session in known else ""), []).append(name)
+    shown = list[tuple[list[str], dict[str, Bounds]]]()
+    for (session, trial), names in groups.items():
+        owners = ("trial",) if trial else ("session", "trial")
+        if not (wanted := {name: limits for name, limits in ranges.items() if limits.owner in owners}):
+            continue
+        times, observed = (x[trials.rows(names)] for x in (trials.times, trials.observed))
+        frames = np.isfinite(observed).all(-1).any(-1) & (times <= seconds + 1e-9)
+        seen = [name for name, of_trial in zip(names, frames, strict=True) if of_trial.any()]
+        if not seen:
+            of = "the trial" if trial else f"the session {session!r}"
+            raise InputError(
+                f"no marker is seen in the first {seconds:g} s of {listed(names)}, from which values of {of} are "
+                "estimated: raise release.window, or leave out what has no marker."
+            )
+        shown.append((seen, _bounds_of_owners(wanted, trials, seen)))
+    return shown
+
+
 def _with_first_frames(
     found: Identification,
     simulator: Simulator,
     motions: ObservedMotions,
     names: Sequence[str],
-    ranges: Mapping[str, Bounds],
+    bounds: Mapping[str, Bounds],
     max_evaluations: int,
 ) -> Identification:
-    """Adds trials' own values from their first frames (`ReleaseSettings.window`), and their deviations.
+    """Adds values of trials and their session from first frames (`ReleaseSettings.window`), and their deviations.
 
-    Everything else is as identified. Values that these frames do not show stay near the mean of their prior.
+    Everything else is as identified. Values that these frames do not show stay near the common value.
     """
-    known, values, deviations = (
-        {**found.parameters, **found.of_trials},
-        dict(found.of_trials),
-        dict(found.of_trials_deviation),
+    known, window = {**found.parameters, **found.of_trials}, motions.release.window
+    guess = {full: found.parameters[split_name(full)[0]] for full in bounds}
+    bounds = {
+        full: limits if limits.prior is None else limits.changed(prior=limits.prior.changed(mean=guess[full]))
+        for full, limits in bounds.items()
+    }
+    try:
+        replays = motions.replays(simulator, names, found)
+        result = search_parameters(_misfit(motions, replays, bounds, window, known=known), [guess], max_evaluations)
+    except ConvergenceError as error:
+        log.warning("identify: the first frames of %s show none of their values: %s", listed(names), error)
+        return found
+    owners = dict.fromkeys(split_name(full)[1] for full in bounds)
+    first = {owner: {name: window for name in ([owner] if owner in names else names)} for owner in owners}
+    return replace(
+        found,
+        of_trials={**found.of_trials, **result.parameters},
+        of_trials_deviation={**found.of_trials_deviation, **result.deviation},
+        first_frames={**found.first_frames, **first},
     )
-    wanted = {name: limits for name, limits in ranges.items() if limits.per == "trial"}
-    for name in (name for name in names if wanted and motions.trials.begin_of(name) in RESTING):
-        bounds = {value_name(parameter, name): limits for parameter, limits in wanted.items()}
-        guess = {full: _guess(full, limits, known) for full, limits in bounds.items()}
-        try:
-            replays = motions.replays(simulator, [name], found)
-            misfit = _misfit(motions, replays, bounds, motions.release.window, known=known)
-            result = search_parameters(misfit, [guess], max_evaluations)
-        except ConvergenceError as error:
-            log.warning("identify: the first frames of %s show none of its own values: %s", name, error)
-            continue
-        values |= result.parameters
-        deviations |= result.deviation
-    return replace(found, of_trials=values, of_trials_deviation=deviations)

@@ -143,7 +143,8 @@ class Misfit(BoundedMisfit):
         bounds: range of each of the P parameters to identify.
         seconds: length of each motion that is compared [s]; the whole motion if None.
         accuracy: standard deviations of the marker places and of the recording's frame; None: both are exact.
-        known: values of further parameters, which are not identified; amplitudes are those of the whole motions then.
+        known: values of further parameters, which are not identified; residuals are lengths then, as amplitudes would
+            be those of the whole motions.
         delay: standard deviation of the delay of motions that their inputs begin [s]; see `nuisances.NuisanceFit`.
         shares: (M,) of the coordinates of each observed point that are independent of the others; None: all.
 
@@ -179,7 +180,7 @@ class Misfit(BoundedMisfit):
         count = sum(len(replay.trials.names) for replay, _ in replays)
         for replay, start in replays:
             trials = replay.trials if seconds is None else replay.trials.first(seconds)
-            amplitude = replay.trials.amplitude if self._known else trials.amplitude
+            amplitude = torch.ones_like(trials.amplitude) if self._known else trials.amplitude
             for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
                 if not moved > 0.0:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")

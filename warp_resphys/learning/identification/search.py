@@ -42,7 +42,7 @@ class Identification(Identified):
     """Result of an identification.
 
     Attributes:
-        parameters, of_trials, placement: see `Identified`.
+        parameters, of_trials, placement, first_frames: see `Identified`.
         loss: smallest loss, relative to the motions' amplitudes.
         history: records of every start, one a step that did not fail: ``loss`` and the parameters. The loss of the last
             step may be that of the linearisation.
@@ -68,7 +68,7 @@ class Identification(Identified):
 
     def plain(self) -> dict[str, Any]:
         """Returns the identification as JSON data."""
-        of_trials = ("of_trials", "of_trials_deviation")
+        of_trials = ("of_trials", "of_trials_deviation", "first_frames")
         return {key: value for key, value in asdict(self).items() if value or key not in of_trials}
 
     @staticmethod

@@ -114,7 +114,7 @@ def _of_batch(
     for name in sets:
         if (parameter := split_name(name)[0]) in moved:
             sets[name][rows[parameter]] += moved[parameter]
-        elif (whole := of_parts.get(parameter, ("", 0))[0]) in moved and whole not in identified.parameters:
+        if (whole := of_parts.get(parameter, ("", 0))[0]) in moved and whole not in identified.parameters:
             # What moves all parts moves each: factors relatively.
             sets[name][rows[whole]] += moved[whole] * (sets[name][0] if whole.endswith("_factor") else 1.0)
     points = (replay.varied if moved and not replay.is_static else replay)(start, sets)

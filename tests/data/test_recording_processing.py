@@ -346,7 +346,7 @@ def test_the_measured_segment(shared_data):
         early = np.nanmax(np.linalg.norm(tip.positions[:opened] - tip.rest, axis=2))
         assert early < 2e-4
         ends.append(float(np.linalg.norm(np.nanmedian(tip.positions[-20:], axis=0).mean(0) - tip.rest.mean(0))))
-        clamp = trial.select(segment.CLAMP_LABELS)
+        clamp = trial.select(segment.BASE_LABELS)
         assert np.nanmax(np.linalg.norm(clamp.positions - clamp.rest, axis=2)) < 3e-4, mbar
     assert ends == sorted(ends)
     assert ends[0] == pytest.approx(1.0e-3, rel=0.1)

@@ -1,9 +1,13 @@
 """Predictions without physics, on motions whose law each of them contains."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from warp_resphys.learning.baselines import PlainTrials, predictions, regression
+from warp_resphys.learning.baselines import predictions
+from warp_resphys.learning.plain_trials import PlainTrials
+from warp_resphys.learning.regression import regression
 
 FRAMES = 60
 TIMES = 0.02 * np.arange(FRAMES)
@@ -19,6 +23,8 @@ def motions(values, inputs=None, *, first=None, origin=None, known=None):
         zero if first is None else first,
         np.zeros((rows, frames, 0)) if inputs is None else inputs,
         np.zeros((rows, 0)) if known is None else known,
+        np.zeros((rows, 0 if inputs is None else inputs.shape[2])),
+        TIMES[1],
     )
 
 
@@ -102,15 +108,41 @@ def test_a_model_linear_in_time_finds_the_degree_of_its_inputs():
     assert np.abs(predicted.values - driven(2).values).max() < 0.02 * np.abs(driven(2).values).max()
 
 
+def lagging(seed, *, before, count=5, frames=300):
+    """A body behind two inputs, by 0.1 s with their squares and by 3 s; it rests under the first or none."""
+    random = np.random.default_rng(seed)
+    inputs = np.repeat(random.normal(size=(count, 10, 2)), frames // 10, axis=1)
+    begin = inputs[:, 0] if before else 0.0 * inputs[:, 0]
+    fast, slow = [begin], [begin]
+    for k in range(frames):
+        fast.append(inputs[:, k] + np.exp(-TIMES[1] / 0.1) * (fast[-1] - inputs[:, k]))
+        slow.append(inputs[:, k] + np.exp(-TIMES[1] / 3.0) * (slow[-1] - inputs[:, k]))
+    series = np.concatenate([np.stack(fast, 1), np.stack(fast, 1) ** 2, np.stack(slow, 1)], 2)
+    values = 7.0 + series @ np.random.default_rng(0).normal(size=(6, 3))
+    first = values[:, 0]
+    return replace(motions(values[:, 1:], inputs, first=first, origin=first), before=begin)
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_regression_finds_how_a_body_lags_behind_its_inputs(before):
+    trials, asked = lagging(1, before=before), lagging(2, before=before)
+    trials.values[0, 200:] = np.nan
+    trials.values[1, 20:30, 1] = np.nan
+    predicted = regression(trials, asked)
+    assert predicted.settings.startswith("means of 0.1, 0.5, 3 s with products")
+    assert np.abs(predicted.values - asked.values).max() < 0.01 * np.ptp(asked.values)
+    trials.values[..., 2] = np.nan
+    assert np.isnan(regression(trials, asked).values[..., 2]).all()
+
+
 def test_after_the_end_of_the_training_the_last_value_holds_and_the_model_in_time_goes_on():
     trials, asked = driven(1), driven(2)
     trials.values[:, 120:] = np.nan
     trials.values[0, 100:] = np.nan
     made = predictions(trials, asked)
     assert made.keys() == {"rest", "interpolation", "regression", "linear"}
-    for model in ("interpolation", "regression"):
-        held = np.broadcast_to(made[model].values[:, 119:120], (4, 80, 3))
-        np.testing.assert_array_equal(made[model].values[:, 120:], held)
+    held = np.broadcast_to(made["interpolation"].values[:, 119:120], (4, 80, 3))
+    np.testing.assert_array_equal(made["interpolation"].values[:, 120:], held)
     assert np.abs(made["linear"].values - asked.values).max() < 0.02 * np.abs(asked.values).max()
 
 

@@ -11,9 +11,10 @@ from ..data.driving import driving
 from ..data.trials import GIVEN, RESTING, Trials
 from ..io.arrays import BoolArray, FloatArray
 from ..stepping.rollout import sample
-from .baselines import BASELINES, REST, PlainTrials, at_rest, predictions
+from .baselines import BASELINES, REST, at_rest, predictions
 from .evaluation import used_frames
 from .observed_motions import ObservedMotions, at_steps
+from .plain_trials import PlainTrials
 from .release import least_delays
 from .trial_batch import TrialBatch
 
@@ -147,6 +148,7 @@ def _motions(
 ) -> tuple[PlainTrials, PlainTrials]:
     """The training trials, as far as they are learned from, and others; what drives them has the size of one."""
     made = list[PlainTrials]()
+    interval = float(np.diff(trials.times[trials.rows(asked)], axis=1).max(initial=0.0))
     for names in (learned, asked):
         rows = trials.rows(names)
         values, first = (
@@ -159,9 +161,13 @@ def _motions(
             ends = np.array([_end(series) for series in values]).reshape(-1, first.shape[1])
             rest = np.array([_mean(column) for column in ends.T])
         settles = trials.begin_of(asked[0]) in ("released", GIVEN)  # at rest where the training ends
-        frames = [np.zeros((*values.shape[:2], 0)), *(acting[name] / size for name, size in sizes.items())]
         origin = np.where(np.isfinite(rest), rest, first) if settles else first
-        made.append(PlainTrials(values, origin, first, np.concatenate(frames, 2), loads / load))
+        parts = [np.zeros((len(rows), 1 + values.shape[1], 0))]  # with a frame before time zero
+        for name, size in sizes.items():
+            before = trials.resting[name][rows] if name in trials.resting else 0.0 * acting[name][:, 0]
+            parts.append(np.concatenate([before[:, None], acting[name]], 1) / size)
+        inputs = np.concatenate(parts, 2)
+        made.append(PlainTrials(values, origin, first, inputs[:, 1:], loads / load, inputs[:, 0], interval))
     return made[0], made[1]
 
 

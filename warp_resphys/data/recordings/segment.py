@@ -16,9 +16,9 @@ from .processing import valve_opening
 from .recording import SI_PER_ACTUATION_UNIT, Recording, in_metres
 from .recording_files import numbers, write_recording
 
-CLAMP_LABELS: Final = tuple(f"Clamp - {number}" for number in range(1, 5))
+BASE_LABELS: Final = tuple(f"Base - {number}" for number in range(1, 5))
 TIP_LABELS: Final = tuple(f"Tip - {number}" for number in range(1, 4))
-SEGMENT_LABELS: Final = (*CLAMP_LABELS, *TIP_LABELS)
+SEGMENT_LABELS: Final = (*BASE_LABELS, *TIP_LABELS)
 MARKERS: Final = (0, 3, 2, 1, 4, 6, 5)  # index of the recorded marker of every label
 
 

@@ -115,6 +115,13 @@ def test_what_a_thread_raises_comes_when_all_have_ended(failing):
     assert sorted(ended) == sorted({0, 1, 2} - {failing})
 
 
+def test_shards_are_not_shared_again(monkeypatch):
+    threads(monkeypatch, 4)
+    inner = in_threads(lambda _: (shards_of(8, torch.device("cpu")), in_threads(lambda n: n, [1, 2])), range(3))
+    assert inner == [([], [1, 2])] * 3
+    assert len(shards_of(8, torch.device("cpu"))) == 4
+
+
 @pytest.mark.parametrize(("name", "limit"), [("quasi_newton", 1), ("newton", 2), ("projective_dynamics", 3)])
 def test_no_environment_has_more_iterations_than_the_limit(name, limit):
     sim = simulator(name=name, max_iterations=limit, on_failure="count")

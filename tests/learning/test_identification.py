@@ -50,6 +50,19 @@ def test_stiffness_and_density_of_a_body_without_weights_are_correlated():
     assert weighted.poorest_deviation < 0.1
 
 
+def test_loss_and_derivatives_do_not_depend_on_the_number_of_threads(monkeypatch):
+    pair, results = replay_of(simulator(), TRUTH, masses=(0.0, 0.05, 0.02), noise=5e-5), []
+    for count in (1, 2):
+        monkeypatch.setenv("WARP_RESPHYS_THREADS", str(count))
+        misfit = Misfit([pair], RANGES)
+        results.append(misfit.linearise(misfit.to_unit(FIRST)))
+    one, two = results
+    assert [trial.name for trial in two.trials] == [trial.name for trial in one.trials] == ["m0", "m1", "m2"]
+    assert two.loss == one.loss
+    np.testing.assert_array_equal(two.gauss_newton, one.gauss_newton)
+    np.testing.assert_array_equal(two.gradient, one.gradient)
+
+
 def test_a_parameter_outside_its_range_ends_on_the_bound():
     bounds = {"youngs_modulus": Bounds(lower=3e5, upper=1e6, logarithmic=True)}
     pair = replay_of(simulator(), {"youngs_modulus": 215e3}, frames=12)

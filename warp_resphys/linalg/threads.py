@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
-from threading import Lock
+from threading import Lock, local
 from typing import TypeVar
 
 import torch
@@ -73,11 +73,16 @@ def _blas() -> list[LibController]:
     return libraries
 
 
-def shards_of(batch: int, device: torch.device) -> list[slice]:
+def shards_of(batch: int, device: torch.device, least: int = _LEAST_ENVIRONMENTS) -> list[slice]:
     """Returns the slices of a batch for one thread each, or none if a single thread does it all.
 
     On a CPU a kernel runs on the thread that launches it and releases the GIL. The number of threads is torch's, or
-    ``WARP_RESPHYS_THREADS``.
+    ``WARP_RESPHYS_THREADS``; within `in_threads` it is one.
+
+    Args:
+        batch: number of environments.
+        device: their device.
+        least: smallest number of environments in a slice.
 
     Raises:
         InputError: the environment variable is not a whole number.
@@ -85,11 +90,18 @@ def shards_of(batch: int, device: torch.device) -> list[slice]:
     threads = os.environ.get("WARP_RESPHYS_THREADS", str(torch.get_num_threads()))
     if not threads.isdecimal():
         raise InputError(f"WARP_RESPHYS_THREADS is {threads!r}: it must be a whole number of threads.")
-    count = min(int(threads), batch // _LEAST_ENVIRONMENTS)
-    if device.type != "cpu" or count < 2:
+    count = min(int(threads), batch // least)
+    if device.type != "cpu" or count < 2 or _is_shared():
         return []
     ends = [round(batch * k / count) for k in range(count + 1)]
     return [slice(*pair) for pair in pairwise(ends)]
+
+
+_SHARING = local()  # of each thread: whether it works on one of several shards
+
+
+def _is_shared() -> bool:
+    return getattr(_SHARING, "now", False)
 
 
 @cache
@@ -110,19 +122,23 @@ if hasattr(os, "register_at_fork"):
 def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
     """Returns the results of a function for all shards; the calling thread works on the last one.
 
-    Exceptions are raised after all threads have finished.
+    Exceptions are raised after all threads have finished. Within the function, further shards are not shared again.
     """
-    if len(shards) == 1:
-        return [work(shards[0])]
+    if len(shards) == 1 or _is_shared():
+        return [work(shard) for shard in shards]
     grad_enabled = torch.is_grad_enabled()  # a thread-local setting
 
     def work_on(shard: S) -> T:
-        with torch.set_grad_enabled(grad_enabled):
-            return work(shard)
+        _SHARING.now = True
+        try:
+            with torch.set_grad_enabled(grad_enabled):
+                return work(shard)
+        finally:
+            _SHARING.now = False
 
     others = [_pool(len(shards) - 1).submit(work_on, shard) for shard in shards[:-1]]
     try:
-        last = work(shards[-1])
+        last = work_on(shards[-1])
     finally:
         wait(others)
     return [*(other.result() for other in others), last]

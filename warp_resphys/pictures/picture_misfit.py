@@ -83,14 +83,13 @@ class PictureMisfit(BoundedMisfit):
         self._shapes, self._last = [*self._first], None
 
     @override
-    def update_prior_weight(self, unit: FloatArray) -> float:
+    def update_prior_weight(self, unit: FloatArray) -> None:
         """As elsewhere, but from the known noise of clouds before the first search: a far guess has no small errors."""
-        self._last = None
-        first, change = not self.prior_weight, super().update_prior_weight(unit)
+        self._last, first = None, not self.prior_weight
+        super().update_prior_weight(unit)
         points = sum(len(photo.cloud.measured) for pose in self.poses for photo in pose.photos if photo.cloud)
         if first and points:
             self.prior_weight = min(self.prior_weight, 1.0 / points)
-        return change
 
     @override
     def objective(self, unit: FloatArray, derivatives: bool) -> tuple[float, FloatArray, FloatArray]:

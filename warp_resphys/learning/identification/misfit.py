@@ -3,7 +3,7 @@
 The loss is the mean square distance of simulated and observed markers, each motion in units of its own amplitude, over
 all motions at once. Prior knowledge is that of the parameters (`parameters.Prior`) and of marker places (`placement`).
 It adds its squares, weighted as much as one independent residual of the data: by their mean square, times the number of
-residuals that are correlated. That weight is computed at the start of a search and again at the minimum.
+residuals that are correlated. That weight is computed at the start of a search and again where the loss hardly falls.
 
 A parameter may have a value for each trial or session (`parameters.value_name`), held by its prior; all others have the
 mean of the prior. A trial depends on its own value alone, so that one motion gives the derivatives of all trials.
@@ -15,6 +15,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import chain, starmap
+from operator import itemgetter
 
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ from typing_extensions import override
 
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
+from ...linalg.threads import in_threads, shards_of
 from ...settings.learning import Bounds
 from ...stepping.state import State
 from ..metrics import redundancy
@@ -117,16 +120,14 @@ class BoundedMisfit(ABC):
             rows[row], slopes[row, i] = weight * (unit[i] - mean) / deviation, weight / deviation
         return rows, slopes, self.prior_weight
 
-    def update_prior_weight(self, unit: FloatArray) -> float:
-        """Sets the weight of the priors from the residuals at (P,) parameters; returns its ratio to the old weight."""
-        before = self.prior_weight
+    def update_prior_weight(self, unit: FloatArray) -> None:
+        """Sets the weight of the priors from the residuals at (P,) parameters."""
         linearised = self.linearise(unit, derivatives=False) if self.has_priors else None
         if linearised is None:
-            return 1.0
+            return
         seen = sum(trial.seen for trial in linearised.trials)
         squares = [np.square(trial.rows).sum() * redundancy(trial.rows) for trial in linearised.trials]
         self.prior_weight = max(float(sum(squares)) / max(seen, 1), _LEAST_WEIGHT)
-        return self.prior_weight / before if before else math.inf
 
     def uncertainty(self, unit: FloatArray) -> Uncertainty | None:
         """Uncertainty of (P,) parameters; None if a simulation close by fails."""
@@ -178,7 +179,7 @@ class Misfit(BoundedMisfit):
         self._shares = None if shares is None else np.array(shares)
         self._replays, self._weights = list[tuple[Replay, Start]](), list[torch.Tensor]()
         count = sum(len(replay.trials.names) for replay, _ in replays)
-        for replay, start in replays:
+        for replay, start in chain.from_iterable(starmap(_parts, replays)):
             trials = replay.trials if seconds is None else replay.trials.first(seconds)
             amplitude = torch.ones_like(trials.amplitude) if self._known else trials.amplitude
             for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
@@ -187,6 +188,9 @@ class Misfit(BoundedMisfit):
             pair = Replay(self.simulator, replay.observe, trials), start
             self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))
             self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
+        numbers = range(len(self._replays))
+        threads = len(shards_of(len(numbers), simulator.rest_positions.device, 1)) or 1
+        self._by_thread = [numbers[first::threads] for first in range(threads)]
         self._fit = NuisanceFit(self._replays, self._weights, accuracy, delay)
         self._moves = _moves_of(self.bounds)
         self.forget()
@@ -292,9 +296,11 @@ class Misfit(BoundedMisfit):
         """
         if self._last is not None and torch.equal(self._last[0], points):
             return self._last[1]
-        unit, values, simulated = points[0], self._values(points), []
+        unit, values = points[0], self._values(points)
         first = {name: value[:1] for name, value in values.items()}
-        for (replay, start), motion in zip(self._replays, self._motions, strict=True):
+
+        def follow(number: int) -> torch.Tensor:
+            (replay, start), motion = self._replays[number], self._motions[number]
             guess = motion.predict(unit, 0) if start.at_rest else None
             begin = start if guess is None else start.near(guess)
             states = motion.states(unit)
@@ -302,12 +308,13 @@ class Misfit(BoundedMisfit):
                 states = replay.states(begin, first, partial(motion.predict, unit))
                 motion.keep(unit, states)
             if len(points) == 1:
-                simulated.append(replay.seen(begin, states))
-            else:
-                motion.differentiate(points)
-                simulated.append(replay.varied(begin, values, states, motion.record))
-        self._last = points, simulated
-        return simulated
+                return replay.seen(begin, states)
+            motion.differentiate(points)
+            return replay.varied(begin, values, states, motion.record)
+
+        followed = in_threads(lambda numbers: [(n, follow(n)) for n in numbers], self._by_thread)
+        self._last = points, [series for _, series in sorted(chain.from_iterable(followed), key=itemgetter(0))]
+        return self._last[1]
 
 
 class NearbyMotion:
@@ -366,6 +373,14 @@ class NearbyMotion:
         slopes = ((others.unflatten(0, (-1, len(q))) - q) / self._steps).float()
         if (len(self._slopes) + 1) * slopes.nbytes <= _MOST_BYTES:
             self._slopes.append(slopes)
+
+
+def _parts(replay: Replay, start: Start) -> list[tuple[Replay, Start]]:
+    """A replay and its start, divided by trials into a part for each thread."""
+    count = len(replay.trials.names)
+    chosen = [[*range(count)[part]] for part in shards_of(count, start.delay.device, 1) or [slice(None)]]
+    trials = replay.trials
+    return [(Replay(replay.simulator, replay.observe, trials.select(part)), start.select(part)) for part in chosen]
 
 
 def _moves_of(names: Iterable[str]) -> list[list[int]]:

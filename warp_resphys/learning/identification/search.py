@@ -32,7 +32,7 @@ from .uncertainty import Uncertainty
 Report = Callable[[int, float, Mapping[str, float]], None]
 IsLast = Callable[[float], bool]
 
-_SIMILAR = 0.7  # ratio of old and new weights of the priors above which a second descent is not worth its time
+_ROUGH = 0.1  # relative decrease below which the weights of the priors are computed again
 _MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
 _AT_A_BOUND = 1e-4  # of the range
 
@@ -241,7 +241,7 @@ def _descend(
         if report is not None:
             report(number, loss, values)
 
-    def minimum(x: torch.Tensor, most: int) -> Point:
+    def minimum(x: torch.Tensor, most: int, tolerance: float) -> Point:
         problem = UnitBox(misfit.objective, tolerance, evaluated)
         begin = problem.evaluate(x)
         if not math.isfinite(float(begin.value)):
@@ -252,10 +252,12 @@ def _descend(
     misfit.prior_weight = 0.0
     misfit.forget()
     misfit.update_prior_weight(first)
-    point = minimum(torch.as_tensor(first)[None], max_evaluations)
+    # Priors are weighted by the residuals at their start, which are too large, until the loss hardly falls.
+    begin = max(tolerance, _ROUGH) if misfit.has_priors else tolerance
+    point = minimum(torch.as_tensor(first)[None], max_evaluations, begin)
     left = max_evaluations - len(history)
-    refines = left > 1 and math.isfinite(float(point.value))
-    if refines and not _SIMILAR < misfit.update_prior_weight(point.x[0].numpy()) < 1.0 / _SIMILAR:
-        refined = minimum(point.x, left)
+    if begin > tolerance and left > 1 and math.isfinite(float(point.value)):
+        misfit.update_prior_weight(point.x[0].numpy())
+        refined = minimum(point.x, left, tolerance)
         point = refined if math.isfinite(float(refined.value)) else point
     return _Attempt(point.x[0].numpy(), float(point.value), history, misfit.prior_weight)

@@ -29,7 +29,7 @@ from .experiment.duration import announcement
 from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.folds import Fold, intervals_of_folds, run_folds, workers_for
 from .experiment.laboratory import run_laboratory
-from .experiment.learning_stages import evaluate, identify, identify_law, reconstruct, train
+from .experiment.learning_stages import evaluate, identify, identify_law, reconstruct, train, train_actuator
 from .experiment.mesh_check import check_mesh
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
@@ -174,19 +174,22 @@ class _SplitStages:
         self.stages.append(Stage(name, work, outputs, settings, (*self._identified, *upstream)))
 
     def identification(self) -> None:
-        """Adds the identification of parameters, of the law of the material, and its test on other bodies."""
-        run, digests = self.run, self._common["files"]
+        """Adds the identification of parameters and law, its test on other bodies, and the learned actuator."""
+        run, digests = self.run.model_copy(update={"actuator": None}), self._common["files"]
         if run.identify is not None:
             self.add("identify", identify, (files.IDENTIFICATION,), ("seed",), run=run.model_copy(update={"law": None}))
             self._identified = ("identify",)
         if run.law is not None:
             law = {} if run.law.file is None else {run.law.file: digest(law_path(run.law.file))}
-            self.add("identify_law", identify_law, (files.LAW_FILE,), ("name",), files=digests | law)
+            self.add("identify_law", identify_law, (files.LAW_FILE,), ("name",), run=run, files=digests | law)
             self._identified += ("identify_law",)
         if run.shapes:
             bodies = [body for shape in run.shapes.values() for body in (shape, shape.target_body)]
             keys = ("target", "shapes", "data.steps")
-            self.add("shapes", try_shapes, (files.SHAPES,), keys, files=digests | files_read(run, *bodies))
+            self.add("shapes", try_shapes, (files.SHAPES,), keys, run=run, files=digests | files_read(run, *bodies))
+        if self.run.actuator is not None:
+            self.add("train_actuator", train_actuator, (files.ACTUATOR_FILE,), ("seed",))
+            self._identified += ("train_actuator",)
 
     def learning(self) -> None:
         """Adds the reconstruction of residual forces, and the training of the networks."""
@@ -261,6 +264,7 @@ class _SplitStages:
 def _without_simulator(run: RunSettings, target: TargetSettings) -> RunSettings:
     """Returns the settings of a network that replaces the simulator, without those that identify the latter."""
     without: dict[str, Any] = {"simulation": target.material, "identify": None, "law": None, "shapes": {}}
+    without["actuator"] = None
     return run.model_copy(update=without)
 
 

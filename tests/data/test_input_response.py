@@ -82,12 +82,12 @@ def test_a_characteristic_curve_has_its_slope_in_each_octave_of_the_typical_comm
     response = InputResponse(STEP, typical=100.0, **CURVE)
     ends = np.array([0.0, 25.0, 50.0, 100.0, 200.0, 400.0, 800.0])
     inner = (0.6 * ends[1:-1] + 0.4 * ends[2:])[:, None]
-    slopes = (response.scaled(inner + 1e-4) - response.scaled(inner - 1e-4))[:, 0] / 2e-4
+    slopes = (response.still(inner + 1e-4) - response.still(inner - 1e-4))[:, 0] / 2e-4
     np.testing.assert_allclose(slopes, [0.5, 2.0, 1.0, 0.0, 1.0], atol=0.1)
     expected = np.cumsum(np.diff(ends) * [1.0, 0.5, 2.0, 1.0, 0.0, 1.0])  # with sharp corners
-    np.testing.assert_allclose(response.scaled(ends[1:, None])[:, 0], expected, rtol=0.15)
-    np.testing.assert_array_equal(response.scaled(-ends), -response.scaled(ends))
-    assert response.scaled(np.zeros(1)) == 0.0
+    np.testing.assert_allclose(response.still(ends[1:, None])[:, 0], expected, rtol=0.15)
+    np.testing.assert_array_equal(response.still(-ends), -response.still(ends))
+    assert response.still(np.zeros(1)) == 0.0
 
 
 def test_what_acts_counts_from_the_zero_beyond_the_dead_band_and_not_below_the_least_input():
@@ -102,10 +102,10 @@ def test_what_acts_counts_from_the_zero_beyond_the_dead_band_and_not_below_the_l
     (slope,) = torch.autograd.grad(result[-1].sum(), bands)
     np.testing.assert_allclose(slope, [-1.0, -1.0, 0.0])
     commands = np.array([0.0, 0.5, 1.0, 3.0])[:, None]
-    acting = InputResponse(STEP, 2.0, zero=0.5, lower=0.0).scaled(commands)
+    acting = InputResponse(STEP, 2.0, zero=0.5, lower=0.0).still(commands)
     np.testing.assert_array_equal(acting[:, 0], [0.0, 0.0, 1.0, 5.0])
     signed = InputResponse(STEP, 2.0, dead_band=0.25, zero=torch.tensor([0.5, -1.0], dtype=torch.float64))
-    of_each = signed.scaled(torch.as_tensor(commands)[:, None].repeat(1, 2, 1))
+    of_each = signed.still(torch.as_tensor(commands)[:, None].repeat(1, 2, 1))
     np.testing.assert_array_equal(of_each[:, 0, 0], [-0.5, 0.0, 0.5, 4.5])
     np.testing.assert_array_equal(of_each[:, 1, 0], [1.5, 2.5, 3.5, 7.5])
 

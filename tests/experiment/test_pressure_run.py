@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import warp_resphys
 from support.configured import check, composed, settings
 from support.main_job import finish, without_reports
 from support.segment_run import TRACKED, place_segment
@@ -27,9 +28,9 @@ from warp_resphys.learning.residuals import fitting
 from warp_resphys.learning.residuals.correction import force_frames
 from warp_resphys.settings.stage_keys import StageSettings
 
-COMMAND = ("experiment=tiny", TRACKED)
+COMMAND = ("experiment=tiny", TRACKED, "actuator={rounds: 1, epochs: 1, gate: false, width: 3, filters: [0.05]}")
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
-STAGES |= {"mesh_check", "report", "laboratory_scaled", "import_scaled"}
+STAGES |= {"mesh_check", "report", "laboratory_scaled", "import_scaled", "train_actuator"}
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +222,22 @@ def test_constant_inputs_are_pulses(recordings):
         recordings.stages(trials, "data.trials.t000.until=0.02")
     with pytest.raises(ResphysError, match=r"t000.inputs is null: onset and until are of constant inputs"):
         recordings.stages(trials, "data.trials.t000.inputs=null")
+
+
+def test_a_robot_has_the_learned_actuator_as_evaluated_from_a_file_and_on_another_mesh(finished, tmp_path):
+    robot = warp_resphys.load(finished, "actuator")
+    trial = warp_resphys.recorded_trial(robot, "t003")
+    shown = trial.shown(trial.play(robot))
+    with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
+        expected, below = (read_array(file, f"{model}_observed")[0] for model in ("actuator", "sysid"))
+    np.testing.assert_allclose(shown, expected, atol=1e-7)
+    assert np.abs(expected - below).max() > 1e-5
+    again = warp_resphys.load(robot.save(tmp_path / "robot.safetensors"))
+    np.testing.assert_allclose(trial.shown(trial.play(again)), shown, atol=1e-9)
+    other = robot.on(robot.description.mesh)
+    pressed = {"pressure": [5e3, 0.0]}
+    torch.testing.assert_close(other.settle(**pressed).q, robot.settle(**pressed).q, rtol=0.0, atol=1e-8)
+    assert (other.settle(**pressed).q - robot.on(robot.description.mesh, chambers=None).settle().q).abs().max() > 1e-6
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,10 @@ from warp_resphys import Body, ConvergenceError, Corotated, Inputs, Simulator, S
 from warp_resphys.data.markers import WHOLE_STATE, bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.observed_motions import at_steps
-from warp_resphys.learning.replay import Replay, Start, Windows
+from warp_resphys.learning.replay import Replay
 from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
+from warp_resphys.learning.starts import Start, Windows
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
@@ -176,7 +177,7 @@ class TestInTheLoop:
         exact = simulated(Replay(simulator(), MARKERS, motions), release)
         other = MotionLoss([TrialGroup(exact, release, LOADS)], {})
         config, seen = CONFIG.changed(epochs=3), []
-        epochs, (before, after) = cross_validated_epochs(network, [(loss, loss)], config, lambda: seen.append(1))
+        epochs, (before, after) = cross_validated_epochs([(network(), loss, loss)], config, lambda: seen.append(1))
         assert epochs == 3
         assert len(before) == len(after) == len(motions.names)
         assert np.mean([row.mean() for row in before]) == pytest.approx(loss.error_mm(None), rel=1e-9)
@@ -184,17 +185,16 @@ class TestInTheLoop:
         assert len(seen) == 3
         for patience, spent in ((2, 2), (9, 3)):
             seen.clear()
-            chosen, _ = cross_validated_epochs(
-                network, [(loss, other)], config.changed(patience=patience), lambda: seen.append(1)
-            )
+            patient = config.changed(patience=patience)
+            chosen, _ = cross_validated_epochs([(network(), loss, other)], patient, lambda: seen.append(1))
             assert (chosen, len(seen)) == (0, spent)
         histories = []
         for held_out in (loss, other):
             alone = finish(InTheLoop(network(), loss, held_out, config))
             histories.append([record["rollout_error_mm"] for record in alone.history])
-        parts = [(loss, loss), (loss, loss), (loss, other)]  # The mean over them decides.
+        parts = [(network(), loss, held_out) for held_out in (loss, loss, other)]  # The mean over them decides.
         mean = np.average(histories, axis=0, weights=[2, 1])
-        assert 0 < np.argmin(mean) == cross_validated_epochs(network, parts, config, lambda: None)[0]
+        assert 0 < np.argmin(mean) == cross_validated_epochs(parts, config, lambda: None)[0]
         trainer = InTheLoop(network(), loss, loss, config, epochs=0)
         trainer.begin()
         assert trainer.finished

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..data.input_network import InputNetwork
 from ..experiment.files import DRIVEN
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError, InputError
@@ -52,6 +53,8 @@ def write_reduced(path: Path, model: ReducedModel) -> None:
     values = {field.name: getattr(model, field.name) for field in fields(model)}
     if (force := values.pop("force")) is not None:
         values |= {name: getattr(force, name) for name in _FORCE}
+    acts = values["acts"].items()
+    values["acts"] = {word: value.plain() if isinstance(value, InputNetwork) else value for word, value in acts}
     polynomials = {name: value for name, value in values.items() if isinstance(value, Polynomial)}
     arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
     plain = {name: value for name, value in values.items() if name not in {*polynomials, *arrays}}
@@ -75,6 +78,8 @@ def read_reduced(path: Path, learned: Learned | None) -> ReducedModel:
         arguments |= {key: tuple(arguments[key]) for key in ("labels", "filters", "times")}
         acts = arguments["acts"].items()
         arguments["acts"] = {word: np.array(value) if isinstance(value, list) else value for word, value in acts}
+        if "network" in arguments["acts"]:
+            arguments["acts"]["network"] = InputNetwork.of_plain(arguments["acts"]["network"])
         if "push" not in orders:
             return ReducedModel(**arguments)
         if learned is None:

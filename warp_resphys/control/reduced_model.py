@@ -157,7 +157,7 @@ class ReducedModel:
             ConvergenceError: there is no equilibrium, because the learned force is too large.
         """
         commands = np.zeros((count, self.parts)) if inputs is None else np.tile(inputs, (count, 1))
-        u = self._moving(self.response.scaled(commands))
+        u = self._moving(self.response.still(commands))
         z = np.repeat(self._equilibrium(Monomials(u[:1])), count, axis=0)
         still, relaxed = np.stack([z, np.zeros_like(z)]), np.zeros((len(self.times), *z.shape))
         memory, no = self.response.steady(commands), np.zeros(count, dtype=np.bool_)
@@ -202,7 +202,7 @@ class ReducedModel:
         Raises:
             ConvergenceError: there is no equilibrium.
         """
-        u = Monomials(self._moving(self.response.scaled(inputs)))
+        u = Monomials(self._moving(self.response.still(inputs)))
         return self.points(self._equilibrium(u), u)
 
     def observe(self, state: ReducedState) -> FloatArray:

@@ -131,6 +131,11 @@ def check_plannable(robot: Robot) -> None:
         InputError: such a response, or no input, or several.
     """
     driven = driven_input(robot)
+    if driven.name in robot.description.actuator:
+        raise InputError(
+            f"the {driven.quantity.words} is changed by a learned actuator, but plans need an input that follows its "
+            "commands linearly: plan with control.models=[sysid], or set actuator=null or control=none."
+        )
     for word in ("slew", "dead_band", "zero", "backlash", *SLOPES):
         if any(f"{name}_".startswith(f"{driven.name}_{word}_") for name in robot.parameters):
             raise InputError(
@@ -157,9 +162,9 @@ class Source:
         self.filters = robot.description.filters if self.learned is not None else ()
         values = {name: float(value[0]) for name, value in robot.parameters.items()}
         self.range, self.moving = np.stack([self._low, self._high]), np.flatnonzero(self._high > self._low)
-        self.acts = response_of(driven.quantity, values, driven.parts)
+        self.acts = response_of(driven.quantity, values, driven.parts, robot.description.actuator)
         self.response = InputResponse(robot.time_step, **self.acts)
-        reach = np.abs(self.response.scaled(np.stack([self._low, self._high]))).max(0)
+        reach = np.abs(self.response.still(np.stack([self._low, self._high]))).max(0)
         self.scale = np.where(reach > 0.0, reach, 1.0)
         damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))}
         words = {name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name}
@@ -183,7 +188,7 @@ class Source:
 
     def acting(self, commands: FloatArray) -> FloatArray:
         """Moving inputs (..., n') under constant commands (..., n), in units of the scale."""
-        return np.asarray((self.response.scaled(commands) / self.scale)[..., self.moving])
+        return np.asarray((self.response.still(commands) / self.scale)[..., self.moving])
 
     def keywords(self, commands: FloatArray) -> dict[str, Any]:
         """Keyword argument of the robot's methods for commands (B, n) in the unit of the input."""

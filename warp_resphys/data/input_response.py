@@ -1,6 +1,6 @@
 """Inputs of a body: drawn and checked, and their response to commands.
 
-The response has backlash, zero, dead band, factor, curve, delay, lag, slew rate and means.
+The response has backlash, zero, dead band, factor, curve, delay, lag, slew rate, a learned change and means.
 
 Every call continues from a memory, so that a series gives the same result at once and step by step. Both NumPy arrays
 and torch tensors are accepted; tensors are differentiable.
@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..io.errors import DataFileError, InputError
 from ..settings.performed import WaveSettings
 from ..settings.played import SequenceSettings
 from ..stepping.quantity import Quantity
+from .input_network import InputNetwork
 
 Array = Any  # of NumPy or torch
 Memory = Mapping[str, Array]
@@ -151,6 +153,7 @@ class InputResponse:
         lower: least input; with a zero, lower ones count as this one.
         typical: typical command, which the octaves of the characteristic curve follow.
         filters: F time constants of the exponential means [s].
+        network: changes the input further; None for no change.
         slopes: of the characteristic curve by the names in `SLOPES`; those left out are one. `_curved` describes it. A
             straight line without any.
     """
@@ -168,8 +171,12 @@ class InputResponse:
         lower: float = -math.inf,
         typical: float = 1.0,
         filters: Sequence[float] = (),
+        network: InputNetwork | None = None,
         **slopes: Number,
     ) -> None:
+        self._network, self._kept_felt = network, list[Array]()
+        if network is not None:
+            self._kept_felt = [_share_kept(time, time_step) for time in network.filters]
         self.filters, self._factor, self._dead_band = tuple(filters), factor, dead_band
         self._typical, self._slopes = typical, slopes
         self._zero, self._backlash, self._lower = zero, backlash, lower
@@ -182,12 +189,14 @@ class InputResponse:
 
     def steady(self, commands: Array) -> dict[str, Array]:
         """Returns the memory under constant commands (..., C); its entries are (..., C) or (L, ..., C)."""
-        scaled, like = self.scaled(commands), _library(commands)
+        scaled, like = self._scaled(commands), _library(commands)
         memory = {} if self._backlash is None else {"geared": commands}
         memory |= {} if self._late is None else {"queue": like.broadcast_to(scaled, (self._length, *scaled.shape))}
         memory |= {} if self._kept_lag is None else {"behind": scaled}
-        means = {"means": like.broadcast_to(scaled, (len(self.filters), *scaled.shape))} if self.filters else {}
-        return memory | means
+        still = self.still(commands) if self.filters else scaled
+        for name, values, count in (("felt", scaled, len(self._kept_felt)), ("means", still, len(self.filters))):
+            memory |= {name: like.broadcast_to(values, (count, *values.shape))} if count else {}
+        return memory
 
     def __call__(self, memory: Memory, commands: Array) -> tuple[Array, Array, dict[str, Array]]:
         """Returns the input during T steps.
@@ -203,24 +212,38 @@ class InputResponse:
         if self._backlash is not None:
             commands = _geared(memory["geared"], commands, _column(self._backlash))
             later["geared"] = commands[-1]
-        acting = self.scaled(commands)
+        acting = self._scaled(commands)
         if self._late is not None:
             queue = like.concatenate([memory["queue"], acting])
             acting, later["queue"] = self._delayed(queue, len(acting)), queue[len(acting) :]
         if self._kept_lag is not None:
             acting = _lagged(memory["behind"], acting, self._kept_lag, self._reach)
             later["behind"] = acting[-1]
+        if self._network is not None:
+            felt = _means(memory["felt"], acting, self._kept_felt)
+            acting, later["felt"] = self._changed(acting, felt), felt[:, -1]
         if not self.filters:
             return acting, acting[None][:0], later
-        means = like.stack([_lagged(x, acting, k) for x, k in zip(memory["means"], self._kept_means, strict=True)])
+        means = _means(memory["means"], acting, self._kept_means)
         return acting, means, later | {"means": means[:, -1]}
 
     def from_rest(self, commands: Array) -> tuple[Array, Array]:
         """Returns the input (T, ..., C) and its means (F, T, ..., C) under commands (T, ..., C), from zero input."""
         return self(self.steady(0.0 * commands[0]), commands)[:2]
 
-    def scaled(self, commands: Array) -> Array:
-        """Returns the input under constant commands (..., C): beyond zero and dead band, with factor, on the curve."""
+    def still(self, commands: Array) -> Array:
+        """Returns the input under constant commands (..., C)."""
+        scaled = self._scaled(commands)
+        return scaled if self._network is None else self._changed(scaled, [scaled] * len(self._kept_felt))
+
+    def _changed(self, acting: Array, means: Any) -> Array:
+        """Inputs (..., C) with what the network adds for them and their means (F, ..., C), from the least input on."""
+        assert self._network is not None
+        changed = acting + self._network.added(with_means(acting, means))
+        return _library(changed).where(changed > self._lower, changed, 0.0 * changed + self._lower)
+
+    def _scaled(self, commands: Array) -> Array:
+        """Commands (..., C) beyond zero and dead band, with factor, on the curve."""
         if self._zero is not None:
             moved = commands - _column(self._zero)
             commands = _library(commands).where(moved > self._lower, moved, 0.0 * moved + self._lower)
@@ -247,13 +270,19 @@ class InputResponse:
         return (1.0 - share) * taken(queue, now, 0) + share * taken(queue, now - 1, 0)
 
 
-def response_of(quantity: Quantity, parameters: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
-    """Returns the arguments of `InputResponse` for the identified parameters of an input, besides its filters.
+def response_of(
+    quantity: Quantity,
+    parameters: Mapping[str, Any],
+    parts: Sequence[str],
+    actuator: Mapping[str, InputNetwork] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Returns the arguments of `InputResponse` for what was identified of an input, besides its filters.
 
     Args:
         quantity: the input.
         parameters: numbers or (B,) by name, such as ``pressure_factor``, or ``pressure_factor_1`` of the part ``1``.
         parts: names of its parts.
+        actuator: learned changes by input.
     """
     known = dict[str, Any]()
     for word in RESPONSES:
@@ -266,6 +295,7 @@ def response_of(quantity: Quantity, parameters: Mapping[str, Any], parts: Sequen
             values = [common if value is None else value for value in of_parts]
             like = _library(one)
             known[word] = like.stack(like.broadcast_tensors(*values) if like is torch else values, -1)
+    known |= {"network": actuator[quantity.name]} if quantity.name in actuator else {}
     return {**known, "lower": quantity.lower, "typical": quantity.typical}
 
 
@@ -315,6 +345,11 @@ def _lagged(behind: Array, series: Array, kept: Array, reach: Array = None) -> A
         behind = behind + change
         lagged.append(behind)
     return _library(series).stack(lagged)
+
+
+def _means(before: Array, series: Array, kept: Sequence[Array]) -> Array:
+    """Exponential means (F, T, ..., C) of a series (T, ..., C) from (F, ..., C) on, with F decays in a step."""
+    return _library(series).stack([_lagged(x, series, k) for x, k in zip(before, kept, strict=True)])
 
 
 def _geared(output: Array, series: Array, width: Array) -> Array:

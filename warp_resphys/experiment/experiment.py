@@ -1,7 +1,7 @@
 """The `Experiment` that all stages share: the body, its trials, its simulators and its models."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -9,6 +9,7 @@ from typing import Any, Final
 import torch
 from numpy.typing import NDArray
 
+from ..data.input_network import InputNetwork
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import WHOLE_STATE, Observation
 from ..data.trials import Trials
@@ -26,12 +27,23 @@ from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.run_keys import models_of
 from ..settings.stage_keys import StageSettings
 from .build import bound_markers, build_body, build_simulator, marker_view_of
-from .files import DATASET, IDENTIFICATION, LAW_FILE, SCALED_DATASET, read_if_there, reconstruction_file, weights_file
+from .files import (
+    ACTUATOR_FILE,
+    DATASET,
+    IDENTIFICATION,
+    LAW_FILE,
+    SCALED_DATASET,
+    read_if_there,
+    reconstruction_file,
+    training_file,
+    weights_file,
+)
 from .simulate import target_settings
 
 LAW: Final = "law"
+ACTUATOR: Final = "actuator"
 SIMFREE: Final = "simfree"
-INTERVAL_MODELS: Final = ("sysid", LAW, SIMFREE, "resphys")  # with prediction intervals, beside the baselines
+INTERVAL_MODELS: Final = ("sysid", LAW, ACTUATOR, SIMFREE, "resphys")  # with prediction intervals, beside the baselines
 LEARNED: Final = (SIMFREE, "resphys_uncorrected", "resphys")
 # By model: the simulator that it uses or corrects, and the identification that provides its parameters.
 MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
@@ -40,6 +52,7 @@ MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
     "sysid_elastic": ("simulation", "sysid_elastic"),
     "sysid": ("identified", "sysid"),
     "law": ("law", "law"),
+    "actuator": ("identified", "sysid"),
     "simfree": ("identified", "sysid"),
     "resphys_uncorrected": ("simulation", None),
     "resphys": ("identified", "sysid"),
@@ -49,6 +62,17 @@ MODELS: Final[Mapping[str, tuple[str, str | None]]] = {
 def network_of(model: str) -> type[StateMap]:
     """Returns the class of a learned model's network."""
     return NextState if model == SIMFREE else ResidualForce
+
+
+def read_actuator(folder: Path) -> dict[str, InputNetwork]:
+    """Networks of actuator.json by input; none without the file."""
+    plain = read_if_there(folder / ACTUATOR_FILE).get("inputs", {})
+    return {name: InputNetwork.of_plain(network) for name, network in plain.items()}
+
+
+def training_files(folder: Path) -> dict[str, Path]:
+    """Files that have the epochs of what was learned and the weights that were kept, by model; some may be missing."""
+    return {ACTUATOR: folder / ACTUATOR_FILE, **{model: folder / training_file(model) for model in LEARNED}}
 
 
 @dataclass(frozen=True)
@@ -141,7 +165,19 @@ class Experiment:
         )
 
     def identified(self, model: str) -> Identification:
-        """Returns the identification of a model's simulator: parameters, their uncertainty, marker places; or none."""
+        """Returns what was identified of a model's simulator, with the learned actuator if the model uses it."""
+        found = self._parameters_of(model)
+        if model not in (ACTUATOR, "resphys") or not self.has_actuator:
+            return found
+        return replace(found, actuator=self._actuator, test=read_json(self.folder / ACTUATOR_FILE)["kept"]["test"])
+
+    @cached_property
+    def _actuator(self) -> dict[str, InputNetwork]:
+        """Networks of the learned actuator, by input."""
+        return {name: network.to(self.like.device) for name, network in read_actuator(self.folder).items()}
+
+    def _parameters_of(self, model: str) -> Identification:
+        """Parameters of a model's simulator, their uncertainty and marker places; or none."""
         key = self.sources(model)[1]
         if key is None or (key != LAW and self.settings.identify is None):
             return Identification()
@@ -158,18 +194,24 @@ class Experiment:
 
     @property
     def models(self) -> list[str]:
-        """Names of the models that are compared; the law is one of them if it helps on the validation trials."""
-        settings = self.settings
-        return models_of(settings.published, settings.identify, settings.correct_uncorrected, self.has_law)
+        """Names of the models that are compared; law and actuator are among them if they help on held-out trials."""
+        settings, found = self.settings, (self.has_law, self.has_actuator)
+        return models_of(settings.published, settings.identify, settings.correct_uncorrected, *found)
 
     @property
     def has_law(self) -> bool:
         """Whether a law was identified, and helps on the validation trials."""
         return self.settings.with_law and bool(read_if_there(self.folder / LAW_FILE).get("accepted"))
 
+    @property
+    def has_actuator(self) -> bool:
+        """Whether changes of the inputs were learned, and help on held-out trials."""
+        learned = read_if_there(self.folder / ACTUATOR_FILE) if self.settings.with_actuator else {}
+        return bool(learned) and ((test := learned["kept"]["test"]) is None or test["used"])
+
     def sources(self, model: str) -> tuple[str, str | None]:
-        """Returns the entry of `MODELS`; a force corrects the law, if there is one."""
-        return MODELS[LAW if model == "resphys" and self.has_law else model]
+        """Returns the entry of `MODELS`; actuator and force correct the law, if there is one."""
+        return MODELS[LAW if model in (ACTUATOR, "resphys") and self.has_law else model]
 
     def model_simulator(self, model: str) -> Simulator:
         """The simulator that a model uses or corrects."""

@@ -15,11 +15,13 @@ from ..learning.comparison import Comparison
 from ..learning.identification import identification, law_search
 from ..learning.placement import Accuracy
 from ..learning.residuals import reconstruction
+from ..learning.residuals.actuator_fit import ActuatorFitting
 from ..learning.residuals.fitting import Fitting, Snapshot, fit
 from ..settings.stage_keys import StageSettings
 from .build import choose_device
 from .experiment import LAW, MODELS, SIMFREE, Experiment
 from .files import (
+    ACTUATOR_FILE,
     ERRORS,
     IDENTIFICATION,
     LAW_FILE,
@@ -109,6 +111,28 @@ def identify_law(context: StageContext) -> None:
         content = {**known, **content, "accepted_there": accepted, "file": file}
     write_json(context.run_dir / LAW_FILE, content)
     kept.unlink(missing_ok=True)
+
+
+def train_actuator(context: StageContext) -> None:
+    """Writes actuator.json: the networks that change inputs, their test on held-out trials, and the epochs.
+
+    An interrupted training resumes.
+    """
+    settings: StageSettings = context.settings
+    experiment, name, split = Experiment(settings, context.run_dir), context.name, settings.split
+    checkpoint = context.run_dir / f"{name}.safetensors"
+    resumed = resume_checkpoint(checkpoint, "training", context.fingerprint)
+
+    def save(kept: Snapshot) -> None:
+        write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
+
+    below = LAW if experiment.has_law else "sysid"
+    made_of = experiment.model_simulator(below), experiment.motions, split.train, split.validation
+    fitting = ActuatorFitting(*made_of, experiment.identified(below))
+    found, training = fitting.fit(settings.actuator, settings.seed, name, resumed, save)
+    networks = {key: network.plain() for key, network in found.actuator.items()}
+    write_json(context.run_dir / ACTUATOR_FILE, {**training, "inputs": networks})
+    checkpoint.unlink(missing_ok=True)
 
 
 def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:

@@ -12,7 +12,6 @@ from ..io.resuming import StageContext
 from ..io.safe_files import write_json
 from ..learning.error_tables import amplitudes
 from ..learning.metrics import marker_errors, summarise
-from ..learning.replay import Replay
 from ..report.data import MeshCheck
 from ..settings.stage_keys import StageSettings
 from .build import finer
@@ -50,7 +49,7 @@ def check_mesh(context: StageContext) -> None:
                 replay = motions.replay(experiment.model_simulator(model), names, identified)
                 if moving:
                     seconds = first_change(experiment.trials, names[0]) + CHECKED_SECONDS
-                    replay = Replay(replay.simulator, replay.observe, replay.trials.first(seconds))
+                    replay = replay.changed(trials=replay.trials.first(seconds))
                 points = replay(motions.start(replay, identified), experiment.parameters(model))[0].cpu().numpy()
                 shown.append(as_markers(points, experiment.trials.labels))
                 observed = as_markers(replay.trials.observed.cpu().numpy(), experiment.trials.labels)

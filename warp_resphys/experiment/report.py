@@ -37,7 +37,7 @@ from ..report.wording import MODELS, models_in_figures
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity, routes_of
 from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
-from .experiment import LEARNED
+from .experiment import read_actuator, training_files
 from .files import (
     CONTROL,
     DATASET,
@@ -58,7 +58,6 @@ from .files import (
     TRUTH,
     fold_folder,
     read_if_there,
-    training_file,
 )
 
 
@@ -110,7 +109,7 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     if stages is None:
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
         stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
-    files = {model: folder / training_file(model) for model in LEARNED}
+    files = training_files(folder)
     common, identified = common_folder(folder), Identification.read(folder / IDENTIFICATION)
     errors: ErrorTables = read_json(folder / ERRORS)
     metrics: Metrics = {
@@ -204,7 +203,7 @@ class RunReader:
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
         assert run.tip is not None
         names = {name for result in identification.values() for name in result.parameters}
-        histories = {model: read_if_there(self.folder / training_file(model)).get("epochs") for model in LEARNED}
+        histories = {model: read_if_there(path).get("epochs") for model, path in training_files(self.folder).items()}
         return RunReport(
             metrics=metrics,
             settings=run,
@@ -220,6 +219,7 @@ class RunReader:
             driven=self.driven,
             recordings=self.recordings(*self._at_rest()),
             identification=identification,
+            actuator=read_actuator(self.folder) if run.with_actuator else {},
             **(self._stretches(metrics["law"]) if "law" in metrics else {}),
             start=configured_parameters(build_simulator(run, run.simulation, payload_at=run.payload_at), sorted(names)),
             truth={name: value for name, value in material.items() if name != "model"} | true_contact(run),

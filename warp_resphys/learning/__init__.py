@@ -8,5 +8,6 @@ from .identification.law_search import identify_law as identify_law
 from .identification.search import Identification as Identification
 from .identification.search import search_parameters as search_parameters
 from .observed_motions import ObservedMotions as ObservedMotions
+from .residuals.actuator_fit import fit_actuator as fit_actuator
 from .residuals.fitting import fit_force as fit_force
 from .residuals.reconstruction import reconstruct as reconstruct

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, with_means
 from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
 from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
@@ -23,11 +24,14 @@ from ..io.errors import ConvergenceError, InputError, in_short
 from ..settings.learning import ActuationSettings, ReleaseSettings
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
+from ..stepping.rollout import sample
 from ..stepping.state import State
 from .parameters import split_name
 from .placement import PlacedMarkers, PlainPlacements, placement_of
 from .release import begin_inputs, estimate_release
-from .replay import Replay, Start, later
+from .replay import Replay
+from .scores import HeldOutTest
+from .starts import Start
 from .trial_batch import TrialBatch
 
 _STANDS_STILL = 1e-9  # m/s, rad/s
@@ -43,12 +47,16 @@ class Identified(Brief):
         placement: of the markers, see `placement.placement_of`; None if it is exact.
         first_frames: first seconds of the trials from which values of a trial or session were estimated that nothing
             else was identified from, by its name and that of the trial [s]; these frames count in no error.
+        actuator: learned changes of the inputs, by input; from `fit_actuator`.
+        test: of the actuator on held-out trials; None: it was not tested.
     """
 
     parameters: Mapping[str, float] = field(default_factory=dict)
     of_trials: Mapping[str, float] = field(default_factory=dict)
     placement: PlainPlacements | None = None
     first_frames: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    actuator: Mapping[str, InputNetwork] = field(default_factory=dict)
+    test: HeldOutTest | None = None
 
     @classmethod
     def of(cls, parameters: "Identified | Mapping[str, float] | None") -> "Identified":
@@ -164,12 +172,13 @@ class ObservedMotions(Brief):
 
     def replay(self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None) -> Replay:
         """Replay of trials of one batch, with the markers where they were identified."""
-        observe, placement = self.observe, None if identified is None else identified.placement
+        identified = identified or Identified()
+        observe, placement = self.observe, identified.placement
         if placement is not None:
             assert isinstance(observe, Markers)
             placed = placement_of(placement, self.labels, self.trials.session(names[0]))
             observe = PlacedMarkers.of(observe, placed).to(simulator.rest_positions)
-        return Replay(simulator, observe, self.batch(names, simulator))
+        return Replay(simulator, observe, self.batch(names, simulator), identified.actuator)
 
     def start(self, replay: Replay, identified: Identified | None = None) -> Start:
         """Estimates how the trials of a replay begin.
@@ -306,6 +315,17 @@ def _fitted(simulator: Simulator, inputs: Inputs, count: int) -> Inputs:
     vertices, fixed = simulator.body.n_vertices, len(simulator.fixed)
     fitted.at(0).check(accepted, count, vertices, fixed, simulator.rest_positions)
     return fitted
+
+
+def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
+    """Values (B, K + 1, ...) at the times k h after delays (B,) [s], from those at k h.
+
+    Before the series, its first value holds; after its end, values are NaN.
+    """
+    last = series.shape[1] - 1
+    times = step * torch.arange(last + 1).to(delay) + delay[:, None]
+    over = times > (last + 1e-6) * step
+    return sample(series, times, step).masked_fill(over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan)
 
 
 def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:

@@ -18,7 +18,8 @@ from typing_extensions import TypedDict, override
 from ..data.markers import Markers, Observation
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from .replay import Replay, Start
+from .replay import Replay
+from .starts import Start
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ class DisplacedMarkers(Observation):
             raise InputError("where the markers sit can be identified of markers alone: leave identify.placement out.")
         observe = cls(replay.observe, replay.trials.observed.shape[2])
         shift = None if start.shift is None else start.shift.repeat(1, len(observe._all), 1)
-        return Replay(replay.simulator, observe, replay.trials), replace(start, shift=shift)
+        return replay.changed(observe=observe), replace(start, shift=shift)
 
     @override
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:

@@ -20,7 +20,8 @@ from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from ..settings.learning import ReleaseSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .replay import Parameters, Replay, Start
+from .replay import Parameters, Replay
+from .starts import Start
 
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration
@@ -78,7 +79,7 @@ def begin_inputs(
     """
     if settings.delay == 0.0:
         return start
-    first = Replay(replay.simulator, replay.observe, replay.trials.first(settings.window))
+    first = replay.changed(trials=replay.trials.first(settings.window))
     furthest = torch.full_like(start.delay, -_FURTHEST * settings.delay)
     with torch.no_grad():
         series = first.series(replace(start, delay=furthest), parameters)
@@ -184,7 +185,7 @@ class _FirstFrames(Problem):
     def __init__(
         self, replay: Replay, held: torch.Tensor, settings: ReleaseSettings, parameters: Parameters | None
     ) -> None:
-        self._simulator, self._observe, self._trials = replay.simulator, replay.observe, replay.trials
+        self._replay, self._observe, self._trials = replay, replay.observe, replay.trials
         self._held, self._settings, self._parameters = held, settings, parameters
         none = held.new_zeros(0, *held[0].shape)
         self._shapes = sideways_shapes(replay.simulator) if settings.sideways > 0.0 else none
@@ -205,7 +206,7 @@ class _FirstFrames(Problem):
         (runs, unknowns), count = x.shape, len(self._held)
         if runs not in self._copies:
             first = self._trials.first(self._settings.window).select([*range(count)] * (runs // count * (1 + unknowns)))
-            self._copies[runs] = Replay(self._simulator, self._observe, first)
+            self._copies[runs] = self._replay.changed(trials=first)
         identity = torch.eye(unknowns, dtype=x.dtype, device=x.device)
         offsets = torch.cat([torch.zeros_like(identity[:1]), _DIFFERENCE * identity]).repeat_interleave(runs, 0)
         replay = self._copies[runs]

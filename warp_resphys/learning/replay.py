@@ -8,22 +8,24 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import torch
 
+from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of
 from ..data.markers import Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
-from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
 from .residuals.correction import equilibrium_under_feedback
+from .starts import Start, Windows
 from .trial_batch import TrialBatch
 
 log = logging.getLogger(__name__)
@@ -31,6 +33,7 @@ log = logging.getLogger(__name__)
 StepForce = Callable[[State, int], torch.Tensor]
 Parameters = Mapping[str, torch.Tensor]
 Near = Callable[[int], torch.Tensor | None]
+Prepared = tuple[Constants, Inputs, Inputs]
 Record = Callable[[torch.Tensor, torch.Tensor], None]
 
 _FIRST, _OTHERS = slice(0, 1), slice(1, None)  # sets of parameters
@@ -43,67 +46,6 @@ def exact(simulator: Simulator) -> Simulator:
     return replace(simulator, solver=simulator.settings.changed(relative_tolerance=_EXACT))
 
 
-@dataclass(frozen=True)
-class Start(Brief):
-    """Initial conditions of R trials."""
-
-    state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
-    delay: torch.Tensor  # (R,) between time zero of the frames and the release of the body, or of its inputs [s]
-    # (R, M, 3) true less bound marker places, where a body was held bent but registered as undeformed [m]; None for
-    # no shift
-    shift: torch.Tensor | None = None
-    # whether the bodies begin in equilibrium, which is then solved again for every set of parameters
-    at_rest: bool = False
-
-    @classmethod
-    def resting(cls, guess: torch.Tensor) -> "Start":
-        """Starts in equilibrium, which is solved from a first guess (R, N, 3) [m]."""
-        return cls(State(guess, torch.zeros_like(guess)), guess.new_zeros(len(guess)), at_rest=True)
-
-    def near(self, q: torch.Tensor) -> "Start":
-        """The start with another first guess of its equilibrium [m], (R or E R, N, 3) for E sets of parameters."""
-        return replace(self, state=State(q, torch.zeros_like(q)))
-
-    def select(self, indices: list[int]) -> "Start":
-        """The start of the trials with these indices."""
-        pick = torch.as_tensor(indices, device=self.delay.device)
-        shift = None if self.shift is None else self.shift[pick]
-        return replace(self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift)
-
-    def shifted(self, markers: torch.Tensor) -> torch.Tensor:
-        """(..., R, T, M, 3) true marker positions, from those of bound markers [m]."""
-        return markers if self.shift is None else markers + self.shift[:, None]
-
-    def bound(self, markers: torch.Tensor) -> torch.Tensor:
-        """(R, T, M, 3) positions of bound markers, from true marker positions [m]."""
-        return markers if self.shift is None else markers - self.shift[:, None]
-
-
-@dataclass(frozen=True)
-class Windows(Brief):
-    """Known states of R trials, from which a simulation begins anew every few steps.
-
-    Where a state is unknown (NaN), the trial goes on from the simulated one. So does the memory of the energies, whose
-    gradient ends there, too.
-    """
-
-    q: torch.Tensor  # (R, K + 1, N, 3) positions at the steps [m]
-    v: torch.Tensor  # (R, K + 1, N, 3) velocities [m/s]
-    steps: int  # of a window
-
-    def begin(self, state: State, step: int) -> State:
-        """Returns the state at the beginning of a step: the known one in the first step of a window."""
-        if step == 0 or step % self.steps or step >= self.q.shape[1]:
-            return state
-        state, known = state.detach(), torch.isfinite(self.q[:, step]).flatten(1).all(1)[:, None, None]
-
-        def pair(at: int, q: torch.Tensor, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            return torch.where(known, self.q[:, at], q), torch.where(known, self.v[:, at], v)
-
-        previous = None if state.previous is None else pair(step - 1, *state.previous)
-        return State(*pair(step, state.q, state.v), previous, state.memory)
-
-
 class Replay:
     """Simulates observed trials.
 
@@ -111,6 +53,7 @@ class Replay:
         simulator: of the body; gives the constants that are not a parameter.
         observe: observation of the body, M points.
         trials: observed trials.
+        actuator: learned changes of inputs, by input; None without any.
 
     Attributes:
         parameter_names: names of the accepted parameters: scalar constants of the simulator; those of each part of an
@@ -122,12 +65,23 @@ class Replay:
             ``pressure_slope_1``.
     """
 
-    def __init__(self, simulator: Simulator, observe: Observation, trials: TrialBatch) -> None:
-        self.simulator, self.observe, self.trials = simulator, observe, trials
+    def __init__(
+        self,
+        simulator: Simulator,
+        observe: Observation,
+        trials: TrialBatch,
+        actuator: Mapping[str, InputNetwork] | None = None,
+    ) -> None:
+        self.simulator, self.observe, self.trials, self.actuator = simulator, observe, trials, actuator or {}
         self.parameter_names = identifiable_parameters(simulator)
         self._shaped = tuple(name for name, q in simulator.parameters.items() if q.shape and name != "gravity")
 
-    def prepare(self, parameters: Parameters | None = None) -> tuple[Constants, Inputs, Inputs]:
+    def changed(self, **fields: Any) -> "Replay":
+        """Returns a replay with other arguments."""
+        kept = {name: getattr(self, name) for name in ("simulator", "observe", "trials", "actuator")}
+        return Replay(**{**kept, **fields})
+
+    def prepare(self, parameters: Parameters | None = None) -> Prepared:
         """Returns constants and inputs of E sets of parameters and R trials, as (E R) environments; trials run fastest.
 
         Args:
@@ -175,13 +129,14 @@ class Replay:
         for name, commands in inputs.actuation.items():
             if name in HUNG:
                 continue
-            arguments = response_of(self.simulator.inputs[name], spread, self.simulator.parts.get(name, ()))
+            parts = self.simulator.parts.get(name, ())
+            arguments = response_of(self.simulator.inputs[name], spread, parts, self.actuator)
             response = InputResponse(self.simulator.time_step, **arguments)
             throughout = commands.ndim == 2
             first = resting.actuation.get(name, 0.0 * (commands if throughout else commands[0]))
-            acting[name] = response.scaled(commands) if throughout else response(response.steady(first), commands)[0]
+            acting[name] = response.still(commands) if throughout else response(response.steady(first), commands)[0]
             if name in resting.actuation or arguments.get("zero") is not None:
-                before[name] = response.scaled(first)
+                before[name] = response.still(first)
         return acting, before
 
     def initial_state(
@@ -326,14 +281,25 @@ class Replay:
         """
         first, others = ({name: value[chosen] for name, value in parameters.items()} for chosen in (_FIRST, _OTHERS))
         states = self.states(start, first) if states is None else states
-        return self._observed(self._varied_positions(start, first, others, states, record))
+        return self.varied_points(start, self.prepare(first), self.prepare(others), _count(others), states, record)
+
+    def varied_points(
+        self,
+        start: Start,
+        first: Prepared,
+        others: Prepared,
+        sets: int,
+        states: Sequence[State],
+        record: Record | None = None,
+    ) -> torch.Tensor:
+        """(E R, K + 1, M, 3) points as of `varied_series`, from constants and inputs of `prepare` of E - 1 sets."""
+        return self._observed(self._varied_positions(start, first, others, sets, states, record))
 
     def _varied_positions(
-        self, start: Start, first: Parameters, others: Parameters, states: Sequence[State], record: Record | None
+        self, start: Start, first: Prepared, others: Prepared, sets: int, states: Sequence[State], record: Record | None
     ) -> Iterator[torch.Tensor]:
         """Yields the positions (E R, N, 3) of `varied_series` [m], from the release on."""
-        (constants, inputs, resting), (their, their_inputs, their_resting) = self.prepare(first), self.prepare(others)
-        sets, state = _count(others), states[0]
+        (constants, inputs, resting), (their, their_inputs, their_resting), state = first, others, states[0]
         if not start.at_rest:
             whole = self.initial_state(start, constants, resting, 1 + sets)
             varied = whole.map(lambda t: t[state.batch :])
@@ -387,14 +353,3 @@ class Replay:
 def _count(parameters: Parameters | None) -> int:
     """Number of sets of parameters."""
     return len(next(iter(parameters.values()))) if parameters else 1
-
-
-def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
-    """Values (B, K + 1, ...) at the times k h after delays (B,) [s], from those at k h.
-
-    Before the series, its first value holds; after its end, values are NaN.
-    """
-    last = series.shape[1] - 1
-    times = step * torch.arange(last + 1).to(delay) + delay[:, None]
-    over = times > (last + 1e-6) * step
-    return sample(series, times, step).masked_fill(over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan)

@@ -7,9 +7,10 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Final, TypedDict
+from typing import Final
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from ..io.arrays import FloatArray
 from ..io.errors import InputError

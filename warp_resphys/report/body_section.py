@@ -18,7 +18,7 @@ from .page import Block, Canvas, Drawn, Part
 from .wording import TONES, mm_text, unbroken
 
 # Models whose coordinates are drawn, as more would overlap.
-_DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "simfree", "resphys")
+_DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "actuator", "simfree", "resphys")
 _CALIBRATED: Final = {  # Source of prediction intervals.
     "validation": "the errors in the validation trials",
     "training": "the errors in the training trials, which tend to be too small",
@@ -165,7 +165,7 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
             models = [m for m in models if m != "simulation"] or models
             caption += f"displacement of the markers from rest, and the {words} that drive it."
             alt += f"; below them the {words} of the {driven.quantity.per}s"
-        banded = [model for model in ("resphys", "law", "sysid") if model in trials.half_widths][:1]
+        banded = [model for model in ("resphys", "actuator", "law", "sysid") if model in trials.half_widths][:1]
         bands = {model: trials.half_widths[model][row][:, kept] for model in banded}
         hidden = len(shown) - len(kept)
         caption += _band_note(data, bands)

@@ -7,6 +7,7 @@ from typing import NotRequired, TypedDict
 
 import numpy as np
 
+from ..data.input_network import InputNetwork
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..energies.catalogue import LawContent
@@ -233,6 +234,7 @@ class RunReport:
     driven: Driven | None = None  # Inputs of all trials.
     recordings: Recordings | None = None  # Quality and registration of all trials.
     identification: Mapping[str, Identification] = field(default_factory=dict)  # By model.
+    actuator: Mapping[str, InputNetwork] = field(default_factory=dict)  # Learned changes of inputs, by input.
     stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # Least and largest, by kind of trial.
     outside: float | None = None  # Share of cells and states of the test trials outside of the law's training.
     start: Mapping[str, float] = field(default_factory=dict)  # Values of the data sheet, by parameter.

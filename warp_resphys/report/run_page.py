@@ -7,6 +7,7 @@ from typing import Any, Final
 from markupsafe import Markup
 
 from ..io.errors import number_of
+from .actuator_section import actuator_section
 from .body_section import body_section, paths_section
 from .control_section import control_section
 from .data import Metrics, RunReport, folds_in, trial_errors
@@ -153,6 +154,7 @@ SECTIONS: Final[tuple[Callable[[RunReport, Canvas], Part | None], ...]] = (
     body_section,
     identification_section,
     law_section,
+    actuator_section,
     shapes_section,
     registration_section,
     quality_section,

@@ -31,7 +31,7 @@ from .wording import (
 BEYOND: Final = 0.01  # Share of cells and times above which a law is said to extrapolate.
 _PUBLISHED_BESIDE: Final = {"published": "simulation", "sysid_elastic": "sysid"}  # Our models: names as published.
 _MOST_WIDE: Final = 8  # Markers in columns of a table; more are in rows.
-_CHAIN: Final = ("simulation", "sysid", "law", "resphys")  # Each builds on the one before.
+_CHAIN: Final = ("simulation", "sysid", "law", "actuator", "resphys")  # Each builds on the one before.
 _LEVELS, _HELPS = 3, 0.9  # least number of different inputs; largest share of the error that a helpful gain leaves
 _ALIKE, _STEADY = 0.3, 0.9  # range of gains that are alike, over their mean; least rank correlation with the inputs
 _REFITTED: Final = {"scale": "Refitted gain", "zero": "Refitted offset", "places": "Refitted marker positions"}

@@ -20,13 +20,14 @@ from .page import Cell, PageTable, Row
 from .wording import mm_text, model_words, number_text, share_text, unbroken
 
 LEAST_TRIALS: Final = 5  # with which an interval over trials is given
-CORRECTED: Final = ("sysid_elastic", "sysid", "law", "resphys_uncorrected", "resphys")
+CORRECTED: Final = ("sysid_elastic", "sysid", "law", "actuator", "resphys_uncorrected", "resphys")
 _RANKED: Final = (  # from the simplest one on
     *BASELINES,
     "simulation",
     "sysid_elastic",
     "sysid",
     "law",
+    "actuator",
     "simfree",
     *CORRECTED[-2:],
 )
@@ -36,6 +37,7 @@ _ROWS: Final[Mapping[str, str]] = {  # Below that of the best model without phys
     "sysid_elastic": "+ identified E and \N{GREEK SMALL LETTER NU}",
     "sysid": "+ identified parameters (SysID)",
     "law": "+ law of its material",
+    "actuator": "+ learned actuator",
     "resphys": "+ learned force (ResPhys)",
     "resphys_uncorrected": "learned force on the uncorrected simulator",
 }
@@ -229,7 +231,8 @@ def _doubts(metrics: Metrics, settings: RunSettings, known: Known, groups: int) 
         yield Doubt(f"the markers at rest fit their positions to {mm_text(rms)} only", "measure the positions again")
     checks = [fold["mesh_check"] for fold in folds if "mesh_check" in fold]
     moves = [moved for check in checks if (moved := check.get("moved_mm")) is not None]
-    base = checks[0]["model"] if moves and model in ("law", "resphys") else "simulation"  # that the model improves
+    improves = moves and model in ("law", "actuator", "resphys")
+    base = checks[0]["model"] if improves else "simulation"  # that the model improves
     if moves and model in known and base in known:
         moved, gained = fmean(moves), fmean(known[base]) - error
         if moved > gained:

@@ -59,6 +59,9 @@ MODELS: Final[Mapping[str, ComparedModel]] = {
     ),
     "sysid": ComparedModel("SysID", "the simulator with the parameters that fit best"),
     "law": ComparedModel("Law", "the simulator with the identified law of its material", "the law of the material"),
+    "actuator": ComparedModel(
+        "Actuator", "the simulator under learned inputs, which differ from the commands", "the learned actuator"
+    ),
     "simfree": ComparedModel("SimFree", "a network in place of the simulator"),
     "resphys_uncorrected": ComparedModel(
         "ResPhys, data sheet",
@@ -81,6 +84,7 @@ TONES: Final[Mapping[str, Tone]] = {
     "reconstruction": Tone("#1d7a55", "#62d2a2"),
     "sysid": Tone("#7a4aa0", "#c9a2ea"),
     "law": Tone("#0f766e", "#5eead4"),
+    "actuator": Tone("#a3342f", "#f2a29d"),
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
     "published": Tone("#b0307b", "#f08bc5"),
@@ -103,7 +107,10 @@ def model_words(model: str) -> str:
 
 def shown_models(positions: Collection[str]) -> list[str]:
     """Returns the models that are drawn as bodies: the uncorrected one, then the best available one."""
-    groups = (("simulation", "published"), ("resphys", "resphys_uncorrected", "law", "sysid", "sysid_elastic"))
+    groups = (
+        ("simulation", "published"),
+        ("resphys", "resphys_uncorrected", "actuator", "law", "sysid", "sysid_elastic"),
+    )
     return [model for group in groups for model in [m for m in group if m in positions][:1]]
 
 

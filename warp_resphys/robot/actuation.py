@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.base_motion import LARGEST_STEP
+from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of, with_means
 from ..data.trials import payload_inputs
 from ..dynamics.frames import base_movement
@@ -19,7 +20,7 @@ from ..energies.base import Energy
 from ..energies.contact.contact_points import MOTION
 from ..energies.strings import PAYLOAD, Strings
 from ..io.errors import InputError, listed
-from ..learning.parameters import MASS_FACTOR
+from ..learning.parameters import MASS_FACTOR, command_of
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.rotations import rotations
@@ -183,6 +184,22 @@ class Acting:
     base: torch.Tensor | None
 
 
+def moved_actuators(
+    description: Description, parameters: Mapping[str, torch.Tensor], here: Simulator, there: Simulator
+) -> tuple[dict[str, float], dict[str, InputNetwork]]:
+    """Returns the parameters of inputs, and the networks that change them, for inputs whose parts two bodies share.
+
+    Args:
+        description: of the robot.
+        parameters: its parameters.
+        here: its simulator.
+        there: that of the other body.
+    """
+    same = {name for name, parts in here.parts.items() if there.parts.get(name) == parts}
+    response = {name: float(x[0]) for name, x in parameters.items() if command_of(here, name)[0] in same}
+    return response, {name: network for name, network in description.actuator.items() if name in same}
+
+
 class Commands:
     """Converts the inputs of a robot, through the delay and lag of its actuators.
 
@@ -204,8 +221,10 @@ class Commands:
         self._mass_factor = parameters.get(MASS_FACTOR)
         h, filters = simulator.time_step, description.filters if description.learned is not None else ()
         taken = [name for name, declared in inputs.items() if declared.is_taken]
-        parts = simulator.parts
-        responses = {name: response_of(simulator.inputs[name], parameters, parts.get(name, ())) for name in taken}
+        parts, actuator = simulator.parts, description.actuator
+        responses = {
+            name: response_of(simulator.inputs[name], parameters, parts.get(name, ()), actuator) for name in taken
+        }
         self._responses = {name: InputResponse(h, **values, filters=filters) for name, values in responses.items()}
 
     def begin(self, body: State, inputs: Mapping[str, torch.Tensor]) -> State:

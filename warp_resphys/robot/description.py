@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 
+from ..data.input_network import InputNetwork
 from ..data.marker_view import ViewedMarkers
 from ..data.markers import Markers
 from ..data.rigid_bodies import corners_of, owners
@@ -44,7 +45,11 @@ SUFFIX: Final = ".safetensors"
 _KIND: Final = "robot"
 _EVALUATE: Final = "evaluate"
 # By simulator: the stage after which it can be loaded.
-_NEEDED: Final = {"simulation": "identify", "sysid": "identify", "sysid_elastic": "identify", "law": "identify_law"}
+_NEEDED: Final = {
+    **dict.fromkeys(("simulation", "sysid", "sysid_elastic"), "identify"),
+    "law": "identify_law",
+    "actuator": "train_actuator",
+}
 _NETWORK: Final = "network."
 _REGION: Final = "region."
 _PLAIN: Final = (  # fields that are written unchanged
@@ -81,6 +86,7 @@ class Description:
     placement: PlainPlacement | None = None  # identified positions of the markers
     # the network, with its input range and the frame of its forces; None for a simulator alone
     learned: Learned | None = None
+    actuator: Mapping[str, InputNetwork] = field(default_factory=dict)  # learned changes of inputs, by input
     filters: tuple[float, ...] = ()  # time constants of the filtered inputs that the network takes [s]
     sees_payload: bool = False  # whether the network takes the payload
     # (15,) which of the numbers of `frames.base_movement` the network takes; None for none
@@ -96,6 +102,11 @@ class Description:
         settings = self.settings.model_copy(update={"device": str(device)})
         body = build_body(settings, self.payload_at, self.mesh)
         return build_simulator(settings, self.material, body, on_failure=on_failure)
+
+    def to(self, device: torch.device) -> "Description":
+        """Returns the description with its networks on a device."""
+        learned = None if self.learned is None else self.learned.to(device)
+        return replace(self, learned=learned, actuator={name: x.to(device) for name, x in self.actuator.items()})
 
     def on(self, mesh: Mesh, parameters: Mapping[str, float], body: Mapping[str, Any]) -> "Description":
         """Returns the description of a simulator with this material, without damping by mass, on another body.
@@ -155,6 +166,7 @@ class Description:
         if path.suffix != SUFFIX:
             raise InputError(f"{path} does not end in {SUFFIX}: give such a name.")
         metadata: dict[str, Any] = {key: getattr(self, key) for key in _PLAIN}
+        metadata["actuator"] = {name: network.plain() for name, network in self.actuator.items()}
         metadata["packages"] = packages_of([self.settings, self.material, self.markers, self._network()])
         metadata["intervals"] = None if self.intervals is None else self.intervals.plain()
         metadata["uncertainty"] = None if self.uncertainty is None else asdict(self.uncertainty)
@@ -185,6 +197,7 @@ class Description:
             range_ = None if stored["range"] is None else Range.restore(stored["range"], network.linear)
             learned = Learned(network, range_, stored["force_frame"])
         intervals = fields.pop("intervals")
+        actuator = {name: InputNetwork.of_plain(plain) for name, plain in fields.pop("actuator", {}).items()}
         for key, kind in _SETTINGS.items():
             fields[key] = None if fields[key] is None else parse(kind, fields[key], key)
         for key in ("labels", "filters", "told_of_base"):
@@ -197,6 +210,7 @@ class Description:
             mesh=Mesh(tensors["vertices"].numpy(), tensors["cells"].numpy(), regions),
             bound=tensors.get("bound"),
             learned=learned,
+            actuator=actuator,
             intervals=Intervals.from_plain(intervals),
             **fields,
         )
@@ -273,6 +287,7 @@ def describe(folder: Path, model: str) -> Description:
         bound=None if trials.bound is None else torch.from_numpy(trials.bound),
         placement=identified.placement,
         learned=learned,
+        actuator=identified.actuator,
         filters=actuation.filter_time_constants,
         sees_payload=learned is not None and (actuation.sees_payload or model == SIMFREE),
         told_of_base=None if base is None else tuple(base.tolist()),

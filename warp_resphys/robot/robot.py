@@ -32,7 +32,7 @@ from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import rollout, states
 from ..stepping.state import State
-from .actuation import Acting, Commands, Given, InputReader, inputs_of
+from .actuation import Acting, Commands, Given, InputReader, inputs_of, moved_actuators
 from .description import Description
 
 
@@ -67,8 +67,7 @@ class Robot:
         folder: Path | None = None,
     ) -> None:
         self.simulator = description.simulator(torch.device(device), on_failure)
-        if description.learned is not None:
-            description = replace(description, learned=description.learned.to(torch.device(device)))
+        description = description.to(torch.device(device))
         self.description, self.folder = description, folder
         self.time_step, self.labels = self.simulator.time_step, description.labels
         observe = description.observe()
@@ -120,9 +119,9 @@ class Robot:
     def on(self, mesh: Mesh, **body: Any) -> "Robot":
         """Returns a robot with the material of this one on another body, without learned force and markers.
 
-        A learned force belongs to its mesh; the material does not. Identified parameters of actuators stay behind, and
-        so does damping by mass, as it stands for what slows this robot down beside its material. Directions of fibres
-        are in the axes of the new mesh.
+        A learned force belongs to its mesh; the material does not, nor do actuators whose parts have the same names in
+        the new body: the response of their inputs goes there, too. Damping by mass stays behind, as it stands for what
+        slows this robot down beside its material. Directions of fibres are in the axes of the new mesh.
 
         Args:
             mesh: rest shape.
@@ -138,7 +137,10 @@ class Robot:
         material = {f"{region}_{name}" if region else name for region, used in materials for name in used.parameters}
         names = material & self.parameters.keys() - {MASS_DAMPING}
         parameters = {name: float(self.parameters[name][0]) for name in names}
-        return Robot(self.description.on(mesh, parameters, body), self.simulator.device)
+        made = Robot(self.description.on(mesh, parameters, body), self.simulator.device)
+        response, actuator = moved_actuators(self.description, self.parameters, self.simulator, made.simulator)
+        description = replace(made.description, parameters=parameters | response, actuator=actuator)
+        return Robot(description, self.simulator.device) if response or actuator else made
 
     @property
     def driven(self) -> tuple[str, ...]:

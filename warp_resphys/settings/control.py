@@ -8,7 +8,9 @@ from ..io.settings import Count, Natural, NotNegative, Positive, Settings, Some,
 from .mesh import Direction
 from .performed import different
 
-Model = Literal["published", "simulation", "sysid_elastic", "sysid", "law", "simfree", "resphys_uncorrected", "resphys"]
+Model = Literal[
+    "published", "simulation", "sysid_elastic", "sysid", "law", "actuator", "simfree", "resphys_uncorrected", "resphys"
+]
 Models = Annotated[Some[Model], AfterValidator(different)]
 Shape = Annotated[
     str, Field(pattern="^(circle|eight|[A-Z])$", json_schema_extra={"wanted": "circle, eight or a capital letter"})

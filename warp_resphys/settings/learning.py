@@ -266,7 +266,17 @@ class TrainerSettings(EpochSettings):
     )
 
 
-class InTheLoopSettings(EpochSettings):
+class LoopSettings(EpochSettings):
+    """Training through the simulator, by L-BFGS."""
+
+    epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
+    rollout_every: Natural = setting(1, "epochs between roll-outs that choose the weights")
+    patience: Natural = setting(3, "epochs without improvement after which training ends")
+    penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
+    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
+
+
+class InTheLoopSettings(LoopSettings):
     """Training of the residual force on whole trials or windows of them, through the simulator, by L-BFGS."""
 
     start: Literal["zero", "steps"] = setting(
@@ -275,14 +285,22 @@ class InTheLoopSettings(EpochSettings):
     window: Natural | None = setting(
         None, "steps after which the simulation begins anew at the known or reconstructed state; null: whole trials"
     )
-    epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
-    rollout_every: Natural = setting(1, "epochs between roll-outs that choose the weights")
     hold_out: bool = setting(
         True, "from zero, without validation trials, hold out each training trial to choose the epochs"
     )
-    patience: Natural = setting(3, "epochs without improvement after which training ends")
-    penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
-    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
+
+
+class ActuatorSettings(LoopSettings):
+    """Learned changes of the inputs, trained through the simulator."""
+
+    filters: Many[Positive] = setting((0.4, 2.0), "time constants of exponential means of the inputs", "s")
+    width: Size = setting(24, "width of the hidden layer")
+    rounds: Count = setting(4, "linearisations of the motions by the inputs, for the weights to begin with")
+    epochs: Count = setting(10, "largest number of iterations of L-BFGS through the simulator, after the rounds")
+    penalty: NotNegative = setting(2.0e-3, "penalty on the squared weights")
+    gate: bool = setting(
+        True, "use it only if it is clearly closer to held-out trials than the simulator; false: always"
+    )
 
 
 class TrainingSettings(Settings):

@@ -12,6 +12,7 @@ from .data_kinds import MovingBase, RecordedData, ReleaseFromLoad, ReleaseFromTw
 from .learning import (
     AblationSettings,
     ActuationSettings,
+    ActuatorSettings,
     BaselineSettings,
     IdentifySettings,
     InTheLoopSettings,
@@ -84,6 +85,7 @@ class RunKeys(SimulatorSettings):
     law: Annotated[LawSettings | None, BeforeValidator(by_file, json_schema_input_type=LawSettings | str | None)] = (
         setting(None, "law of the material to identify; null: none")
     )
+    actuator: ActuatorSettings | None = setting(None, "learned changes of the inputs of actuators; null: none")
     shapes: dict[str, ShapeSettings] = setting(
         {}, "other bodies by name, on which the identified material is tested, where the real body is simulated"
     )
@@ -189,6 +191,11 @@ class RunKeys(SimulatorSettings):
         return self.law is not None
 
     @property
+    def with_actuator(self) -> bool:
+        """Whether changes of the inputs are learned."""
+        return self.actuator is not None
+
+    @property
     def binding(self) -> BindingSettings:
         """Positions of markers, and how they are bound to the body."""
         assert self.markers is not None
@@ -202,7 +209,7 @@ class RunKeys(SimulatorSettings):
     @property
     def models(self) -> list[str]:
         """Names of the models that the run compares."""
-        return models_of(self.published, self.identify, self.correct_uncorrected, self.with_law)
+        return models_of(self.published, self.identify, self.correct_uncorrected, self.with_law, self.with_actuator)
 
     def training_of(self, model: str) -> TrainingSettings:
         """Settings of the training of a model; ``simfree`` has its own, and is trained on steps.
@@ -236,7 +243,11 @@ class RunKeys(SimulatorSettings):
 
 
 def models_of(
-    published: Any, identified: IdentifySettings | None, correct_uncorrected: bool, law: bool = False
+    published: Any,
+    identified: IdentifySettings | None,
+    correct_uncorrected: bool,
+    law: bool = False,
+    actuator: bool = False,
 ) -> list[str]:
     """Returns the names of the models that an experiment compares.
 
@@ -245,12 +256,14 @@ def models_of(
         identified: settings of the identified simulator, or None.
         correct_uncorrected: whether a force is learned for the uncorrected simulator as well.
         law: whether the law of the material is identified.
+        actuator: whether changes of the inputs are learned.
     """
     absent = {
         "published": published is None,
         "sysid": identified is None,
         "sysid_elastic": identified is None or not identified.elastic,
         "law": not law,
+        "actuator": not actuator,
         "resphys_uncorrected": identified is None or not correct_uncorrected,
     }
     return [model for model in get_args(Model) if not absent.get(model)]

@@ -15,7 +15,7 @@ from ..io.settings import Many, Settings, setting
 from .body import SimulatorSettings, TargetSettings
 from .control import ControlSettings, FigureSettings
 from .data_kinds import ReadingSettings
-from .learning import AblationSettings, IdentifySettings, LawSettings, TrainingSettings
+from .learning import AblationSettings, ActuatorSettings, IdentifySettings, LawSettings, TrainingSettings
 from .mesh import Place
 from .observed import BindingSettings
 from .performed import Split, Trial
@@ -43,7 +43,7 @@ PLAYED: Final = (
 # Keys of all stages of a split, and of all with networks.
 LEARNING: Final = (
     *SIMULATOR,
-    *("simulation", "markers", "release", "force_frame", "identify", "law"),
+    *("simulation", "markers", "release", "force_frame", "identify", "law", "actuator"),
     *("data.payload_at", "data.seconds", "data.train_fraction", BATCH),
 )
 NETWORKS: Final = ("actuation", "range_guard")
@@ -78,6 +78,7 @@ class StageSettings(RunSettings):
         laboratory: LaboratorySettings
         identify: IdentifySettings
         law: LawSettings
+        actuator: ActuatorSettings
         control: ControlSettings
         ablation: AblationSettings
         mesh_check: float

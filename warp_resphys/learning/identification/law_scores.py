@@ -15,8 +15,9 @@ from ...io.arrays import FloatArray
 from ...mesh.volume_mesh import Mesh
 from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
-from ..replay import Replay, Start
+from ..replay import Replay
 from ..scores import Score
+from ..starts import Start
 from .law import LawClass, branches_of, family, longest_side
 from .search import Identification
 
@@ -53,7 +54,7 @@ def scores_of(
     frames: list[list[FloatArray]] = [[] for _ in next(iter(values.values()), range(1))]
     for replay, start in replays:
         trials = replay.trials if seconds is None else replay.trials.first(seconds)
-        counted = Replay(replay.simulator, replay.observe, trials)
+        counted = replay.changed(trials=trials)
         errors = counted.errors(counted(start, values)).square().sum((3, 4))  # (E, R, T)
         seen = trials.seen.sum(2)
         means = errors / (seen.clamp_min(1) * trials.amplitude.square()[:, None])
@@ -85,10 +86,9 @@ def stretches_in(
     else:
         values = {name: simulator.tensor([value]) for name, value in parameters.items()}
         with torch.no_grad():
-            bodies = [
-                Replay(simulator, WHOLE_STATE, replay.trials)(replace(start, shift=None), values).cpu().numpy()
-                for replay, start in motions.replays(simulator, names, identified)
-            ]
+            replays = motions.replays(simulator, names, identified)
+            whole = [(replay.changed(simulator=simulator, observe=WHOLE_STATE), start) for replay, start in replays]
+            bodies = [replay(replace(start, shift=None), values).cpu().numpy() for replay, start in whole]
     parts = [principal_stretches(mesh, body.reshape(-1, *mesh.vertices.shape)) for body in bodies]
     return [float(min(map(np.nanmin, parts))), float(max(map(np.nanmax, parts)))]
 

@@ -30,7 +30,8 @@ from ...stepping.state import State
 from ..metrics import redundancy
 from ..parameters import check_names, split_name
 from ..placement import Accuracy, DisplacedMarkers
-from ..replay import Replay, Start, exact
+from ..replay import Replay, exact
+from ..starts import Start
 from ..trial_batch import TrialBatch
 from .nuisances import NuisanceFit, Nuisances
 from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, uncertainty_of
@@ -185,7 +186,7 @@ class Misfit(BoundedMisfit):
             for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
                 if not moved > 0.0:
                     raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
-            pair = Replay(self.simulator, replay.observe, trials), start
+            pair = replay.changed(simulator=self.simulator, trials=trials), start
             self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))
             self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
         numbers = range(len(self._replays))
@@ -218,7 +219,7 @@ class Misfit(BoundedMisfit):
         if self.simulator.energies.follow_pose:
             accurate = copy(self)
             accurate.simulator = exact(self.simulator)
-            accurate._replays = [(Replay(accurate.simulator, r.observe, r.trials), start) for r, start in self._replays]
+            accurate._replays = [(r.changed(simulator=accurate.simulator), start) for r, start in self._replays]
             accurate.forget()
             system = accurate._system(unit)
         system = system or self._system(unit)

@@ -52,7 +52,7 @@ class Identification(Identified):
         first_guess: start of the search.
     """
 
-    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
 
     loss: float = math.nan
     history: Sequence[Sequence[Mapping[str, float]]] = ()
@@ -67,9 +67,10 @@ class Identification(Identified):
         return {} if self.uncertainty is None else self.uncertainty.deviation
 
     def plain(self) -> dict[str, Any]:
-        """Returns the identification as JSON data."""
-        of_trials = ("of_trials", "of_trials_deviation", "first_frames")
-        return {key: value for key, value in asdict(self).items() if value or key not in of_trials}
+        """Returns the identification as JSON data, without an actuator, which is a file of its own."""
+        where_given = ("of_trials", "of_trials_deviation", "first_frames", "actuator", "test")
+        without = replace(self, actuator={}, test=None)
+        return {key: value for key, value in asdict(without).items() if value or key not in where_given}
 
     @staticmethod
     def from_plain(plain: Any) -> "Identification":

@@ -21,8 +21,9 @@ from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
 from ..evaluation import HeldOutRollouts
 from ..observed_motions import Identified, ObservedMotions
-from ..replay import Replay, Start, Windows
+from ..replay import Replay
 from ..scores import HeldOutTest, held_out_test, text_of
+from ..starts import Start, Windows
 from .correction import Learned, Range, force_frames
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model
@@ -277,10 +278,13 @@ class Fitting:
             run_epochs(f"{name}: steps", first)
             network, after = first.use_best().double().train(), first.best_epoch
         elif loop.hold_out and not validation and len(train) > 1:
-            parts = [(loss([name for name in train if name != out], loop.window), loss([out])) for out in train]
+            parts = [
+                (make_network(), loss([name for name in train if name != out], loop.window), loss([out]))
+                for out in train
+            ]
             with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
-                epochs, (below, errors) = cross_validated_epochs(make_network, parts, loop, progress.advance)
-            sizes = [size for _, held_out in parts for size in held_out.amplitudes_mm()]
+                epochs, (below, errors) = cross_validated_epochs(parts, loop, progress.advance)
+            sizes = [size for *_, held_out in parts for size in held_out.amplitudes_mm()]
             test = held_out_test(train, HELD_OUT, errors, below, sizes) if settings.trainer.gate else None
             epochs = epochs if test is None or test["used"] else 0
             log.debug("%s: %d epochs are best for held-out trials", name, epochs)
@@ -329,7 +333,7 @@ class Fitting:
         rows = [batch.index(name) for name in names if name in batch]
         if not rows:
             return None
-        part, windows = Replay(simulator, replay.observe, replay.trials.select(rows)), None
+        part, windows = replay.changed(trials=replay.trials.select(rows)), None
         if window is not None:
             q, v, *_ = self._states(part.trials.names)
             windows = Windows(q.to(simulator.rest_positions), v.to(simulator.rest_positions), window)

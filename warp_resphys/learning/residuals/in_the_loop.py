@@ -1,7 +1,7 @@
 """Training of a residual force through the simulator: the loss is the error of the corrected simulator over motions.
 
 Its gradient goes back through the implicit adjoint of every step (Um et al. 2020, "Solver-in-the-Loop"), over whole
-motions or over windows of some steps, which begin at known states (`replay.Windows`).
+motions or over windows of some steps, which begin at known states (`starts.Windows`).
 
 An epoch is one iteration of L-BFGS with its line search. Adam's first steps move every weight by the learning rate,
 however small the gradient, which spoils a network that is nearly right; and where the loss comes from the simulator, a
@@ -9,12 +9,12 @@ line search costs less than tuning a schedule of rates.
 
 Few recordings determine only part of a residual force. So the force starts from zero, which is the uncorrected
 simulator, and a penalty on the weights keeps it there as far as the motions allow. A force that was trained on
-reconstructed steps may be the start instead.
+reconstructed steps may be the start instead. An `Actuator` is trained in the same way.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,14 +23,18 @@ from typing_extensions import override
 from ...dynamics.frames import BaseFrame, VertexFrames
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
-from ...settings.learning import InTheLoopSettings
-from ..replay import Replay, Start, Windows
+from ...settings.learning import InTheLoopSettings, LoopSettings
+from ..replay import Replay
+from ..starts import Start, Windows
+from .actuator import Actuator
 from .correction import LearnedPredictor
 from .networks import OwnNetwork, ResidualForce
 from .training import EpochTrainer
 
 _EVALUATIONS = 12  # of the loss, at most, in one epoch
 _FAILURE = 1e4  # loss of a failed simulation, from which the line search steps back
+Corrects = ResidualForce | Actuator
+Corrected = TypeVar("Corrected", bound=Corrects)
 _LEAST = 1e-30  # of the loss of the first weights, by which others are divided
 
 
@@ -63,8 +67,8 @@ class MotionLoss:
         shares = [count / sum(counts) for count in counts]
         self._weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
 
-    def _errors(self, model: ResidualForce | None) -> list[torch.Tensor]:
-        """(R, T, M, 3) simulated less observed markers of each group [m], without a force if the model is None.
+    def _errors(self, model: Corrects | None) -> list[torch.Tensor]:
+        """(R, T, M, 3) simulated less observed markers of each group [m], of the simulator if the model is None.
 
         Raises:
             ConvergenceError: the simulation fails.
@@ -72,18 +76,19 @@ class MotionLoss:
         errors = []
         for group in self._groups:
             force: Any = None
-            if model is not None:
+            replay = group.replay.changed(actuator=model.inputs) if isinstance(model, Actuator) else group.replay
+            if isinstance(model, ResidualForce):
                 force = LearnedPredictor(model, group.context, None, group.frames, group.base)
-            simulated = group.replay(group.start, self._parameters or None, force=force, windows=group.windows)
-            errors.append(group.replay.errors(simulated)[0])
+            simulated = replay(group.start, self._parameters or None, force=force, windows=group.windows)
+            errors.append(replay.errors(simulated)[0])
         return errors
 
-    def __call__(self, model: ResidualForce | None) -> torch.Tensor:
+    def __call__(self, model: Corrects | None) -> torch.Tensor:
         """Returns the loss, differentiable in the model's weights."""
         pairs = zip(self._errors(model), self._weights, strict=True)
         return torch.stack([(errors.square().sum((1, 2, 3)) * weight).sum() for errors, weight in pairs]).sum()
 
-    def error_mm(self, model: ResidualForce | None) -> float:
+    def error_mm(self, model: Corrects | None) -> float:
         """Mean distance of the seen markers, all trials with equal weight [mm]; infinite where a trial diverged.
 
         The distances by frame are kept in `judged`.
@@ -105,33 +110,34 @@ class MotionLoss:
         return [1e3 * size for group in self._groups for size in group.replay.trials.amplitude.tolist()]
 
 
-class InTheLoop(EpochTrainer[ResidualForce]):
+class InTheLoop(EpochTrainer[Corrected]):
     """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS.
 
     From zero force, the last layers have no bias: a constant force would compensate how one trial was held, which does
-    not generalise. From a trained force, the loss is divided by its first value.
+    not generalise. From a trained force or actuator, the loss is divided by its first value.
 
     Args:
-        model: to train; for a start from zero, its last layers and the mean force are set to zero.
+        model: to train; for a force from zero, its last layers and the mean force are set to zero.
         train: loss on the training motions.
         judge: loss whose error selects the weights, those of the start among them.
-        settings: start, epochs, and the penalty on the weights.
+        settings: epochs, the penalty on the weights, and where a force starts.
         epochs: in place of the configured number; 0 keeps the start.
         after: number of epochs that the model has been trained before, from which epochs are counted.
     """
 
-    settings: InTheLoopSettings
+    settings: LoopSettings
 
     def __init__(
         self,
-        model: ResidualForce,
+        model: Corrected,
         train: MotionLoss,
         judge: MotionLoss,
-        settings: InTheLoopSettings,
+        settings: LoopSettings,
         epochs: int | None = None,
         after: int = 0,
     ) -> None:
-        if settings.start == "zero":
+        self._from_zero = isinstance(settings, InTheLoopSettings) and settings.start == "zero"
+        if self._from_zero and isinstance(model, ResidualForce):
             with torch.no_grad():
                 _remove_force(model)
         self._train = train
@@ -168,7 +174,7 @@ class InTheLoop(EpochTrainer[ResidualForce]):
     @property
     def _unit(self) -> float:
         """Loss by which that of the optimiser is divided."""
-        return 1.0 if self.settings.start == "zero" else max(self.history[0]["train_loss"], _LEAST)
+        return 1.0 if self._from_zero else max(self.history[0]["train_loss"], _LEAST)
 
     def _loss(self) -> torch.Tensor:
         squares = [w.square().sum() for w in self.model.network.parameters()]
@@ -197,33 +203,29 @@ class InTheLoop(EpochTrainer[ResidualForce]):
 
 
 def cross_validated_epochs(
-    make_model: Callable[[], ResidualForce],
-    parts: Sequence[tuple[MotionLoss, MotionLoss]],
-    settings: InTheLoopSettings,
-    advance: Callable[[], None],
+    parts: Sequence[tuple[Corrected, MotionLoss, MotionLoss]], settings: LoopSettings, advance: Callable[[], None]
 ) -> tuple[int, tuple[list[FloatArray], list[FloatArray]]]:
     """Returns the number of epochs with the smallest mean error on held-out motions, by cross-validation.
 
     Args:
-        make_model: returns an untrained model, with the same weights every time.
-        parts: losses on the motions to train on and on the held-out ones, for each fold.
+        parts: a model to train, and the losses on the motions to train on and on the held-out ones, for each fold.
         settings: of every training; epochs is the largest number tried, and patience the number of epochs without an
             improvement after which the search ends.
         advance: called after every epoch of every fold.
 
     Returns:
-        The number of epochs, 0 where training never improves on zero force, and the mean distances (T,) by frame of all
-        held-out motions [mm], with zero force and after that number.
+        The number of epochs, 0 where training never improves on its start, and the mean distances (T,) by frame of all
+        held-out motions [mm], at the start and after that number.
     """
     settings = settings.changed(rollout_every=1)
-    trainers = [InTheLoop(make_model(), train, held_out, settings) for train, held_out in parts]
+    trainers = [InTheLoop(model, train, held_out, settings) for model, train, held_out in parts]
     for trainer in trainers:
         trainer.begin()
     while True:
         means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
         if trainers[0].finished or len(means) - 1 - best >= settings.patience:
-            judged = [held_out.judged[-len(means) :] for _, held_out in parts]
+            judged = [held_out.judged[-len(means) :] for *_, held_out in parts]
             before, after = ([row for of_part in judged for row in of_part[epoch]] for epoch in (0, best))
             return best, (before, after)
         for trainer in trainers:

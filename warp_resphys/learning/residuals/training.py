@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any, Generic, TypeVar
 
 import torch
 from typing_extensions import override
@@ -14,10 +14,12 @@ from typing_extensions import override
 from ...io.errors import InputError
 from ...io.progress import Progress
 from ...settings.learning import EpochSettings, TrainerSettings
+from .actuator import Actuator
 from .networks import Model, StateMap
 
 _SAVE_SECONDS = 10.0
 
+Trained = TypeVar("Trained", bound=StateMap | Actuator)
 Snapshot = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
@@ -44,7 +46,7 @@ class Samples:
         )
 
 
-class EpochTrainer(ABC, Generic[Model]):
+class EpochTrainer(ABC, Generic[Trained]):
     """Trains epoch by epoch, and keeps the weights with the smallest roll-out error.
 
     Args:
@@ -66,9 +68,9 @@ class EpochTrainer(ABC, Generic[Model]):
 
     def __init__(
         self,
-        model: Model,
+        model: Trained,
         optimiser: torch.optim.Optimizer,
-        rollout_error: Callable[[Model], float],
+        rollout_error: Callable[[Trained], float],
         settings: EpochSettings,
     ) -> None:
         self.model, self.settings, self.rollout_error = model, settings, rollout_error
@@ -111,7 +113,7 @@ class EpochTrainer(ABC, Generic[Model]):
         """Roll-out error of the kept weights [mm]; infinite if one diverged, NaN before the first measurement."""
         return self._kept_record().get("rollout_error_mm", math.nan) if self.best else math.nan
 
-    def use_best(self) -> Model:
+    def use_best(self) -> Trained:
         """Returns the model with the kept weights; adds their roll-out error to the history if missing."""
         self.model.network.load_state_dict(self.best)
         self.model.eval()

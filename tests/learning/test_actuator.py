@@ -1,0 +1,165 @@
+"""Learned changes of the inputs, on a beam with two tendons that creep and act on each other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import warp_resphys as wr
+from support.refusals import refuses
+from warp_resphys import ObservedMotions, evaluate, fit_actuator
+from warp_resphys.data.input_network import InputNetwork
+from warp_resphys.data.input_response import InputResponse
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning.observed_motions import Identified
+from warp_resphys.learning.residuals.actuator_fit import ActuatorFitting, felt_inputs
+from warp_resphys.settings.learning import ActuatorSettings
+
+MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
+ROUTES = {side: [[x, y, 0.02] for x in (0.0, 0.05, 0.1)] for side, y in (("left", 0.0), ("right", 0.02))}
+BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0), energies=[wr.Tendons(ROUTES)])
+MARKERS = wr.bind_markers(
+    MESH, np.array([[0.1, 0.01, 0.022], [0.06, 0.01, 0.022], [0.1, 0.022, 0.01]]), ["a", "b", "c"]
+)
+STEP, STEPS, TRIALS = 0.02, 40, 6
+QUICK = ActuatorSettings(filters=(0.3,), width=6, rounds=3, epochs=2, penalty=1e-5)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    material = wr.Corotated(264e3, 0.45, density=1070.0, stiffness_damping=5e-3)
+    return wr.Simulator(BODY, material, time_step=STEP)
+
+
+def tensions():
+    """(T, B, 2) smooth commands, each from its own tension on [N]."""
+    random = np.random.default_rng(3)
+    phases, rates = random.uniform(0.0, 6.3, (TRIALS, 2)), random.uniform(1.5, 4.0, (TRIALS, 2))
+    times = STEP * np.arange(STEPS)[:, None, None]
+    return torch.as_tensor(0.5 * (1.0 + np.sin(phases + rates * times)))
+
+
+def acting(commands):
+    """Tensions of an actuator with friction between its tendons and a slow share."""
+    response = InputResponse(STEP, filters=(0.3,))
+    _, means, _ = response(response.steady(commands[0]), commands)
+    return 0.8 * commands + 0.3 * means[0] - 0.4 * commands * commands.flip(-1)
+
+
+def observed(simulator, commands, effective):
+    start = simulator.static_equilibrium(wr.Inputs(tendon_tension=effective[0]))
+    q = simulator.rollout(start, STEPS, wr.Inputs(tendon_tension=effective)).q
+    seen = torch.stack([MARKERS(positions) for positions in q])
+    resting = wr.Inputs(tendon_tension=commands[0])
+    return ObservedMotions.of(simulator, seen, None, wr.Inputs(tendon_tension=commands), resting, observation=MARKERS)
+
+
+@pytest.fixture(scope="module")
+def motions(simulator):
+    return observed(simulator, tensions(), acting(tensions()))
+
+
+@pytest.fixture(scope="module")
+def learned(simulator, motions):
+    return fit_actuator(simulator, motions, validation=["motion 3"], train=MANY, settings=QUICK)
+
+
+MANY = ("motion 0", "motion 1", "motion 2")
+OTHERS = ("motion 4", "motion 5")
+
+
+def trained():
+    """A network with weights, and the range that it was made for."""
+    network = InputNetwork(torch.tensor([0.1, 0.2, 0.1, 0.2]), torch.tensor([1.0, 2.0, 1.0, 2.0]), (0.1,), 3)
+    torch.manual_seed(0)
+    for weight in network.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    return network.requires_grad_(False)
+
+
+def test_an_untrained_network_changes_nothing_and_zero_inputs_never_change():
+    fresh = InputNetwork(torch.zeros(4), torch.ones(4), (0.1,), 3)
+    values = torch.rand(5, 4, dtype=torch.float64)
+    assert not fresh(values).any()
+    assert trained()(values).abs().mean() > 1e-2
+    torch.testing.assert_close(trained()(torch.zeros(1, 4, dtype=torch.float64)), torch.zeros(1, 2).double())
+
+
+def test_beyond_the_range_of_the_training_a_network_adds_no_more():
+    network, far = trained(), torch.tensor([[1.25, 2.5, 1.25, 2.5]], dtype=torch.float64)
+    torch.testing.assert_close(network(100.0 * far), network(far))
+    assert not torch.allclose(network(0.5 * far), network(far))
+
+
+def test_a_network_is_the_same_from_plain_data_and_for_numpy():
+    network, values = trained(), torch.rand(5, 4, dtype=torch.float64)
+    again = InputNetwork.of_plain(network.plain())
+    torch.testing.assert_close(again(values), network(values), rtol=0.0, atol=0.0)
+    np.testing.assert_array_equal(network.added(values.numpy()), network(values).numpy())
+
+
+def test_a_series_at_once_is_the_series_step_by_step_and_settles_at_the_still_input():
+    response = InputResponse(STEP, 1.2, rise=0.05, filters=(0.2,), network=trained(), lower=0.0)
+    commands = torch.rand(20, 3, 2, dtype=torch.float64)
+    whole, means, _ = response(response.steady(commands[0]), commands)
+    memory, steps = response.steady(commands[0]), []
+    for now in commands:
+        one, mean, memory = response(memory, now[None])
+        steps.append((one[0], mean[:, 0]))
+    torch.testing.assert_close(whole, torch.stack([one for one, _ in steps]))
+    torch.testing.assert_close(means, torch.stack([mean for _, mean in steps], 1))
+    held = commands[:1].expand(400, -1, -1)
+    settled, mean, _ = response(response.steady(0.0 * commands[0]), held)
+    torch.testing.assert_close(settled[-1], response.still(commands[0]))
+    torch.testing.assert_close(response.steady(commands[0])["means"][0], mean[0, -1], rtol=1e-5, atol=1e-7)
+
+
+def test_the_actuator_is_learned_and_predicts_other_motions(simulator, motions, learned):
+    alone = evaluate(simulator, motions, names=OTHERS).mean()
+    found = evaluate(simulator, motions, names=OTHERS, parameters=learned).mean()
+    assert alone > 1e-3
+    assert found < 0.4 * alone
+    assert learned.test["used"]
+    assert learned.test["trials"] == ["motion 3"]
+    (felt,) = felt_inputs(motions.replay(simulator, OTHERS), {}, QUICK.filters).values()
+    commands = tensions()[:, [4, 5]]
+    expected = acting(commands) - commands
+    added = learned.actuator["tendon_tension"](felt[1:])
+    assert (added - expected).abs().mean() < 0.3 * expected.abs().mean()
+
+
+def test_the_first_weights_alone_bring_the_motions_closer(simulator, motions):
+    fitting = ActuatorFitting(simulator, motions, MANY, ("motion 3",))
+    begun = replace(Identified(), actuator=fitting._begun(MANY, QUICK, 0, "fit", 3).inputs)
+    errors = [np.mean([row.mean() for row in fitting._rolled_out(one, OTHERS)]) for one in (begun, Identified())]
+    assert errors[0] < 0.4 * errors[1]
+
+
+def test_an_actuator_that_has_nothing_to_learn_is_not_used(simulator):
+    commands = tensions()
+    motions = observed(simulator, commands, commands)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(motions.trials.observed.shape)
+    motions = replace(motions, trials=replace(motions.trials, observed=motions.trials.observed + noise))
+    found = fit_actuator(simulator, motions, train=MANY, settings=QUICK.changed(rounds=1, epochs=1))
+    assert not found.test["used"]
+    assert (found.test["split"], len(found.test["trials"])) == ("left-out training", 3)
+
+
+def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, motions):
+    fitting, kept = ActuatorFitting(simulator, motions, MANY, ("motion 3",)), []
+    whole, training = fitting.fit(QUICK, save=kept.append)
+    fitting.fit(QUICK.changed(epochs=1), save=kept.append)
+    again, resumed = fitting.fit(QUICK, resumed=kept[-1])
+    assert [row["epoch"] for row in resumed["epochs"]] == [row["epoch"] for row in training["epochs"]]
+    for one, other in zip(
+        whole.actuator["tendon_tension"].parameters(), again.actuator["tendon_tension"].parameters(), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+
+
+def test_trials_without_inputs_are_refused(simulator):
+    bare = wr.Simulator(wr.Body(MESH, fixed=BODY.fixed_vertices), wr.Corotated(264e3, 0.45), time_step=STEP)
+    q = bare.rollout(bare.rest_state(), 4).q
+    motions = ObservedMotions.of(bare, q, bare.rest_state())
+    refuses(InputError, "motion 0 have no inputs whose actuator could be learned", fit_actuator, bare, motions)

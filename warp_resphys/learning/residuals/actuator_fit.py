@@ -1,0 +1,356 @@
+"""Learns what the actuators of a robot do beyond their identified response.
+
+Forces in the modes of a body are more than a few markers can tell. What a driven robot has and its model lacks lies
+mostly in its few inputs: chambers made by hand differ, creep, and act on each other. So the effective inputs are the
+identified response x to the commands and a network f of x and its exponential means (`InputNetwork`).
+
+The first weights come from linearised motions: the paper's equation 6, which changes a simulated motion as little as
+possible to bring it to the markers, with the force restricted to what the inputs can do. A roll-out also gives the
+derivatives J_k of the points p_k of each frame by lasting changes of the inputs; the weights w minimise
+
+    sum_k |p_k + J_k (f_w - f)_k - y_k|^2 + penalty |w|^2,
+
+in a few rounds, each from a new roll-out. L-BFGS through the simulator (`InTheLoop`) then also sees what the inputs do
+in a step, as when they excite a vibration.
+"""
+
+import copy
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import torch
+
+from ...data.input_network import InputNetwork
+from ...data.input_response import InputResponse, with_means
+from ...dynamics.simulator import Simulator
+from ...io.arrays import FloatArray
+from ...io.errors import ConvergenceError, InputError, checks_types
+from ...io.progress import Progress
+from ...settings.learning import ActuatorSettings
+from ...stepping.inputs import Inputs
+from ...stepping.rollout import sample
+from ..evaluation import HeldOutRollouts
+from ..observed_motions import Identified, ObservedMotions
+from ..parameters import HUNG
+from ..replay import Replay
+from ..scores import HeldOutTest, held_out_test, text_of
+from ..starts import Start
+from .actuator import Actuator
+from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from .training import Snapshot, run_epochs
+
+log = logging.getLogger(__name__)
+
+_CHANGE: Final = 1e-3  # of the largest input, by which the derivatives are computed
+_SHARES: Final = (1.0, 0.5, 0.25)  # of a round's change of the weights that are tried
+_ITERATIONS: Final = 200  # of L-BFGS on linearised motions
+_FOLDS: Final = 3  # of the training trials, without validation trials
+
+
+@checks_types
+def fit_actuator(
+    simulator: Simulator,
+    motions: ObservedMotions,
+    *,
+    train: Sequence[str] | None = None,
+    validation: Sequence[str] = (),
+    parameters: Identified | Mapping[str, float] | None = None,
+    settings: ActuatorSettings | None = None,
+    seed: int = 0,
+) -> Identified:
+    """Trains networks that change the inputs of a simulator towards those that act in the robot.
+
+    Args:
+        simulator: to correct.
+        motions: observed states or markers, under inputs.
+        train: names of the trials to learn from; by default all that are not in `validation`.
+        validation: names of the trials that choose the weights and test the result; a third of the training trials in
+            turn if empty.
+        parameters: as for `reconstruct`.
+        settings: size and training; the defaults of the class if None.
+        seed: of the weights; torch's global generator is restored.
+
+    Returns:
+        The parameters with the actuator, to pass on as ``parameters`` of `reconstruct`, `fit_force` and `evaluate`, and
+        its test on held-out trials.
+
+    Raises:
+        InputError: no trial of the training has inputs, or the body takes none.
+        ConvergenceError: the simulation fails without the actuator.
+    """
+    others = [name for name in motions.trials.names if name not in validation]
+    train = motions.trials.chosen(others if train is None else train)
+    fitting = ActuatorFitting(simulator, motions, train, tuple(validation), Identified.of(parameters))
+    return fitting.fit(settings or ActuatorSettings(), seed)[0]
+
+
+@dataclass(frozen=True)
+class ActuatorFitting:
+    """Data of a fit.
+
+    Attributes:
+        simulator: to correct.
+        motions: observed trials.
+        train: names of the trials to learn from.
+        validation: names of the trials that choose the weights.
+        identified: parameters of the simulator, without an actuator.
+    """
+
+    simulator: Simulator
+    motions: ObservedMotions
+    train: tuple[str, ...]
+    validation: tuple[str, ...] = ()
+    identified: Identified = field(default_factory=Identified)
+
+    def fit(
+        self,
+        settings: ActuatorSettings,
+        seed: int = 0,
+        name: str = "fit_actuator",
+        resumed: Snapshot | None = None,
+        save: Callable[[Snapshot], None] = lambda kept: None,
+    ) -> tuple[Identified, dict[str, Any]]:
+        """Trains an actuator to the end, and tests it.
+
+        Args:
+            settings: of the network and the training.
+            seed: of the weights.
+            name: displayed beside the progress bar.
+            resumed: a snapshot from which an interrupted training goes on.
+            save: is called with a snapshot every ten seconds, and when the training ends or is interrupted.
+
+        Returns:
+            The parameters with the actuator and its test, and ``training`` as of `Learned`.
+        """
+        epochs, test, folds = None, None, self._folds()
+        if folds:
+            epochs, test = self._held_out(folds, settings, seed, name)
+        model = self._begun(self.train, settings, seed, name, settings.rounds if resumed is None else 0)
+        trainer = InTheLoop(
+            *(model, self._loss(self.train), self._loss(self.validation or self.train), settings, epochs)
+        )
+        if resumed is not None:
+            trainer.resume(*resumed)
+        trainer.begin()
+        run_epochs(name, trainer, save)
+        found = replace(self.identified, actuator=trainer.use_best().requires_grad_(False).inputs)
+        if test is None:
+            names, split = self.validation or self.train, "validation" if self.validation else "training"
+            errors, below = (self._rolled_out(identified, names) for identified in (found, self.identified))
+            test = self._tested(names, split, errors, below)
+        if not settings.gate:
+            test = None
+        elif not test["used"]:
+            log.warning("%s: the learned actuator is no clear gain: %s", name, text_of(test))
+        error = trainer.best_error if math.isfinite(trainer.best_error) else None
+        kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
+        return replace(found, test=test), {"kept": {**kept, "test": test}, "epochs": trainer.history}
+
+    def _folds(self) -> list[tuple[str, ...]]:
+        """Training trials that are left out in turn, each begun as another one; none with validation trials."""
+        alike = [batch for batch in self.motions.trials.batches(self.train) if len(batch) > 1]
+        count = 0 if self.validation else min(max(map(len, alike), default=0), _FOLDS)
+        return [tuple(name for batch in alike for name in batch[number::count]) for number in range(count)]
+
+    def _held_out(
+        self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, seed: int, name: str
+    ) -> tuple[int, HeldOutTest]:
+        """Number of epochs with the smallest error on trials that are left out in turn, and the test on these."""
+        parts = []
+        for number, left_out in enumerate(folds):
+            rest = [one for one in self.train if one not in left_out]
+            model = self._begun(rest, settings, seed, f"{name}: without {number + 1} of {len(folds)}", settings.rounds)
+            parts.append((model, self._loss(rest), self._loss(left_out)))
+        names = [one for left_out in folds for batch in self.motions.trials.batches(left_out) for one in batch]
+        below = [row for left_out in folds for row in self._rolled_out(self.identified, left_out)]
+        with Progress(f"{name}: held out", len(folds) * settings.epochs, "epochs at most") as progress:
+            epochs, (_, errors) = cross_validated_epochs(parts, settings, progress.advance)
+        return epochs, self._tested(names, "left-out training", errors, below)
+
+    def _tested(
+        self, names: Sequence[str], split: str, errors: Sequence[FloatArray], below: Sequence[FloatArray]
+    ) -> HeldOutTest:
+        names = [name for batch in self.motions.trials.batches(names) for name in batch]
+        sizes = [1e3 * size for size in self._amplitudes(names)]
+        return held_out_test(names, split, errors, below, sizes)
+
+    def _amplitudes(self, names: Sequence[str]) -> list[float]:
+        """Amplitudes of trials [m]."""
+        of_batches = (self.motions.batch(batch, self.simulator) for batch in self.motions.trials.batches(names))
+        return [size for batch in of_batches for size in batch.amplitude.tolist()]
+
+    def _rolled_out(self, identified: Identified, names: Sequence[str]) -> list[FloatArray]:
+        """Mean distances (T,) by frame of trials [mm], in the order of their batches."""
+        counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
+        return HeldOutRollouts(counting, self.motions, names, identified).errors(None)
+
+    def _loss(self, names: Sequence[str]) -> MotionLoss:
+        replays = self.motions.replays(self.simulator, names, self.identified)
+        return MotionLoss([TrialGroup(*pair) for pair in replays], self.identified.values(self.simulator))
+
+    def _begun(self, names: Sequence[str], settings: ActuatorSettings, seed: int, name: str, rounds: int) -> Actuator:
+        """An actuator that is fitted to linearised motions of some trials.
+
+        A round ends at the first share of its change of the weights that makes the motions closer; without one, the
+        weights stay as they are.
+        """
+        values = self.identified.values(self.simulator)
+        replays = self.motions.replays(self.simulator, names, self.identified)
+        felt = [felt_inputs(replay, values, settings.filters) for replay, _ in replays]
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            model = _untrained(felt, settings)
+        loss, penalty = self._loss(names), settings.penalty
+        with torch.no_grad():
+            least = float(loss(model))
+        with Progress(f"{name}: first weights", rounds, "rounds") as progress:
+            for _ in range(rounds):
+                before = copy.deepcopy(model.network.state_dict())
+                best = least + penalty * float(_squares(model).detach())
+                of_batches = zip(replays, felt, strict=True)
+                linearised = [_Linearised.of(*pair, values, model, inputs) for pair, inputs in of_batches]
+                _fit_linearised(linearised, model, penalty)
+                after = copy.deepcopy(model.network.state_dict())
+                for share in _SHARES:
+                    model.network.load_state_dict({k: torch.lerp(before[k], x, share) for k, x in after.items()})
+                    least = _loss_of(loss, model)
+                    if least + penalty * float(_squares(model).detach()) < best:
+                        break
+                else:
+                    model.network.load_state_dict(before)
+                    break
+                progress.advance()
+        return model
+
+
+def felt_inputs(
+    replay: Replay, parameters: Mapping[str, torch.Tensor], filters: Sequence[float]
+) -> dict[str, torch.Tensor]:
+    """Returns inputs and their means (K + 1, R, C (1 + F)) by input, at the steps of trials, first before these.
+
+    Args:
+        replay: of the R trials.
+        parameters: (1,) identified parameters.
+        filters: F time constants of the means [s].
+
+    Raises:
+        InputError: the trials have no inputs of actuators.
+    """
+    _, inputs, resting = replay.changed(actuator={}).prepare(parameters)
+    response, felt = InputResponse(replay.simulator.time_step, filters=filters), {}
+    for name, acting in inputs.actuation.items():
+        if name in HUNG:
+            continue
+        acting = acting if acting.ndim == 3 else acting[None]
+        memory = response.steady(resting.actuation.get(name, 0.0 * acting[0]))
+        before = with_means(*response(memory, resting.actuation.get(name, 0.0 * acting[0])[None])[:2])
+        felt[name] = torch.cat([before, with_means(*response(memory, acting)[:2])])
+    if not felt:
+        raise InputError(f"the trials {', '.join(replay.trials.names)} have no inputs whose actuator could be learned.")
+    return felt
+
+
+def _untrained(felt: Sequence[Mapping[str, torch.Tensor]], settings: ActuatorSettings) -> Actuator:
+    """An actuator without an effect, for the values (K + 1, R, C (1 + F)) of some batches of trials by input."""
+    networks = {}
+    for name in felt[0]:
+        values = torch.cat([batch[name].flatten(0, 1) for batch in felt])
+        networks[name] = InputNetwork(values.amin(0), values.amax(0), settings.filters, settings.width)
+    return Actuator(networks).to(next(iter(felt[0].values())).device)
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Simulated points (R, T, M, D) of trials as a linear function of changes of their inputs."""
+
+    replay: Replay
+    points: torch.Tensor  # (R, T, M, D), under the inputs with the actuator
+    slopes: dict[str, torch.Tensor]  # (R, T, M, D, C) by the inputs
+    felt: dict[str, torch.Tensor]  # what the networks take, (R, T, C (1 + F))
+    added: dict[str, torch.Tensor]  # by the actuator, (R, T, C)
+
+    @classmethod
+    @torch.no_grad()
+    def of(
+        cls,
+        replay: Replay,
+        start: Start,
+        parameters: Mapping[str, torch.Tensor],
+        model: Actuator,
+        felt: Mapping[str, torch.Tensor],
+    ) -> "_Linearised":
+        """Simulates trials, with the derivatives by lasting changes of the inputs."""
+        replay = replay.changed(actuator=model.inputs)
+        states, prepared = replay.states(start, parameters), replay.prepare(parameters)
+        sizes = {name: _CHANGE * float(x[..., : model.inputs[name].parts].abs().max()) for name, x in felt.items()}
+        columns = [name for name in sizes for _ in range(model.inputs[name].parts)]
+        repeated = {name: x.repeat(len(columns)) for name, x in parameters.items()}
+        constants, *fields = replay.prepare(
+            repeated or {f"{columns[0]}_factor": replay.trials.times.new_ones(len(columns))}
+        )
+        during, before = (_changed(inputs, sizes, columns) for inputs in fields)
+        series = replay.varied_points(start, prepared, (constants, during, before), len(columns), states)
+        first, *rest = replay.at_frames(series, start).unflatten(0, (1 + len(columns), -1))
+        times = (replay.trials.times - start.delay[:, None]).clamp_min(0.0)
+        slopes: dict[str, list[torch.Tensor]] = {name: [] for name in felt}
+        for name, moved in zip(columns, rest, strict=True):
+            slopes[name].append((moved - first) / sizes[name])
+        step, count = replay.simulator.time_step, series.shape[1]
+        shown = {name: sample(x[:count].swapaxes(0, 1), times, step) for name, x in felt.items()}
+        added = {name: model.inputs[name](x) for name, x in shown.items()}
+        return cls(replay, first, {name: torch.stack(x, -1) for name, x in slopes.items()}, shown, added)
+
+    def errors(self, model: Actuator) -> torch.Tensor:
+        """Points with an actuator less the observed ones (1, R, T, M, D)."""
+        moved = self.points
+        for name, slope in self.slopes.items():
+            change = model.inputs[name](self.felt[name]) - self.added[name]
+            moved = moved + (slope @ change[:, :, None, :, None])[..., 0]
+        return self.replay.errors(moved[None])
+
+
+def _changed(inputs: Inputs, sizes: Mapping[str, float], columns: Sequence[str]) -> Inputs:
+    """Inputs of C R environments, in which each of C parts is changed in turn; its input is named in the columns."""
+    for name in sizes.keys() & inputs.actuation.keys():
+        values = inputs.actuation[name]
+        rows = [row for row, column in enumerate(columns) if column == name]
+        change = values.new_zeros(len(columns), len(rows))
+        change[rows] = sizes[name] * torch.eye(len(rows)).to(values)
+        inputs = inputs.replace(**{name: values + change.repeat_interleave(values.shape[-2] // len(columns), 0)})
+    return inputs
+
+
+def _fit_linearised(linearised: Sequence[_Linearised], model: Actuator, penalty: float) -> None:
+    """Minimises the squared error of linearised motions and the penalty."""
+    weights = [*model.parameters()]
+    lbfgs = torch.optim.LBFGS(weights, max_iter=_ITERATIONS, history_size=20, line_search_fn="strong_wolfe")
+    count = sum(len(one.replay.trials.names) for one in linearised)
+
+    def evaluate() -> float:
+        lbfgs.zero_grad()
+        squares = []
+        for one in linearised:
+            weight = one.replay.trials.loss_weight * len(one.replay.trials.names) / count
+            squares.append((one.errors(model)[0].square().sum((1, 2, 3)) * weight).sum())
+        loss = torch.stack(squares).sum() + penalty * _squares(model)
+        loss.backward()
+        return float(loss.detach())
+
+    lbfgs.step(evaluate)
+
+
+def _loss_of(loss: MotionLoss, model: Actuator) -> float:
+    """Loss of an actuator; infinite where the simulation fails."""
+    try:
+        with torch.no_grad():
+            return float(loss(model))
+    except ConvergenceError:
+        return float("inf")
+
+
+def _squares(model: Actuator) -> torch.Tensor:
+    """Sum of the squared weights."""
+    return torch.stack([weight.square().sum() for weight in model.parameters()]).sum()

@@ -31,6 +31,7 @@ from .learning.evaluation import evaluate as evaluate
 from .learning.identification.identification import identify as identify
 from .learning.identification.law_search import identify_law as identify_law
 from .learning.observed_motions import ObservedMotions as ObservedMotions
+from .learning.residuals.actuator_fit import fit_actuator as fit_actuator
 from .learning.residuals.fitting import fit_force as fit_force
 from .learning.residuals.reconstruction import reconstruct as reconstruct
 from .mesh.boxes import box_hexahedra as box_hexahedra

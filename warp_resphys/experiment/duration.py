@@ -86,8 +86,8 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
         actuator, folds = settings.actuator, 0 if settings.split.validation else _FOLDS
         trained, rolled = (steps_of(experiment, "actuator", names) for names in (train, judged))
         first = actuator.rounds * (2.0 + _VARIED * _PARTS) * trained
-        each = first + (actuator.epochs + 1) * (_ITERATION * trained + rolled)
-        return (1 + folds) * each, 0.0, 0.0
+        looped = (actuator.epochs + 1) * (_ITERATION * trained + rolled)
+        return (1 + folds) * (first + looped), 0.0, 0.0
     if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))

@@ -9,6 +9,7 @@ import torch
 
 import warp_resphys as wr
 from support.refusals import refuses
+from warp_resphys.data.input_response import RESPONSES
 from warp_resphys.io.errors import InputError
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.comparison import Comparison, Model
@@ -100,6 +101,29 @@ def test_first_frames_count_in_no_error_and_predictions_without_physics_are_shif
     offset = (observed[:, :11] - observed[:, :1]).mean((0, 1))
     assert table.simulated["rest"] == pytest.approx(observed[:, :1] + offset + np.zeros_like(observed))
     assert content["free_fits"]["sysid"][0]["values"]["scale"] == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("name", [*(f"tendon_tension_{word}" for word in RESPONSES), "tendon_stiffness"])
+def test_all_that_parts_may_have_may_differ_between_sessions(motions, name):
+    wave = 40.0 * np.sin(0.2 * np.arange(STEPS)) ** 2 + np.zeros((4, 2, 1))  # N: on all octaves of the characteristic
+    logged = replace(motions, trials=replace(motions.trials, inputs={"tendon_tension": wave.swapaxes(1, 2)}))
+    one, other = ROBOT.tensor([0.7]), ROBOT.tensor([0.02])
+    for trials, mine, theirs in ((NAMES[:2], one, other), (NAMES[2:], other, one)):
+        replay = logged.replay(ROBOT, trials)
+        mixed = acting(replay, {f"{name}_left": one, f"{name}_left@friday": other})
+        assert distance(mixed, acting(replay, {f"{name}_left": mine})) < 1e-12
+        assert distance(mixed, acting(replay, {f"{name}_left": theirs})) > 1e-3
+
+
+def acting(replay, parameters):
+    """Tensions, and stiffnesses of the tendons."""
+    constants, inputs, _ = replay.prepare(parameters)
+    stiffness = next(energy["tendon_stiffness"] for energy in constants.values if "tendon_stiffness" in energy)
+    return inputs.actuation["tendon_tension"], stiffness
+
+
+def distance(one, other):
+    return max(float((a - b).abs().max()) for a, b in zip(one, other, strict=True))
 
 
 def test_the_report_has_a_table_of_parts_and_sessions_and_a_sentence(found):

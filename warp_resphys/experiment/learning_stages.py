@@ -12,6 +12,7 @@ from ..io.parts import Parts
 from ..io.resuming import StageContext, package_versions
 from ..io.safe_files import atomic_hdf5, create, resume_checkpoint, write_checkpoint, write_json
 from ..learning.comparison import Comparison
+from ..learning.error_tables import counted
 from ..learning.identification import identification, law_search
 from ..learning.placement import Accuracy
 from ..learning.residuals import reconstruction
@@ -40,6 +41,9 @@ def identify(context: StageContext) -> None:
     E and nu alone are identified with the integrator of the uncorrected simulator, as published; all parameters with
     the identified simulator. ``identify.trials`` and ``identify.seconds`` restrict the number and length of the
     training trials. An interrupted run keeps its finished searches.
+
+    Raises:
+        InputError: values are estimated from the whole of a test trial.
     """
     settings: StageSettings = context.settings
     wanted, names = settings.identify, settings.split.train
@@ -62,6 +66,7 @@ def identify(context: StageContext) -> None:
             seed=settings.seed,
             kept=kept[model],
         )
+        counted(experiment.motions, names, settings.split.test, result.first_frames)  # Raises before any training.
         found[model] = result.plain()
     write_json(context.run_dir / IDENTIFICATION, found)
     for path in kept.values():

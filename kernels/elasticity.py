@@ -58,24 +58,6 @@ def viscous_response(f: wp.mat33d, lame: wp.vec2d, c: wp.vec2d, offset: wp.mat33
 
 
 @wp.func
-def add_strain_tangent(
-    f: wp.mat33d, stress: wp.mat33d, shape: wp.float64, volume: wp.float64, out: wp.array[wp.mat33d]
-):
-    """Adds the blocks of F S(E), with S = 2 mu E + lambda tr(E) I and its value `stress`."""
-    columns = wp.transpose(f)
-    left = shape * (f * columns)
-    for k in range(3):
-        for n in range(k + 1):
-            block = shape * wp.outer(columns[n], columns[k]) + volume * wp.outer(columns[k], columns[n])
-            if k == n:
-                block += left
-            block[0, 0] += stress[k, n]
-            block[1, 1] += stress[k, n]
-            block[2, 2] += stress[k, n]
-            out[(k * (k + 1)) / 2 + n] += block
-
-
-@wp.func
 def add_viscous_tangent(
     f: wp.mat33d,
     lame: wp.vec2d,
@@ -90,16 +72,19 @@ def add_viscous_tangent(
     if not clamp:
         strain = green_strain(f)
         stress = isotropic(c[0] * strain - offset, c[1] * wp.trace(strain) - dilation_offset, lame[0], lame[1])
-    add_strain_tangent(f, stress, c[0] * lame[0], c[1] * lame[1], out)
-
-
-@wp.func
-def add_square(a: wp.mat33d, factor: wp.float64, out: wp.array[wp.mat33d]):
-    """Adds the blocks of a factor times the product of a matrix with itself."""
-    columns = wp.transpose(a)
+    shape = c[0] * lame[0]
+    volume = c[1] * lame[1]
+    columns = wp.transpose(f)
+    left = shape * (f * columns)
     for k in range(3):
         for n in range(k + 1):
-            out[(k * (k + 1)) / 2 + n] += factor * wp.outer(columns[k], columns[n])
+            block = shape * wp.outer(columns[n], columns[k]) + volume * wp.outer(columns[k], columns[n])
+            if k == n:
+                block += left
+            block[0, 0] += stress[k, n]
+            block[1, 1] += stress[k, n]
+            block[2, 2] += stress[k, n]
+            out[(k * (k + 1)) / 2 + n] += block
 
 
 @wp.func

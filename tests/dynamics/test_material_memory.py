@@ -1,6 +1,5 @@
-"""Branches and sliders of a material against closed forms, what they take and keep, their strain and gradients."""
+"""Relaxation branches of a material against closed forms, what they keep, their strain and gradients."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ import torch
 from support.clamped import clamped, noise
 from support.slopes import check_rows, check_slopes
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
-from warp_resphys.energies import ConvexMaterial, Gent
 from warp_resphys.energies.catalogue import make_material
 from warp_resphys.energies.viscosity import GreenStrain, StrainTerm
 from warp_resphys.io.errors import InputError
@@ -24,50 +22,8 @@ CLAMPED = clamped(MESH)
 TIGHT = SolverSettings(name="newton", relative_tolerance=1e-11)
 WEIGHTLESS = (0.0, 0.0, 0.0)
 ELASTIC = Corotated(2e4, 0.0, density=1000.0)  # without lateral contraction: lambda is zero, all stiffness relaxes
-MU = 1e4  # Pa, the shear modulus
-CREEPING, SLIDING = replace(ELASTIC, prony=[(0.5, 0.2)]), replace(ELASTIC, hysteresis=[(0.5, 0.02)])
+CREEPING = replace(ELASTIC, prony=[(0.5, 0.2)])
 TWO_BRANCHES = Corotated(2e4, 0.45, density=1000.0, stiffness_damping=1e-3, prony=[(0.4, 0.02), (0.2, 0.3)])
-TWO_SLIDERS = Corotated(2e4, 0.45, density=1000.0, stiffness_damping=1e-3, hysteresis=[(0.4, 0.005), (0.2, 0.03)])
-
-
-def sheared(gammas, material, step=0.01):
-    """(T,) shear stresses [Pa] after steps to shear angles (T,): the force that holds the end, over its area."""
-    simulator = Simulator(CLAMPED, material, step, WEIGHTLESS, solver=TIGHT)
-    rest, state, forces = simulator.rest_positions, simulator.rest_state(), []
-    for gamma in gammas:
-        x = rest.clone()
-        x[:, 1] += gamma * rest[:, 0]
-        residual = simulator.linearise(replace(state, v=torch.zeros_like(state.v))).residual(x[None])[0]
-        inertia = simulator.prepare().mass[0, :, None] * (x - state.q[0]) / step**2
-        forces.append(float((residual - inertia)[TIP, 1].sum()))
-        state = simulator.remember(state, x[None], simulator.prepare())
-    return np.array(forces) / (SIZE[1] * SIZE[2])
-
-
-def cycle(steps, peak):
-    """Shear angles of a cycle after a first rise to the peak."""
-    up, down = np.linspace(-peak, peak, steps + 1)[1:], np.linspace(peak, -peak, steps + 1)[1:]
-    return np.concatenate([np.linspace(0.0, peak, steps // 2 + 1)[1:], down, up])
-
-
-def closed_form(gammas, ratio, limit):
-    """(T,) shear stresses [Pa] of a slider, by its definition in one dimension, with dE = dgamma [[0, 1], [1, 0]] / 2.
-
-    The part gamma^2 / 2 of the Green strain is left out.
-    """
-    plastic, stresses, most = 0.0, [], math.sqrt(2.0) * limit
-    for gamma in gammas:
-        plastic = gamma - float(np.clip(gamma - plastic, -most, most))
-        stresses.append(ratio * MU * (gamma - plastic))
-    return np.array(stresses)
-
-
-@pytest.mark.parametrize("step", [1e-3, 1e3])
-def test_a_loop_follows_the_elastic_perfectly_plastic_slider_at_any_speed(step):
-    path, slider = cycle(40, 5e-4), (0.5, 2e-4)
-    stress = sheared(path, replace(ELASTIC, hysteresis=[slider]), step) - sheared(path, ELASTIC, step)
-    expected = closed_form(path, *slider)
-    np.testing.assert_allclose(stress, expected, atol=2e-3 * expected.max())
 
 
 def pull(newtons, batch=1):
@@ -80,58 +36,12 @@ def sag(q):
     return q[..., TIP, 2].mean(-1) - float(np.mean(MESH.vertices[TIP, 2]))
 
 
-class TestPoses:
-    """Static equilibria, which depend on the poses before."""
-
-    simulator = Simulator(CLAMPED, SLIDING, 0.01, WEIGHTLESS, solver=TIGHT)
-
-    def test_a_body_that_was_bent_keeps_a_deflection(self):
-        simulator = self.simulator
-        bent = simulator.static_equilibrium(pull(0.1))
-        left = float(sag(simulator.static_equilibrium(after=bent).q)[0])
-        assert 0.05 * float(sag(bent.q)[0]) < left < float(sag(bent.q)[0])
-        assert float(sag(simulator.static_equilibrium().q)[0]) == pytest.approx(0.0, abs=1e-12)
-
-    def test_the_order_of_poses_counts(self):
-        simulator = self.simulator
-        first = simulator.static_equilibrium(pull(0.05))
-        large = simulator.static_equilibrium(pull(0.15), after=first)
-        again = simulator.static_equilibrium(pull(0.05), after=large)
-        assert float(sag(again.q)) > 1.1 * float(sag(first.q))
-        # The same load again changes nothing.
-        torch.testing.assert_close(simulator.static_equilibrium(pull(0.05), after=again).q, again.q, rtol=0, atol=1e-9)
-
-    def test_a_state_without_memory_was_strained_in_proportion(self):
-        """A pose that a motion begins from is in equilibrium in its first step, with or without its memory."""
-        simulator = self.simulator
-        bent = simulator.static_equilibrium(pull(0.1))
-        assert bent.memory["plastic_strain"].shape[:2] == (1, 1)
-        for start in (bent, replace(bent, memory={})):
-            after = simulator.step(start, pull(0.1))
-            torch.testing.assert_close(after.q, bent.q, rtol=0.0, atol=1e-9)
-            strains = (state.memory["plastic_strain"] for state in (after, bent))
-            torch.testing.assert_close(*strains, rtol=0.0, atol=1e-8)
-
-
-def test_a_slider_that_sticks_is_a_spring_for_every_integrator():
-    stuck, spring = replace(ELASTIC, hysteresis=[(0.5, 10.0)]), replace(ELASTIC, prony=[(0.5, 1e12)])
-    for integrator in INTEGRATORS:
-        runs = [Simulator(CLAMPED, m, 0.005, integrator=integrator, solver=TIGHT) for m in (stuck, spring)]
-        ends = [sim.rollout(sim.rest_state(), 10).q[-1] for sim in runs]
-        torch.testing.assert_close(ends[0], ends[1], rtol=0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("material", "memory"),
-    [(TWO_SLIDERS, "plastic_strain"), (TWO_BRANCHES, "viscous_strain")],
-    ids=["sliders", "branches"],
-)
-def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments(material, memory):
-    simulator = Simulator(CLAMPED, material, integrator="bdf2", solver=TIGHT)
+def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments():
+    simulator = Simulator(CLAMPED, TWO_BRANCHES, integrator="bdf2", solver=TIGHT)
     forces = torch.cat([pull(0.2).external_force, pull(-0.1).external_force])
     whole = simulator.rollout(simulator.rest_state(2), 8, Inputs(forces))
     half = simulator.rollout(simulator.rest_state(2), 4, Inputs(forces)).final
-    assert half.memory[memory].shape[:2] == (2, 2)
+    assert half.memory["viscous_strain"].shape[:2] == (2, 2)
     again = State.from_tensors({name: tensor.clone() for name, tensor in half.tensors().items()})
     torch.testing.assert_close(simulator.rollout(again, 4, Inputs(forces)).q[-1], whole.q[-1], rtol=0, atol=1e-11)
     forgotten = replace(again, memory={})
@@ -140,60 +50,22 @@ def test_a_roll_out_goes_on_from_its_last_state_and_a_batch_is_its_environments(
     torch.testing.assert_close(alone, whole.q[-1, 1], rtol=0.0, atol=1e-11)
 
 
-class TestGradients:
-    """Adjoints against differences, over changes that are small beside the kinks where sliders begin to slide."""
+@pytest.mark.parametrize(("start", "integrator"), [*zip(POSES, INTEGRATORS, strict=True)])
+def test_gradients_of_a_roll_out(start, integrator):
+    simulator = Simulator(CLAMPED, replace(TWO_BRANCHES, mass_damping=0.5), integrator=integrator, solver=TIGHT)
+    check_rows(check_gradients(simulator, start), "prony_time_2, each environment")
 
-    @pytest.mark.parametrize(
-        ("start", "poissons_ratio", "integrator"), [*zip(POSES, (0.45, 0.45, 0.499), INTEGRATORS, strict=True)]
-    )
-    def test_of_a_roll_out(self, start, poissons_ratio, integrator):
-        material = replace(TWO_SLIDERS, mass_damping=0.5, poissons_ratio=poissons_ratio)
-        simulator = Simulator(CLAMPED, material, integrator=integrator, solver=TIGHT)
-        rows = check_gradients(simulator, start, change=1e-3, together=False)
-        names = "hysteresis_ratio_2, each environment", "hysteresis_strain_1, each environment"
-        check_rows(rows, *names, bound=3e-6)
 
-    @pytest.mark.parametrize(("start", "integrator"), [*zip(POSES, INTEGRATORS, strict=True)])
-    def test_by_branches(self, start, integrator):
-        simulator = Simulator(CLAMPED, replace(TWO_BRANCHES, mass_damping=0.5), integrator=integrator, solver=TIGHT)
-        check_rows(check_gradients(simulator, start), "prony_time_2, each environment")
+def test_gradients_by_the_memory_of_the_start():
+    simulator = Simulator(CLAMPED, TWO_BRANCHES, solver=TIGHT)
+    state = simulator.rollout(pose(simulator, "bent", 1), 2).final
+    weights = noise(*state.q.shape)
 
-    @pytest.mark.parametrize(
-        "material",
-        [
-            Gent(8e3, 30.0, 1e5, density=1000.0, hysteresis=[(0.5, 0.01)]),
-            ConvexMaterial(c10=4e3, bulk_1=5e4, density=1000.0, hysteresis=[(4e3, 0.01)]),
-        ],
-        ids=lambda material: material.model,
-    )
-    def test_with_every_material(self, material):
-        simulator = Simulator(CLAMPED, material, solver=TIGHT)
-        rows = check_gradients(simulator, "bent", steps=2, batch=1, change=1e-3)
-        assert len(check_rows([row for row in rows if "hysteresis" in row.parameter], bound=3e-6)) == 2
+    def loss(given):
+        memory = {"viscous_strain": 0.5 * (given["strain"] + given["strain"].mT)}
+        return (weights * simulator.rollout(replace(state, memory=memory), 2).q[-1]).sum()
 
-    def test_by_the_memory_of_the_start(self):
-        simulator = Simulator(CLAMPED, TWO_SLIDERS, solver=TIGHT)
-        state = simulator.rollout(pose(simulator, "bent", 1), 2).final
-        weights = noise(*state.q.shape)
-
-        def loss(given):
-            memory = {"plastic_strain": 0.5 * (given["strain"] + given["strain"].mT)}
-            return (weights * simulator.rollout(replace(state, memory=memory), 2).q[-1]).sum()
-
-        check_slopes(loss, {"strain": state.memory["plastic_strain"]}, {"strain": 1e-6}, tolerance=1e-5)
-
-    def test_of_poses_one_after_the_other(self):
-        simulator = Simulator(CLAMPED, SLIDING, 0.01, solver=TIGHT)
-        weights, names = noise(*simulator.rest_state().q.shape, seed=1), ("hysteresis_strain_1", "youngs_modulus")
-
-        def loss(given):
-            state = None
-            for newtons in (0.1, -0.05, 0.0):
-                state = simulator.static_equilibrium(pull(newtons), given, after=state)
-            return (weights * simulator.step(state, pull(0.02), given).q).sum()
-
-        values = {name: torch.tensor([simulator.defaults[name]]).double() for name in names}
-        check_slopes(loss, values, {name: 1e-4 * float(values[name]) for name in names}, tolerance=1e-5)
+    check_slopes(loss, {"strain": state.memory["viscous_strain"]}, {"strain": 1e-4})
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -264,17 +136,13 @@ def test_branches_without_modulus_have_a_gradient():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: replace(ELASTIC, hysteresis=[0.3]), "give a (ratio, strain) for each slider"),
-        (lambda: replace(ELASTIC, hysteresis=[(0.3, 0.0)]), "hysteresis_strain_1 is"),
-        (lambda: replace(ELASTIC, hysteresis=[(-0.1, 0.1)]), "hysteresis_ratio_1 is"),
-        (lambda: make_material(hysteresis_ratio_1=0.1), "hysteresis has hysteresis_ratio_1: give each slider"),
         (lambda: replace(ELASTIC, prony=[0.3]), "give a (ratio, time) for each branch"),
         (lambda: replace(ELASTIC, prony=[(0.3, 0.0)]), "prony_time_1 is"),
         (lambda: make_material(prony_ratio_1=0.1), "prony has prony_ratio_1: give each branch"),
         (lambda: make_material(prony=3), "has no parameter 'prony'"),
     ],
 )
-def test_wrong_branches_and_sliders_are_refused(make, said):
+def test_wrong_branches_are_refused(make, said):
     with pytest.raises(InputError) as caught:
         make()
     assert said in str(caught.value)

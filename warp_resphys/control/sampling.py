@@ -97,8 +97,6 @@ def check_reducible(robot: Robot) -> None:
         raise InputError(f"{description.name} has no markers: a reduced model predicts markers.")
     if description.told_of_base is not None:
         raise InputError(f"the base of {description.name} moves: reduced models have a fixed base.")
-    if any(material.hysteresis for material in robot.simulator.materials.values()):
-        raise InputError("a material with hysteresis cannot be reduced: remove its sliders (material.hysteresis).")
     if robot.simulator.integrator not in ("implicit_euler", "bdf2"):
         raise InputError(
             f"a robot that is stepped by {robot.simulator.integrator} cannot be reduced: set identify.integrator to "

@@ -17,7 +17,6 @@ from ..energies.contact.barrier import ContactForces
 from ..energies.contact.obstacle_contact import BoundContact
 from ..energies.contact.obstacle_poses import Pose
 from ..energies.contact.surface_contact import BoundSurfaceContact
-from ..energies.hysteresis import Hysteresis
 from ..energies.materials import Material
 from ..energies.pointwise import one_part_each
 from ..energies.potential import StepTerms
@@ -283,7 +282,7 @@ def joined_names(materials: Material | Materials) -> dict[str, Material]:
 
 
 def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEnergy]:
-    """Returns the energies of all bodies: solids and their hysteresis, rigid parts, and the bodies' own energies.
+    """Returns the energies of all bodies: solids, rigid parts, and the bodies' own energies.
 
     Args:
         whole: a body, or a `fem.scene.Scene`.
@@ -297,8 +296,6 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
         prefix = f"{name}_" if name else ""
         solids = solids_of(body, _material_of(material, body, name))
         energies: list[tuple[Energy, str]] = [(solid, f"{prefix}{region}") for solid, region in solids]
-        sliding = [(Hysteresis(solid), f"{prefix}{region}") for solid, region in solids if solid.material.hysteresis]
-        energies += sliding
         for part in body.controls:
             energies += [(energy, f"{prefix}{part}_") for energy in rigid_energies(body, part, body.rigid[part])]
         items: list[tuple[Energy, Any, str]] = [

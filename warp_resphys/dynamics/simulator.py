@@ -286,8 +286,8 @@ class Simulator:
     ) -> State:
         """Returns the static equilibrium under gravity and constant inputs, differentiable like a step.
 
-        Friction without rate, as of `energies.hysteresis` and of contact, makes it depend on the poses before.
-        The state that is returned has the memory of such energies; that of others is of a body long at rest.
+        Friction of contact makes it depend on the poses before. The state that is returned has the memory of contact;
+        that of other energies is of a body long at rest.
 
         Args:
             inputs: constant inputs.
@@ -295,9 +295,9 @@ class Simulator:
             start: (B, N, 3) initial guess [m]; the rest shape if omitted. If Newton's method does not converge from it
                 in 100 iterations, loads, inputs and motion of the fixed vertices are increased in steps.
             batch: number of environments, if no other argument implies it.
-            after: state that friction without rate continues, of the batch or of one environment; the undeformed body
-                if omitted. Friction of contact acts against the slide since its positions, with the normal forces that
-                it has there: to press a body and shear it, press first, then shear after that equilibrium.
+            after: state that contact continues, of the batch or of one environment; the undeformed body if omitted.
+                Friction acts against the slide since its positions, with the normal forces that it has there: to press
+                a body and shear it, press first, then shear after that equilibrium.
 
         Raises:
             InputError: wrong shapes, values that are not finite, or a body that is not held (`is_held`) in ``after``.

@@ -49,7 +49,7 @@ def record_rollout(
     Args:
         tape: a tape, active or not.
         simulator: the simulator; every array must have its device and dtype.
-        q: (B, N) vec3 positions [m]; Prony branches start relaxed, sliders of materials as strained in proportion.
+        q: (B, N) vec3 positions [m]; Prony branches start relaxed.
         v: (B, N) vec3 velocities [m/s].
         steps: number of steps T.
         previous: (q, v) one step earlier, to continue a roll-out by BDF2: its ``(q[-2], v[-2])``.

@@ -12,7 +12,7 @@ from typing_extensions import override
 from ..io.errors import InputError
 from ..kernels.materials.convex import ISOTROPIC, convex_law
 from ..stepping.quantity import Parameter, Quantity, parameter
-from .materials import PRONY_TIME_QUANTITY, YIELD_STRAIN, Material
+from .materials import PRONY_TIME_QUANTITY, Material
 
 
 def _modulus(name: str) -> Quantity:
@@ -48,10 +48,10 @@ class ConvexMaterial(Material):
     """Rubber of terms with non-negative coefficients: powers of invariants, Ogden's terms, and families of fibres.
 
     With c10 and c01 alone it is `MooneyRivlin`, with c10, c20 and c30 the rubber of Yeoh (1993), with `ogden` alone
-    that of Ogden (1972). Viscosities, branches and sliders have moduli of their own, independent of the elastic
-    coefficients, so that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities, branches
-    and sliders are functions of the strain of Green, and outside of that argument. Coefficients are zero by default,
-    but for `bulk_1`.
+    that of Ogden (1972). Viscosities and branches have moduli of their own, independent of the elastic
+    coefficients, so that forces are linear in all coefficients. The elastic energy is polyconvex; viscosities and
+    branches are functions of the strain of Green, and outside of that argument. Coefficients are zero by default, but
+    for `bulk_1`.
 
     Attributes:
         c10, c20, c30: coefficients [Pa] of a, a^2 and a^3, with a of `kernels.materials.convex`, near I1 - 3.
@@ -63,13 +63,11 @@ class ConvexMaterial(Material):
         ogden: shear moduli [Pa] of Ogden's terms at small strains, by exponent, a whole number.
         fibres: families of fibres, see `FibreFamily`.
         prony: moduli [Pa] and relaxation times [s] of branches.
-        hysteresis: moduli [Pa] and yield strains of sliders.
     """
 
     model = "law"
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
         "prony": (Quantity("prony_modulus", "Pa", 0.0, closed=True), PRONY_TIME_QUANTITY),
-        "hysteresis": (Quantity("hysteresis_modulus", "Pa", 0.0, closed=True), YIELD_STRAIN),
         "fibres": (
             Quantity("fibre_azimuth", "rad", per="element"),
             Quantity("fibre_elevation", "rad", per="element"),

@@ -36,13 +36,12 @@ VISCOUS: Final = ("stiffness_damping", "shear_viscosity", "bulk_viscosity")
 PRONY_RATIOS: Final = ("prony_ratio", "prony_modulus")  # likewise, of relaxation, and of the times with their numbers
 PRONY_TIME: Final = "prony_time"
 PRONY_TIME_QUANTITY = Quantity(PRONY_TIME, "s", 0.0)
-YIELD_STRAIN = Quantity("hysteresis_strain", "", 0.0)
-_ITEMS: Final = {"prony": "branch", "hysteresis": "slider", "fibres": "family"}  # of groups
+_ITEMS: Final = {"prony": "branch", "fibres": "family"}  # of groups
 
 
 @dataclass(frozen=True)
 class Material(ABC):
-    """An elastic material with Rayleigh damping, relaxation and hysteresis.
+    """An elastic material with Rayleigh damping and relaxation.
 
     Elastic parameters and density are numbers, (M,) tensors with one value per element, (B, 1) tensors with one value
     per environment, or (B, M) tensors; damping parameters are numbers or (B,) tensors. Every simulated quantity is
@@ -57,8 +56,7 @@ class Material(ABC):
     curvature: ClassVar[tuple[float, ...]]
     # parameters of each item of a field that is a sequence, such as a branch or a family of fibres, by the field
     groups: ClassVar[Mapping[str, tuple[Quantity, ...]]] = {
-        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), PRONY_TIME_QUANTITY),
-        "hysteresis": (Quantity("hysteresis_ratio", "", 0.0, closed=True), YIELD_STRAIN),
+        "prony": (Quantity("prony_ratio", "", 0.0, closed=True), PRONY_TIME_QUANTITY)
     }
 
     density: Parameter = parameter(1070.0, "density", "kg/m^3", per="element", kw_only=True)  # rho [kg/m^3]
@@ -69,8 +67,6 @@ class Material(ABC):
     # generalised Maxwell (Prony) branches: ratio of the shear modulus to the long-term modulus mu, and relaxation time
     # [s] (`energies.viscosity`)
     prony: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
-    # sliders of rate-independent friction: ratio of the shear modulus to mu, and yield strain (`energies.hysteresis`)
-    hysteresis: Sequence[tuple[Parameter, Parameter]] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Raises InputError for a parameter outside its physical range."""

@@ -148,29 +148,6 @@ def _shares(points: SolidPoints) -> dict[str, scipy.sparse.csr_array]:
     return {"shape": points.shape_volume, "volume": points.volume_volume, "mean": mean}
 
 
-class PointModuli:
-    """Moduli of a solid's material, times the volumes of its points or as means over these.
-
-    Args:
-        solid: the solid.
-        site: the simulator.
-    """
-
-    def __init__(self, solid: Solid, site: EnergySite) -> None:
-        self._material, like = solid.material, site.rest_positions
-        shares = [_shares(s) for s in solid.discretisation.point_sets]
-        self._shares = {
-            rule: device_matrix(scipy.sparse.vstack([by_rule[rule] for by_rule in shares]), like.device, like.dtype)
-            for rule in set(solid.material.rules)
-        }
-
-    def __call__(self, parameters: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the values (1 or B, P, T), which are mostly in J."""
-        moduli = torch.broadcast_tensors(*self._material.moduli(parameters))
-        rules = zip(self._material.rules, moduli, strict=True)
-        return torch.stack([spread(self._shares[rule], m) for rule, m in rules], dim=-1)
-
-
 class BoundSolid(BoundEnergy):
     """A solid in a simulator: stiffness, mass, and viscous strain."""
 
@@ -178,7 +155,11 @@ class BoundSolid(BoundEnergy):
         super().__init__(solid, site)
         self._solid = solid
         like, sets = site.rest_positions, solid.discretisation.point_sets
-        self._moduli = PointModuli(solid, site)
+        shares = [_shares(s) for s in sets]
+        self._shares = {
+            rule: device_matrix(scipy.sparse.vstack([by_rule[rule] for by_rule in shares]), like.device, like.dtype)
+            for rule in set(solid.material.rules)
+        }
         cells = slice(None) if solid.cells is None else solid.cells
         self._mass_volume, self._load_volume = (
             device_matrix(matrix[:, cells], like.device, like.dtype) for matrix in (site.mass_volume, site.load_volume)
@@ -189,6 +170,7 @@ class BoundSolid(BoundEnergy):
     @override
     def prepare(self, parameters: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor | None]:
         material = self._solid.material
+        rules = zip(material.rules, torch.broadcast_tensors(*material.moduli(parameters)), strict=True)
         damping = torch.cat(torch.broadcast_tensors(*material.viscosity(parameters)), 1)
         ratio = time = None
         if material.prony:
@@ -198,7 +180,7 @@ class BoundSolid(BoundEnergy):
                 ratio = time = None
         damped = damping.requires_grad or bool((damping > 0).any())
         return {
-            "stiffness": self._moduli(parameters),
+            "stiffness": torch.stack([spread(self._shares[rule], m) for rule, m in rules], dim=-1),
             "damping": damping if damped else None,
             "prony_ratio": ratio,
             "prony_time": time,

@@ -114,9 +114,8 @@ class Slope(NamedTuple):
     """An output of the kernel ``adjoint``: the derivative by a value, at every point."""
 
     name: str
-    shape: tuple[int, ...]  # without the batch
+    shape: tuple[int, ...]  # without the batch, the points first
     kind: Any = wp.float64
-    axis: int = 0  # of the points in the shape
 
 
 class Term(ABC):
@@ -176,7 +175,7 @@ class Term(ABC):
         out = {o.name: batch.zeros(*o.shape) for o in outputs}
         x, z = (warp_view(field, wp.vec3d) for field in (positions, direction))
         for s in self.sets:
-            views = [warp_view(out[o.name].narrow(1 + o.axis, s.first, s.n_points), o.kind) for o in outputs]
+            views = [warp_view(out[o.name].narrow(1, s.first, s.n_points), o.kind) for o in outputs]
             inputs = self._adjoint_inputs(s, x, z)
             commands.append(batch.record(self._kernels.adjoint, (batch.batch, s.n_points), inputs, views))
 
@@ -196,8 +195,8 @@ class Term(ABC):
 
     def _by_values(self, out: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Returns the derivatives by the values from those at the points, summed where these share a value."""
-        sums = ((o.name, out[o.name], self.values[o.name].shape, 1 + o.axis) for o in self._slopes())
-        return {name: slope.clone() if slope.shape == shape else slope.sum(axis) for name, slope, shape, axis in sums}
+        sums = ((name, slope, self.values[name].shape) for name, slope in out.items())
+        return {name: slope.clone() if slope.shape == shape else slope.sum(1) for name, slope, shape in sums}
 
     def total_stiffness(self) -> torch.Tensor | None:
         """Returns the sum (B,) of a solid's moduli times volumes, the scale of its energy's rounding error [J]."""

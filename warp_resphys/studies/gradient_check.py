@@ -106,7 +106,7 @@ def check_gradients(
         steps: number of steps of the roll-out.
         batch: number of environments.
         seed: of the random directions and functional.
-        change: factor of the largest changes; less than one where second derivatives jump, as those of sliders do.
+        change: factor of the largest changes; less than one where second derivatives jump, as those of friction do.
         names: of the inputs and parameters that are compared, with `q` and `v` of the start; None for all.
         together: whether inputs and parameters of one shape change at the same time, by amounts that contribute
             about the same, which takes a fraction of the time. The difference of a row is then that of all less the

@@ -22,7 +22,6 @@ import scipy.optimize
 import torch
 
 from ...dynamics.simulator import Simulator
-from ...energies.hysteresis import PLASTIC_STRAIN
 from ...energies.solid import VISCOUS_STRAIN
 from ...energies.tendon_forces import SEGMENT_TENSION
 from ...io.arrays import FloatArray
@@ -32,7 +31,7 @@ from ...stepping.state import State
 
 Candidate = Mapping[str, float]  # values of parameters that give one unit of a coefficient, the others being zero
 
-_CARRIED = (VISCOUS_STRAIN, PLASTIC_STRAIN, SEGMENT_TENSION)  # memory that forces of later steps depend on
+_CARRIED = (VISCOUS_STRAIN, SEGMENT_TENSION)  # memory that forces of later steps depend on
 _AT_ONCE = 256  # environments of a batch
 _RIDGE = 1e-14  # of the trace, where columns are dependent
 

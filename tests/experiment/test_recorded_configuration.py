@@ -125,6 +125,23 @@ def test_folds_and_splits(tmp_path):
     refuses(InputError, r"data\.train is others, .* give these as lists", check, config)
     config["data"] |= {"train": [], "validation": []}
     refuses(InputError, r"data\.train is empty: .* or set data\.folds to leave_one_out", check, config)
+    named = {"train": ["bare", "load52"], "validation": [], "test": ["load101"]}
+    config["data"] |= {"splits": {"heavier": named}, "split": "heavier"}  # in place of the lists
+    assert split_of(parse(RunSettings, config)) == Split(**named)
+    named["test"] = ["load102"]
+    refuses(InputError, r"data\.splits\.heavier\.test names .*'load102', .* not in data\.trials", check, config)
+    config["data"]["split"] = "lighter"
+    refuses(ResphysError, r"data\.split is 'lighter': choose from heavier", check, config)
+
+
+def test_the_frozen_splits_of_the_real_arm_share_no_trial_and_test_other_motions_or_another_day():
+    days = {}
+    for name in ("within", "to_long", "to_large"):
+        run = settings("experiment=sopra_real", "data.folder=recordings", f"data.split={name}")
+        check_run(run)
+        days[name] = [{run.data.trials[trial].session for trial in part} for part in dict(split_of(run)).values()]
+    assert days["within"] == days["to_long"] == [{"day_21"}] * 3
+    assert days["to_large"] == [{"day_21"}, {"day_21"}, {"day_20"}]
 
 
 def test_the_rest_of_a_trial_that_is_learned_from_in_part_may_be_the_test():

@@ -1,7 +1,8 @@
 """The expected duration of a run: the time of a step and of a reconstructed one, times their numbers.
 
-The steps are those of bodies that fall from rest, under the inputs in the middle of the trials; the reconstructed
-forces support a fifth of their weight. Reports, laws of materials, other bodies and control have no estimate.
+The steps are the first ones of bodies that begin under inputs; others fall from rest under the inputs in the middle of
+the trials. The reconstructed forces support a fifth of their weight. Reports, laws of materials, other bodies and
+control have no estimate.
 """
 
 import math
@@ -13,7 +14,7 @@ from statistics import fmean
 
 import torch
 
-from ..data.trials import evenly
+from ..data.trials import UNDER_INPUTS, evenly
 from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
@@ -140,9 +141,11 @@ def pace_of(experiment: Experiment, reconstructed: bool) -> float:
         method = make_reconstructor(simulator, settings.reconstruction, replay.observe)
         method = method.with_constants(constants)
     support = -_SUPPORTED * constants.load_mass[..., None] * constants.gravity[:, None] * torch.ones_like(state.q)
-    middle = round(float(replay.trials.times.max()) / simulator.time_step) // 2  # where inputs act
+    first = round(float(replay.trials.times.max()) / simulator.time_step) // 2  # where inputs act
+    if experiment.trials.begin_of(names[0]) == UNDER_INPUTS:
+        state, first = simulator.static_equilibrium(resting, constants), 0
     for k in range(_MOST_STEPS):
-        acting = resting if replay.is_static else inputs.at(middle + k)
+        acting = resting if replay.is_static else inputs.at(first + k)
         begin = time.perf_counter()
         with torch.no_grad():
             target = simulator.step(state, acting if method is None else acting.plus(support), constants)

@@ -136,17 +136,20 @@ def _valued(data: SimulatedData) -> dict[str, list[str]]:
     return named
 
 
-def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings]:
+def _splits(run: RunSettings) -> tuple[str, RecordedData | LaboratorySettings | Split]:
     """Name and settings of the group that configures the split."""
     assert isinstance(run.data, RecordedData)
     if run.is_laboratory and run.laboratory is not None and run.laboratory.train is not None:
         return "laboratory", run.laboratory
+    if run.data.split is not None:
+        return f"data.splits.{run.data.split}", run.data.splits[run.data.split]
     return "data", run.data
 
 
 def _named(run: RunSettings) -> dict[str, list[str]]:
     """Names of the trials in each split, from the configured lists or numbers."""
     names, (group, settings) = list(all_trials(run)), _splits(run)
+    table = group.partition(".")[0]
     wanted = {name: getattr(settings, name) for name in SPLITS}
     asked = sum(members for members in wanted.values() if isinstance(members, int))
     if asked > len(names):
@@ -166,11 +169,11 @@ def _named(run: RunSettings) -> dict[str, list[str]]:
         unknown = [trial for trial in lists[name] if trial not in names]
         if unknown:
             raise InputError(
-                f"{group}.{name} names the trial '{unknown[0]}', which is not in {group}.trials: {', '.join(names)}."
+                f"{group}.{name} names the trial '{unknown[0]}', which is not in {table}.trials: {', '.join(names)}."
             )
         if not lists[name] and not (name == "validation" and run.in_the_loop is not None):
             more = ", or set data.folds to leave_one_out" if group == "data" else ""
-            raise InputError(f"{group}.{name} is empty: add at least one of {group}.trials{more}.")
+            raise InputError(f"{group}.{name} is empty: add at least one of {table}.trials{more}.")
     seen: dict[str, str] = {}
     for name, trial in ((name, trial) for name, members in lists.items() for trial in members):
         # The remainder of a partly trained trial is tested.

@@ -15,6 +15,7 @@ from .performed import (
     MotionSettings,
     ObstacleMotions,
     SignedAxis,
+    Split,
     Trials,
     TrialTable,
     different,
@@ -165,10 +166,16 @@ class RecordedData(ReadingSettings):
     train: Trials = setting((), "names or number of trials; others: the rest")
     validation: Trials = setting((), "names or number of trials; others: the rest")
     test: Trials = setting((), "names or number of trials; others: the rest")
+    splits: dict[str, Split] = setting({}, "train, validation and test by the name of a split")
+    split: Word | None = setting(None, "one of splits, in place of train, validation and test")
     limit: LimitSettings | None = setting(None, "fewer trials, evenly chosen")
 
     @model_validator(mode="after")
     def _scales(self) -> Self:
+        if self.split is not None and self.split not in self.splits:
+            raise ValueError(
+                f"split is {self.split!r}: choose from {', '.join(self.splits) or 'splits, which is empty'}."
+            )
         if 1.0 in self.input_scales:
             raise ValueError("input_scales has 1, which is always tested: leave it out.")
         if self.input_scales and self.folds:

@@ -101,7 +101,8 @@ def test_a_failure_in_a_thread_names_the_environment_of_the_batch(motion, monkey
 
 
 @pytest.mark.parametrize("failing", [0, 2])
-def test_what_a_thread_raises_comes_when_all_have_ended(failing):
+def test_what_a_thread_raises_comes_when_all_have_ended(failing, monkeypatch):
+    threads(monkeypatch, 3)
     ended = []
 
     def work(number):
@@ -113,6 +114,11 @@ def test_what_a_thread_raises_comes_when_all_have_ended(failing):
     with pytest.raises(ValueError, match=f"from {failing}"):
         in_threads(work, range(3))
     assert sorted(ended) == sorted({0, 1, 2} - {failing})
+
+
+def test_results_are_in_the_order_of_the_shards(monkeypatch):
+    threads(monkeypatch, 2)
+    assert in_threads(lambda number: number, range(5)) == [*range(5)]
 
 
 def test_shards_are_not_shared_again(monkeypatch):
@@ -141,6 +147,9 @@ def test_shards_cover_the_batch(monkeypatch):
         rows = shards_of(batch, cpu)
         assert [i for part in rows for i in range(batch)[part]] == list(range(batch))
         assert len(rows) == min(4, batch // 2)
+        large = shards_of(batch, cpu, 3_000)
+        assert [i for part in large for i in range(batch)[part]] == list(range(batch))
+        assert len(large) == batch
 
 
 MATERIAL = Corotated(1e5, 0.45, density=1000.0, stiffness_damping=1e-3)

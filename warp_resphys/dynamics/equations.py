@@ -103,7 +103,7 @@ class EquationsOfMotion:
         if key not in self.workspaces:
             with lasting():
                 workspace = self._make_workspace(batch=batch)
-                shards = shards_of(batch, workspace.potential.device)
+                shards = shards_of(batch, workspace.potential.device, 3 * len(workspace.pattern.free))
                 workspace.shards += [(rows, self._make_workspace(batch=rows.stop - rows.start)) for rows in shards]
             self.workspaces[key] = workspace
         return self.workspaces[key]

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
 from threading import Lock, local
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import torch
 from threadpoolctl import LibController, ThreadpoolController
@@ -18,7 +18,8 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 _WORTH_SHARING = 9_000  # unknowns of a body from which torch uses several threads
-_LEAST_ENVIRONMENTS = 2  # environments per shard
+_LEAST_ENVIRONMENTS = 2  # of small bodies per shard
+_IN_CACHE = 4_000  # unknowns of the environments of a shard
 
 
 @contextmanager
@@ -73,16 +74,32 @@ def _blas() -> list[LibController]:
     return libraries
 
 
-def shards_of(batch: int, device: torch.device, least: int = _LEAST_ENVIRONMENTS) -> list[slice]:
-    """Returns the slices of a batch for one thread each, or none if a single thread does it all.
+def shards_of(batch: int, device: torch.device, unknowns: int = 1) -> list[slice]:
+    """Returns the slices of a batch that are worked on one after another or by several threads; none for a single one.
 
-    On a CPU a kernel runs on the thread that launches it and releases the GIL. The number of threads is torch's, or
-    ``WARP_RESPHYS_THREADS``; within `in_threads` it is one.
+    On a CPU a kernel runs on the thread that launches it and releases the GIL. There is a slice for each thread, or
+    more for large environments, whose matrices then stay in a processor's cache from one kernel to the next.
 
     Args:
         batch: number of environments.
         device: their device.
-        least: smallest number of environments in a slice.
+        unknowns: of an environment.
+
+    Raises:
+        InputError: see `thread_count`.
+    """
+    most = max(1, _IN_CACHE // unknowns)  # environments of a slice
+    least = min(most, _LEAST_ENVIRONMENTS)
+    threads = 1 if _is_shared() else thread_count()
+    count = max(min(threads, batch // least), -(-batch // most))
+    if device.type != "cpu" or count < 2:
+        return []
+    ends = [round(batch * k / count) for k in range(count + 1)]
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def thread_count() -> int:
+    """Returns the number of threads that share a batch: torch's, or ``WARP_RESPHYS_THREADS``.
 
     Raises:
         InputError: the environment variable is not a whole number.
@@ -90,11 +107,7 @@ def shards_of(batch: int, device: torch.device, least: int = _LEAST_ENVIRONMENTS
     threads = os.environ.get("WARP_RESPHYS_THREADS", str(torch.get_num_threads()))
     if not threads.isdecimal():
         raise InputError(f"WARP_RESPHYS_THREADS is {threads!r}: it must be a whole number of threads.")
-    count = min(int(threads), batch // least)
-    if device.type != "cpu" or count < 2 or _is_shared():
-        return []
-    ends = [round(batch * k / count) for k in range(count + 1)]
-    return [slice(*pair) for pair in pairwise(ends)]
+    return max(1, int(threads))
 
 
 _SHARING = local()  # of each thread: whether it works on one of several shards
@@ -120,25 +133,31 @@ if hasattr(os, "register_at_fork"):
 
 
 def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
-    """Returns the results of a function for all shards; the calling thread works on the last one.
+    """Returns the results of a function for all shards, of which every thread works on some.
 
-    Exceptions are raised after all threads have finished. Within the function, further shards are not shared again.
+    The calling thread is the last one. Exceptions are raised after all threads have finished. Within the function,
+    further shards are not shared again.
     """
-    if len(shards) == 1 or _is_shared():
+    threads = min(thread_count(), len(shards))
+    if threads == 1 or _is_shared():
         return [work(shard) for shard in shards]
     grad_enabled = torch.is_grad_enabled()  # a thread-local setting
 
-    def work_on(shard: S) -> T:
+    def work_on(mine: Sequence[S]) -> list[T]:
         _SHARING.now = True
         try:
             with torch.set_grad_enabled(grad_enabled):
-                return work(shard)
+                return [work(shard) for shard in mine]
         finally:
             _SHARING.now = False
 
-    others = [_pool(len(shards) - 1).submit(work_on, shard) for shard in shards[:-1]]
+    *first, last = (shards[number::threads] for number in range(threads))
+    others = [_pool(threads - 1).submit(work_on, mine) for mine in first]
+    results: list[T | None] = [None] * len(shards)
     try:
-        last = work_on(shards[-1])
+        results[threads - 1 :: threads] = work_on(last)
     finally:
         wait(others)
-    return [*(other.result() for other in others), last]
+    for number, other in enumerate(others):
+        results[number::threads] = other.result()
+    return cast(list[T], results)

@@ -16,7 +16,6 @@ from copy import copy
 from dataclasses import replace
 from functools import partial
 from itertools import chain, starmap
-from operator import itemgetter
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from typing_extensions import override
 
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
-from ...linalg.threads import in_threads, shards_of
+from ...linalg.threads import in_threads, thread_count
 from ...settings.learning import Bounds
 from ...stepping.state import State
 from ..metrics import redundancy
@@ -189,9 +188,6 @@ class Misfit(BoundedMisfit):
             pair = replay.changed(simulator=self.simulator, trials=trials), start
             self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))
             self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
-        numbers = range(len(self._replays))
-        threads = len(shards_of(len(numbers), simulator.rest_positions.device, 1)) or 1
-        self._by_thread = [numbers[first::threads] for first in range(threads)]
         self._fit = NuisanceFit(self._replays, self._weights, accuracy, delay)
         self._moves = _moves_of(self.bounds)
         self.forget()
@@ -313,8 +309,9 @@ class Misfit(BoundedMisfit):
             motion.differentiate(points)
             return replay.varied(begin, values, states, motion.record)
 
-        followed = in_threads(lambda numbers: [(n, follow(n)) for n in numbers], self._by_thread)
-        self._last = points, [series for _, series in sorted(chain.from_iterable(followed), key=itemgetter(0))]
+        numbers = range(len(self._replays))
+        shares = self.simulator.rest_positions.device.type == "cpu"
+        self._last = points, in_threads(follow, numbers) if shares else [*map(follow, numbers)]
         return self._last[1]
 
 
@@ -377,10 +374,10 @@ class NearbyMotion:
 
 
 def _parts(replay: Replay, start: Start) -> list[tuple[Replay, Start]]:
-    """A replay and its start, divided by trials into a part for each thread."""
-    count = len(replay.trials.names)
-    chosen = [[*range(count)[part]] for part in shards_of(count, start.delay.device, 1) or [slice(None)]]
-    trials = replay.trials
+    """A replay and its start, divided by trials into a part for each thread of a CPU."""
+    trials, count = replay.trials, len(replay.trials.names)
+    parts = min(thread_count(), count) if start.delay.device.type == "cpu" else 1
+    chosen = [part.tolist() for part in np.array_split(np.arange(count), parts)]
     return [(Replay(replay.simulator, replay.observe, trials.select(part)), start.select(part)) for part in chosen]
 
 

@@ -208,7 +208,7 @@ class ObservedMotions(Brief):
         if begins in (STATIC, UNDER_INPUTS):  # Small changes of a parameter then start close to the solution.
             with contextlib.suppress(ConvergenceError), torch.no_grad():
                 constants, _, resting = replay.prepare(values)
-                guess = simulator.static_equilibrium(resting, constants).q
+                guess = simulator.static_equilibrium(resting, constants).q.expand_as(guess)
         if begins == STATIC:
             return Start.resting(guess)
         return begin_inputs(replay, Start.resting(guess), self.release, values)

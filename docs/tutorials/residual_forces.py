@@ -118,7 +118,7 @@ losses = []
 for _ in range(400):
     optimiser.zero_grad()
     noisy = inputs + 1e-3 * torch.randn_like(inputs)
-    loss = (model.standardised(noisy)[0] - outputs).square().mean()
+    loss = (model.standardised(noisy) - outputs).square().mean()
     loss.backward()
     optimiser.step()
     schedule.step()

@@ -108,14 +108,14 @@ def test_the_evaluator_is_the_network(activation, blocks):
     inputs = 3.0 * torch.randn(7, 8, dtype=torch.float64)
     range_ = Range.of(torch.randn(30, 8, dtype=torch.float64))
     for guard in (None, range_):
-        wanted = network.standardised(inputs if guard is None else guard.clamp(inputs))[0]
+        wanted = network.standardised(inputs if guard is None else guard.clamp(inputs))
         outputs, _ = Evaluator(network, guard)(inputs.numpy())
         np.testing.assert_allclose(outputs, wanted.detach().numpy(), atol=1e-12)
     fading = replace(range_, missed=torch.ones(2, dtype=torch.float64))
     weight = fading.weight(inputs)
     assert (weight < 1.0).sum() > 0
     assert weight.max() > 0.0
-    force = weight[:, None, None] * network.decode(range_.clamp(inputs))[0][0]
+    force = weight[:, None, None] * network.decode(range_.clamp(inputs))[0]
     outputs, left = Evaluator(network, fading)(inputs.numpy())
     np.testing.assert_array_equal(left, range_.excludes(inputs))
     np.testing.assert_allclose(outputs, network.encode_outputs(force).detach().numpy(), atol=1e-12)

@@ -231,7 +231,7 @@ class TestConfiguration:
             pytest.importorskip("gmsh", reason="gmsh is not installed", exc_type=ImportError)
             trimesh.creation.box(bounds=[[0.0, 0.0, 0.0], [0.1, 0.03, 0.03]]).export("box.obj")
         meshio.write("box.vtu", meshio.Mesh(box.vertices, [("hexahedron", box.cells)]))
-        more = {"mesh=surface": ["mesh.path=box.obj", "mesh.units=m"], "network=recurrent": ["trainer=sequences"]}
+        more = {"mesh=surface": ["mesh.path=box.obj", "mesh.units=m"]}
         more |= {f"mesh={kind}": ["mesh.path=box.vtu"] for kind in ("file", "arm_published")}
         run = settings(choice, *more.get(choice, []))
         if choice.startswith(("mesh=arm", "mesh=rod", "mesh=segment")) and choice != "mesh=arm_published":

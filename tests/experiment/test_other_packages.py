@@ -126,7 +126,6 @@ def test_another_version_is_told_and_runs_stages_again(installed, tmp_path, monk
         ("energies.magnet._target_=torch.nn.Linear", r"Linear is no subclass of warp_resphys\.energies\.base\.Energy"),
         ("energies.magnet.magnetisatoin=3", r"unknown key 'energies\.magnet\.magnetisatoin', did you mean 'magnetisat"),
         ("energies.magnet.magnetisation=null", r"energies\.magnet\.magnetisation is missing: it must be a positive"),
-        ("network.recurrent=4", r"network\.core has no hidden state, but recurrent is its size"),
         ("markers.bind=frame", r"markers\.observation takes the place of bind and bind_to"),
         ("energies.magnet=null", r"simulator takes no input: give both the same inputs, by .* or energies"),
         (

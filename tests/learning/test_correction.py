@@ -254,12 +254,15 @@ class TestSelection:
     def test_the_smallest_validation_loss_is_selected(self, monkeypatch, measured):
         losses, weights, asked = [5.0, 4.0, 2.0, 3.0, math.nan, 6.0], [], []
         run = trainer(selection="validation_loss", error=lambda model: asked.append(model) or measured)
+        training = run._loss
 
-        def validate():
+        def loss(*samples):
+            if torch.is_grad_enabled():
+                return training(*samples)
             weights.append({k: t.clone() for k, t in run.model.network.state_dict().items()})
             return losses[len(weights) - 1]
 
-        monkeypatch.setattr(run, "_validate", validate)
+        monkeypatch.setattr(run, "_loss", loss)
         finish(run)
         assert run.best_epoch == 3
         assert not same(weights[2], weights[-1])

@@ -1,4 +1,4 @@
-"""Networks, recurrent ones with their hidden states in the roll-out, and a force that fades out beyond its training."""
+"""Networks, and a force that fades out beyond its training."""
 
 import dataclasses
 import math
@@ -15,8 +15,7 @@ from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals.coders import actuation_coder, displacement_coder, nodal_coder, pod_coder
 from warp_resphys.learning.residuals.correction import Learned, LearnedPredictor, Range
 from warp_resphys.learning.residuals.networks import NextState, ResidualForce, SkipMLP, build_model, restore
-from warp_resphys.learning.residuals.training import Samples, SequenceTrainer
-from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
+from warp_resphys.settings.learning import NetworkSettings
 
 REDUCED = {"kind": "reduced", "position_modes": 3, "velocity_modes": 4, "force_modes": 5}
 ARCHITECTURE = {"blocks": 2, "layers": 1, "width": 16, "activation": "normalised_elu"}
@@ -94,7 +93,7 @@ class TestResidualForce:
         left = y - x @ expected
         np.testing.assert_allclose(model.remainder, np.sqrt((left**2).mean()), rtol=1e-6)
         inputs = torch.tensor(x)
-        together = model.standardised(inputs)[0]
+        together = model.standardised(inputs)
         np.testing.assert_allclose(
             together.detach(), inputs @ model.linear + model.remainder * model.network(inputs).detach(), rtol=1e-6
         )
@@ -235,74 +234,6 @@ def test_rest_stiffness_knows_no_viscosity_and_wants_a_body_that_is_held():
     np.testing.assert_allclose(damped.displacements(force), plain.displacements(force), rtol=1e-9)
     with pytest.raises(InputError, match="fix some vertices"):
         RestStiffness(Simulator(Body(box_hexahedra())))
-
-
-MODES = {"position_modes": 1, "velocity_modes": 0, "force_modes": 1}
-NETWORK = NetworkSettings(**MODES, layers=1, width=16, activation="silu", recurrent=8)
-TRAINER = {"epochs": 150, "batch_size": 8, "learning_rate": 1e-2, "final_learning_rate": 1e-4, "noise": 0.0}
-TRAINER |= {"selection": "validation_loss", "rollout_every": 1000, "sequence": 10}
-TRIALS, STEPS, LAG = 6, 40, 8.0
-REST = torch.zeros(2, 3, dtype=torch.float64)
-
-
-def series(seed):
-    """Inputs that jump, and a force that follows them with a lag: the input alone does not tell it."""
-    random = torch.Generator().manual_seed(seed)
-    levels = torch.rand(TRIALS, 4, generator=random, dtype=torch.float64)
-    inputs = levels.repeat_interleave(STEPS // 4, 1)  # (R, K)
-    force, behind = [], torch.zeros(TRIALS, dtype=torch.float64)
-    for k in range(STEPS):
-        behind = behind + (inputs[:, k] - behind) / LAG
-        force.append(behind)
-    shape = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-    q = 1e-3 * inputs.flatten()[:, None, None] * shape
-    f = torch.stack(force, 1).flatten()[:, None, None] * shape
-    return Samples(q, torch.zeros_like(q), (f,), None, (STEPS,) * TRIALS)
-
-
-@pytest.fixture(scope="module")
-def model():
-    """A trained network, and motions that it has not seen."""
-    torch.manual_seed(0)
-    train, held_out = series(1), series(2)
-    model = build_model(ResidualForce, NETWORK, REST, train.q, train.v, train.outputs[0])
-    trainer = SequenceTrainer(model, train, held_out, lambda _: 0.0, TrainerSettings(**TRAINER), 0)
-    while not trainer.finished:
-        trainer.run_epoch()
-    return trainer.use_best(), held_out
-
-
-def rolled_out(model, samples):
-    """(R, K) the first component of the predicted force, and of the true one, in closed loop."""
-    q = samples.q.unflatten(0, (TRIALS, STEPS))
-    predict = LearnedPredictor(model)
-    with torch.no_grad():
-        forces = [predict(State(q[:, k], torch.zeros_like(q[:, k])), k) for k in range(STEPS)]
-    return torch.stack(forces, 1)[:, :, 0, 0], samples.outputs[0].unflatten(0, (TRIALS, STEPS))[:, :, 0, 0]
-
-
-def test_a_recurrent_network_learns_a_lag(model):
-    result, true = rolled_out(*model)
-    present = model[1].q[:, 0, 0].view(TRIALS, STEPS) * 1e3
-    ratio = ((result - true).square().mean() / (present - true).square().mean()).sqrt()
-    assert float(ratio) < 0.3
-
-
-def test_every_environment_has_its_hidden_state_of_its_size(model):
-    """Trials have the same roll-outs alone and in a batch, all from no hidden state."""
-    learned, samples = model
-    together, _ = rolled_out(learned, samples)
-    q = samples.q.unflatten(0, (TRIALS, STEPS))[3:4]
-    for _ in range(2):
-        predict = LearnedPredictor(learned)
-        with torch.no_grad():
-            alone = [predict(State(q[:, k], torch.zeros_like(q[:, k])), k)[0, 0, 0] for k in range(STEPS)]
-        torch.testing.assert_close(torch.stack(alone), together[3])
-    assert predict.hidden.shape == (1, 8)
-    inputs = torch.zeros(3, 1)
-    for wrong in (torch.zeros(3, 7), torch.zeros(2, 8)):
-        with pytest.raises(InputError, match=r"the hidden state is \(.*\): it must be \(3, 8\), or None to begin"):
-            model[0].standardised(inputs, wrong)
 
 
 SAMPLES, VERTICES = 30, 8

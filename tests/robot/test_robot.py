@@ -71,11 +71,6 @@ class TestRollouts:
     def test_every_model_does_what_the_evaluation_wrote(self, arm):
         check_robots(arm)
 
-    def test_a_recurrent_force_takes_its_memory_along(self, tmp_path):
-        folder = made(tmp_path, "network=recurrent", "network.width=8", "trainer=sequences", "trainer.sequence=4",
-                      "trainer.epochs=2", "trainer.rollout_every=2", "actuation.filter_time_constants=[]")  # fmt: skip
-        check_robots(folder, ("resphys", "simfree"))
-
     def test_a_fold_is_a_robot_and_their_parent_says_so(self, tmp_path):
         folder = made(tmp_path, "data.folds=leave_one_out", "data.limit={train: 2, validation: 1, test: 2}")
         folds = sorted(folder.glob("fold_*"))

@@ -20,7 +20,7 @@ def moved(batch, **more):
 
 def test_environments_are_chosen_from_two_states_repeated_and_selected():
     """What a state lacks is zero there, and its past is its present."""
-    more = {"hidden": torch.ones(2, 4), "base": torch.ones(2, 2, 6), "left": torch.tensor([True, True])}
+    more = {"base": torch.ones(2, 2, 6), "left": torch.tensor([True, True])}
     first, still = moved(2, **more), torch.zeros(2, 2, 3).double()
     second = State(still + 5.0, still, (still + 3.0, still)).with_memory({"pressure.queue": torch.zeros(2, 2, 2)})
     mixed = first.where(torch.tensor([True, False]), second)

@@ -24,7 +24,7 @@ Layer = Callable[[Array], Array]
 
 
 class Evaluator:
-    """Evaluates a trained network that is not recurrent, in the type of its weights.
+    """Evaluates a trained network in the type of its weights.
 
     Args:
         network: whose weights are final.

@@ -86,8 +86,7 @@ def check_reducible(robot: Robot) -> None:
 
     Raises:
         InputError: a data-driven robot, one that is not driven by exactly one input, without markers, with a moving
-            base, friction, a medium or obstacles, that is stepped by the midpoint rule, or whose network is recurrent
-            or nodal.
+            base, friction, a medium or obstacles, that is stepped by the midpoint rule, or whose network is nodal.
     """
     description = robot.description
     if robot.is_data_driven:
@@ -110,8 +109,6 @@ def check_reducible(robot: Robot) -> None:
         if name in robot.simulator.parameters and bool((_value(robot, name) != 0.0).any()):
             raise InputError(f"{name} is no stiffness, so that this robot cannot be reduced: use the full simulator.")
     network = None if description.learned is None else description.learned.network
-    if network is not None and network.recurrent is not None:
-        raise InputError("a recurrent network cannot be reduced: train one without a recurrent state.")
     if network is not None and any(coder.basis is None for coder in (network.position, *network.coders)):
         raise InputError("a nodal network cannot be reduced: train one with network.kind=reduced.")
 
@@ -254,7 +251,7 @@ class Source:
         conditions = None if conditions is None or network.actuation is None else conditions.to(like)
         inputs = network.encode(state.q.to(like), state.v.to(like), conditions)
         range_ = self.learned.range_
-        outputs = network.standardised(inputs)[0] if range_ is None else range_.outputs(network, inputs)
+        outputs = network.standardised(inputs) if range_ is None else range_.outputs(network, inputs)
         return np.asarray(outputs.double().cpu().numpy())
 
     def equilibria(self, commands: FloatArray) -> tuple[torch.Tensor, FloatArray, FloatArray | None]:

@@ -291,9 +291,7 @@ class Robot:
             return acting, None
         conditions = None if learned.network.actuation is None else acting.conditions
         frame = None if acting.base is None else BaseFrame(acting.base, self.time_step, first=1)
-        predictor = LearnedPredictor(learned.network, conditions, learned.range_, self.frames, frame)
-        predictor.hidden = state.memory_of().get("hidden")
-        return acting, predictor
+        return acting, LearnedPredictor(learned.network, conditions, learned.range_, self.frames, frame)
 
     @staticmethod
     def _remembered(state: State, acting: Acting, predictor: LearnedPredictor | None, after: State) -> State:
@@ -301,8 +299,6 @@ class Robot:
         memory = {**acting.memory, "lost": after.lost, "left": state.left}
         if predictor is not None and predictor.left_at is not None:
             memory["left"] = state.left | (predictor.left_at >= 0)
-        if predictor is not None and predictor.hidden is not None:
-            memory["hidden"] = predictor.hidden
         return after.with_memory(memory)
 
     def drive(self, state: State, **inputs: Given) -> tuple[Inputs, Callable[[State], State]]:

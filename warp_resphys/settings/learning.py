@@ -219,18 +219,9 @@ class NetworkSettings(Settings):
     activation: Literal["normalised_elu", "silu"] = setting(
         "normalised_elu", "layer normalisation and ELU, as published; silu is smoother"
     )
-    recurrent: Annotated[int, Field(ge=1, le=1_024)] | None = setting(
-        None, "size of a hidden state; needs trainer=sequences"
-    )
     core: ClassSettings | None = setting(
         None, "map between the coders by a class of another package, in place of blocks and layers"
     )
-
-    @model_validator(mode="after")
-    def _keeps_nothing(self) -> Self:
-        if self.core is not None and self.recurrent is not None:
-            raise ValueError("core has no hidden state, but recurrent is its size: leave one of them out.")
-        return self
 
 
 class EpochSettings(Settings):
@@ -260,7 +251,6 @@ class TrainerSettings(EpochSettings):
     selection: Literal["rollout", "validation_loss"] = setting(
         "rollout", "keep the weights of the least validation roll-out error, or loss"
     )
-    sequence: Natural | None = setting(None, "steps of back-propagation through time, for recurrent networks")
     gate: bool = setting(
         True, "use the force only if it is clearly closer to held-out trials than the simulator; false: always"
     )
@@ -310,13 +300,6 @@ class TrainingSettings(Settings):
     trainer: TrainerSettings
     in_the_loop: InTheLoopSettings | None
     seed: Count  # of the weights, the batches and the noise
-
-    @model_validator(mode="after")
-    def _sequences(self) -> Self:
-        on_steps = self.in_the_loop is None or self.in_the_loop.start == "steps"
-        if self.network.recurrent is not None and on_steps and self.trainer.sequence is None:
-            raise ValueError("trainer.sequence is missing: a recurrent network needs it; trainer=sequences has one.")
-        return self
 
 
 class BaselineSettings(Settings):

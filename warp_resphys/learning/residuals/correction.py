@@ -152,7 +152,7 @@ class Range(Brief):
 
     def outputs(self, network: StateMap, inputs: torch.Tensor) -> torch.Tensor:
         """Returns a network's standardised outputs (B, C) for unclamped inputs (B, A), faded out as by `weight`."""
-        outputs = network.standardised(self.clamp(inputs))[0]
+        outputs = network.standardised(self.clamp(inputs))
         if self.missed is None:
             return outputs
         nothing = network.encode_outputs(torch.zeros_like(network.rest)[None])
@@ -201,7 +201,6 @@ class LearnedPredictor:
 
     Attributes:
         left_at: (B,) step at which an environment left the range, -1 where it has not; None before the first step.
-        hidden: (B, H) hidden state of a recurrent network; None before the first step.
     """
 
     def __init__(
@@ -214,7 +213,6 @@ class LearnedPredictor:
     ) -> None:
         self.model, self._context, self._range, self._frames, self._base = model, context, range_, frames, base
         self.left_at: torch.Tensor | None = None
-        self.hidden: torch.Tensor | None = None
 
     def __call__(self, state: State, step: int) -> torch.Tensor | State:
         """Returns the model's force (B, N, 3) [N] or next state, on the simulator's device and in its precision."""
@@ -233,8 +231,7 @@ class LearnedPredictor:
             if self._range.missed is not None:
                 weight = self._range.weight(inputs, self.model.missed(q.to(like), v.to(like)).to(inputs)).to(q)
             inputs = self._range.clamp(inputs)
-        outputs, self.hidden = self.model.decode(inputs, self.hidden)
-        fields = [field.to(q) for field in outputs]
+        fields = [field.to(q) for field in self.model.decode(inputs)]
         if isinstance(self.model, NextState):
             return State(*(fields if self._base is None else self._base.leave(fields[0], fields[1], step + 1)))
         if weight is not None:

@@ -28,7 +28,7 @@ from .correction import Learned, Range, force_frames
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model
 from .reconstruction import ReconstructedTrials
-from .training import EpochTrainer, Samples, SequenceTrainer, Snapshot, Trainer, run_epochs
+from .training import EpochTrainer, Samples, Snapshot, Trainer, run_epochs
 
 log = logging.getLogger(__name__)
 _FOLDS: Final = 3  # of the training trials, without validation trials
@@ -152,10 +152,9 @@ class Fitting:
             inputs = inputs[:steps].swapaxes(0, 1) if inputs.ndim == 3 else inputs[:, None].expand(-1, steps, -1)
             inputs = pick(inputs.expand(-1, steps, -1).to(self.device))
         now = pick(q[:, :-1]), pick(v[:, :-1])
-        lengths = tuple(seen.sum(1).tolist())
         if not self.data_driven:
-            return Samples(*now, (pick(force[:, 1:]),), inputs, lengths)
-        return Samples(*now, (pick(q[:, 1:]) - like.to(q), pick(v[:, 1:])), inputs, lengths)
+            return Samples(*now, (pick(force[:, 1:]),), inputs)
+        return Samples(*now, (pick(q[:, 1:]) - like.to(q), pick(v[:, 1:])), inputs)
 
     def _states(self, names: Sequence[str], simulated: bool = True) -> tuple[torch.Tensor, ...]:
         """Positions, velocities and forces (R, K + 1, N, 3) of trials, and (R, K) whether steps were seen.
@@ -236,12 +235,11 @@ class Fitting:
         learned = Learned(network, self._range_of(network, train), self.force_frame)
         counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
         rollouts = HeldOutRollouts(counting, self.motions, judged, self.identified, self.data_driven)
-        kind: type[Trainer[Any]] = Trainer if network.recurrent is None else SequenceTrainer
 
         def judge(weights: StateMap) -> float:
             return rollouts.error_mm(replace(learned, network=weights))
 
-        return kind(network, train, validation, judge, settings.trainer, settings.seed), learned
+        return Trainer(network, train, validation, judge, settings.trainer, settings.seed), learned
 
     def _range_of(self, network: StateMap, train: Samples) -> Range | None:
         """Training range of a network's inputs, to which roll-outs clamp them; None without a guard."""

@@ -51,39 +51,6 @@ class SkipMLP(nn.Module):
         return x
 
 
-class RecurrentMLP(nn.Module):
-    """A gated recurrent unit, and a perceptron of the inputs and the hidden state.
-
-    Args:
-        n_in: inputs.
-        n_out: outputs.
-        recurrent: size of the hidden state.
-        architecture: of the perceptron, a `SkipMLP`.
-    """
-
-    def __init__(self, n_in: int, n_out: int, recurrent: int, **architecture: Any) -> None:
-        super().__init__()
-        self.cell = nn.GRUCell(n_in, recurrent)
-        self.perceptron = SkipMLP(n_in + recurrent, n_out, **architecture)
-
-    @property
-    def blocks(self) -> nn.ModuleList:
-        """Blocks of the perceptron."""
-        return self.perceptron.blocks
-
-    def forward(self, x: torch.Tensor, hidden: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Maps inputs (S, n_in) and hidden state (S, H), None at first, to outputs (S, n_out) and next hidden state.
-
-        Raises:
-            InputError: a hidden state of another size.
-        """
-        size = (x.shape[0], self.cell.hidden_size)
-        if hidden is not None and tuple(hidden.shape) != size:
-            raise InputError(f"the hidden state is {tuple(hidden.shape)}: it must be {size}, or None to begin.")
-        following = self.cell(x, hidden)
-        return self.perceptron(torch.cat([x, following], 1)), following
-
-
 def _perceptron(n_in: int, n_out: int, layers: int, width: int, activation: str) -> nn.Sequential:
     modules: list[nn.Module] = []
     for i in range(layers):
@@ -140,7 +107,7 @@ class StateMap(nn.Module):
         position: coder of displacements from rest.
         velocity: coder of velocities.
         outputs: coder of each predicted field.
-        architecture: number and width of the layers, their activation, and the size of the hidden state if recurrent.
+        architecture: number and width of the layers and their activation, or the class of another package.
         actuation: coder of further inputs, such as weights or pressures; None without any.
     """
 
@@ -162,17 +129,16 @@ class StateMap(nn.Module):
         self.register_buffer("rest", rest)
         self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
-        self.recurrent = architecture.recurrent
-        keys = (*_ARCHITECTURE, *(key for key in ("recurrent", "core") if getattr(architecture, key)))
+        keys = (*_ARCHITECTURE, *(("core",) if architecture.core else ()))
         self.architecture = {key: value for key, value in architecture.plain().items() if key in keys}
         self._sizes = [coder.size for coder in outputs.values()]
         n_in = position.size + velocity.size + (0 if actuation is None else actuation.size)
         n_out = sum(self._sizes)
-        network: SkipMLP | RecurrentMLP | OwnNetwork
-        if architecture.core is not None:
-            network = OwnNetwork(architecture.core, n_in, n_out)
+        network: SkipMLP | OwnNetwork
+        if architecture.core is None:
+            network = SkipMLP(n_in, n_out, **self.architecture)
         else:
-            network = (SkipMLP if self.recurrent is None else RecurrentMLP)(n_in, n_out, **self.architecture)
+            network = OwnNetwork(architecture.core, n_in, n_out)
         self.network = network.to(rest.device)
         self.register_buffer("linear", torch.zeros(n_in, n_out, device=rest.device))
         self.register_buffer("remainder", torch.ones((), device=rest.device))
@@ -196,20 +162,9 @@ class StateMap(nn.Module):
         self.linear.copy_(linear)
         self.remainder.copy_((y - x @ linear).square().mean().sqrt())
 
-    def standardised(
-        self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Maps standardised inputs (S, n_in) to standardised fields (S, n_out), and returns the next hidden state.
-
-        Args:
-            inputs: from `encode`.
-            hidden: (S, H) hidden state of a recurrent network; None at first.
-        """
-        if isinstance(self.network, RecurrentMLP):
-            outputs, hidden = self.network(inputs, hidden)
-        else:
-            outputs = self.network(inputs)
-        return inputs @ self.linear + self.remainder * outputs, hidden
+    def standardised(self, inputs: torch.Tensor) -> torch.Tensor:
+        """Maps standardised inputs (S, n_in) from `encode` to standardised fields (S, n_out)."""
+        return inputs @ self.linear + self.remainder * self.network(inputs)
 
     def encode(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> torch.Tensor:
         """Standardised inputs (S, n_in), in the network's precision, from q, v (S, N, 3) [m], [m/s] and (S, A) or None.
@@ -235,17 +190,14 @@ class StateMap(nn.Module):
         pairs = zip(self.coders, fields, strict=True)
         return torch.cat([coder.encode(field) for coder, field in pairs], dim=1).to(self.linear.dtype)
 
-    def decode(
-        self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
-    ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-        """Predicted fields (S, N, 3) in order, and the next hidden state; see `standardised`."""
-        outputs, hidden = self.standardised(inputs, hidden)
-        parts = outputs.split(self._sizes, dim=1)
-        return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)], hidden
+    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """Predicted fields (S, N, 3) in order, from standardised inputs (S, n_in)."""
+        parts = self.standardised(inputs).split(self._sizes, dim=1)
+        return [coder.decode(part) for coder, part in zip(self.coders, parts, strict=True)]
 
     def predict(self, q: torch.Tensor, v: torch.Tensor, actuation: torch.Tensor | None = None) -> list[torch.Tensor]:
         """Predicted fields (S, N, 3) in order; for the arguments, see `encode`."""
-        return self.decode(self.encode(q, v, actuation))[0]
+        return self.decode(self.encode(q, v, actuation))
 
     def description(self) -> dict[str, Any]:
         """Metadata for `restore`, beside the tensors."""
@@ -279,12 +231,10 @@ class NextState(StateMap):
         return position, velocity
 
     @override
-    def decode(
-        self, inputs: torch.Tensor, hidden: torch.Tensor | None = None
-    ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-        """Positions [m] and velocities [m/s], (S, N, 3) each, and the next hidden state; see `StateMap.decode`."""
-        (displacement, velocity), hidden = super().decode(inputs, hidden)
-        return [self.rest + displacement, velocity], hidden
+    def decode(self, inputs: torch.Tensor) -> list[torch.Tensor]:
+        """Positions [m] and velocities [m/s], (S, N, 3) each; see `StateMap.decode`."""
+        displacement, velocity = super().decode(inputs)
+        return [self.rest + displacement, velocity]
 
 
 Model = TypeVar("Model", bound=StateMap)

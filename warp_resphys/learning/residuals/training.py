@@ -4,7 +4,7 @@ import copy
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -31,7 +31,6 @@ class Samples:
     v: torch.Tensor  # (S, N, 3) velocities [m/s]
     outputs: tuple[torch.Tensor, ...]  # fields to predict, (S, N, 3) each
     actuation: torch.Tensor | None = None  # (S, A) further inputs of the network; None without any
-    lengths: tuple[int, ...] = ()  # of the time series that the samples consist of, one after the other
 
     @classmethod
     def joined(cls, parts: "Sequence[Samples]") -> "Samples":
@@ -42,7 +41,6 @@ class Samples:
             v=torch.cat([part.v for part in parts]),
             outputs=tuple(map(torch.cat, zip(*(part.outputs for part in parts), strict=True))),
             actuation=torch.cat(actuation) if actuation else None,
-            lengths=tuple(length for part in parts for length in part.lengths),
         )
 
 
@@ -222,40 +220,30 @@ class Trainer(EpochTrainer[Model]):
         rate = self.learning_rate(self.epoch)
         self._adam.param_groups[0]["lr"] = rate
         self.model.train()
-        total, count = torch.zeros((), device=self.model.rest.device), 0.0
-        for loss, weight in self._batches():
+        inputs, outputs = self._train
+        total = torch.zeros((), device=inputs.device)
+        order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
+        for batch in order.split(self.settings.batch_size):
+            loss = self._loss(self._noisy(inputs[batch]), outputs[batch])
             self._adam.zero_grad()
             loss.backward()
             self._adam.step()
-            total += loss.detach() * weight
-            count += weight
+            total += loss.detach() * len(batch)
         self.model.eval()
         unit = float(self.model.remainder) ** 2
         with torch.no_grad():
-            validation = float(self._validate()) * unit
-        return {"train_loss": float(total) / count * unit, "validation_loss": validation, "learning_rate": rate}
-
-    def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
-        """Yields the mean loss and the number of samples of every batch in one epoch."""
-        inputs, outputs = self._train
-        order = torch.randperm(len(inputs), generator=self._random).to(inputs.device)
-        for batch in order.split(self.settings.batch_size):
-            predicted, _ = self.model.standardised(self._noisy(inputs[batch]))
-            yield self._squares(predicted, outputs[batch]).mean(), len(batch)
-
-    def _validate(self) -> torch.Tensor:
-        """Mean validation loss."""
-        inputs, outputs = self._validation
-        return self._squares(self.model.standardised(inputs)[0], outputs).mean()
+            validation = float(self._loss(*self._validation)) * unit
+        return {"train_loss": float(total) / len(inputs) * unit, "validation_loss": validation, "learning_rate": rate}
 
     def _noisy(self, inputs: torch.Tensor) -> torch.Tensor:
         if not self.settings.noise > 0.0:
             return inputs
         return inputs + self.settings.noise * torch.randn(inputs.shape, generator=self._random).to(inputs.device)
 
-    def _squares(self, predicted: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
-        """Weighted squared errors of the standardised outputs, relative to the remainder of the linear part."""
-        return (self._weights * (predicted - outputs) / self.model.remainder).square()
+    def _loss(self, inputs: torch.Tensor, outputs: torch.Tensor) -> torch.Tensor:
+        """Mean weighted squared error of the standardised outputs, relative to the remainder of the linear part."""
+        error = self.model.standardised(inputs) - outputs
+        return (self._weights * error / self.model.remainder).square().mean()
 
     @override
     def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
@@ -266,59 +254,6 @@ class Trainer(EpochTrainer[Model]):
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
         self._random.set_state(tensors["random"])
-
-
-class SequenceTrainer(Trainer[Model]):
-    """Trainer of a recurrent model, by truncated backpropagation through time.
-
-    All trials are a batch of series, in spans of ``sequence`` steps. The hidden state is passed from one span to the
-    next, without its gradient.
-    """
-
-    def __init__(self, model: Model, train: Samples, validation: Samples, *settings: Any) -> None:
-        super().__init__(model, train, validation, *settings)
-        self._train_series = _padded(*self._train, train.lengths)
-        self._validation_series = _padded(*self._validation, validation.lengths)
-
-    @override
-    def _batches(self) -> Iterator[tuple[torch.Tensor, float]]:
-        inputs, outputs, inside = self._train_series
-        hidden = None
-        assert self.settings.sequence is not None
-        for span in torch.arange(len(inputs)).split(self.settings.sequence):
-            count = float(inside[span].sum())
-            loss, hidden = self._series_loss(self._noisy(inputs[span]), outputs[span], inside[span], hidden, count)
-            yield loss, count
-            hidden = hidden.detach()
-
-    def _series_loss(
-        self,
-        inputs: torch.Tensor,
-        outputs: torch.Tensor,
-        inside: torch.Tensor,
-        hidden: torch.Tensor | None,
-        count: float,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Summed loss of (L, R, .) steps inside (L, R) of their trial over a count, and the last hidden state."""
-        total = inputs.new_zeros(())
-        for x, y, valid in zip(inputs, outputs, inside, strict=True):
-            predicted, hidden = self.model.standardised(x, hidden)
-            total = total + torch.where(valid, self._squares(predicted, y).mean(1), 0.0).sum()
-        assert hidden is not None
-        return total / max(count, 1.0), hidden
-
-    @override
-    def _validate(self) -> torch.Tensor:
-        return self._series_loss(*self._validation_series, None, float(self._validation_series[2].sum()))[0]
-
-
-def _padded(
-    inputs: torch.Tensor, outputs: torch.Tensor, lengths: Sequence[int]
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Inputs and outputs (K, R, .) of R series, padded to one length, and whether a step is valid (K, R)."""
-    parts = [torch.nn.utils.rnn.pad_sequence(list(x.split(list(lengths)))) for x in (inputs, outputs)]
-    ends = torch.tensor(lengths, device=inputs.device)
-    return parts[0], parts[1], torch.arange(len(parts[0]), device=inputs.device)[:, None] < ends
 
 
 def scale_weights(model: StateMap, exponent: float) -> torch.Tensor:

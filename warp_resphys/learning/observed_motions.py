@@ -221,6 +221,13 @@ class ObservedMotions(Brief):
         replays = [self.replay(simulator, batch, identified) for batch in batches]
         return [(replay, self.start(replay, identified)) for replay in replays]
 
+    def learned(self, replay: Replay) -> Replay:
+        """Returns a replay of the frames that are learned from."""
+        if self.train_fraction == 1.0 or replay.is_static:
+            return replay
+        seconds = self.train_fraction * float(replay.trials.times.max())
+        return replay.changed(trials=replay.trials.first(seconds))
+
     def targets(self, replay: Replay, start: Start) -> torch.Tensor:
         """(R, K + 1, M, 3) target positions at a simulator's steps [m], NaN where a marker was not seen.
 

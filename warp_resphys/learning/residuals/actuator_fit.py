@@ -188,8 +188,12 @@ class ActuatorFitting:
         return HeldOutRollouts(counting, self.motions, names, identified).errors(None)
 
     def _loss(self, names: Sequence[str]) -> MotionLoss:
+        return MotionLoss([TrialGroup(*pair) for pair in self._replays(names)], self.identified.values(self.simulator))
+
+    def _replays(self, names: Sequence[str]) -> list[tuple[Replay, Start]]:
+        """Replays of the frames that are learned from, one for each batch of trials, each with its start."""
         replays = self.motions.replays(self.simulator, names, self.identified)
-        return MotionLoss([TrialGroup(*pair) for pair in replays], self.identified.values(self.simulator))
+        return [(self.motions.learned(replay), start) for replay, start in replays]
 
     def _begun(self, names: Sequence[str], settings: ActuatorSettings, seed: int, name: str, rounds: int) -> Actuator:
         """An actuator that is fitted to linearised motions of some trials.
@@ -198,7 +202,7 @@ class ActuatorFitting:
         weights stay as they are.
         """
         values = self.identified.values(self.simulator)
-        replays = self.motions.replays(self.simulator, names, self.identified)
+        replays = self._replays(names)
         felt = [felt_inputs(replay, values, settings.filters) for replay, _ in replays]
         with torch.random.fork_rng():
             torch.manual_seed(seed)

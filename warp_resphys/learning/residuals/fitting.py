@@ -331,7 +331,7 @@ class Fitting:
         rows = [batch.index(name) for name in names if name in batch]
         if not rows:
             return None
-        part, windows = replay.changed(trials=replay.trials.select(rows)), None
+        part, windows = self.motions.learned(replay.changed(trials=replay.trials.select(rows))), None
         if window is not None:
             q, v, *_ = self._states(part.trials.names)
             windows = Windows(q.to(simulator.rest_positions), v.to(simulator.rest_positions), window)

@@ -76,7 +76,7 @@ def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str,
         )
     note = (
         "Mean distance of the markers on data that neither training nor identification used [mm], ± the standard "
-        "deviation over trials. Without physics: the best of a body at rest, interpolation and kernel regression "
+        "deviation over trials. Without physics: the best of a body at rest, interpolation and regression "
         "between the training trials, and a linear model. Less error: the share of the uncorrected error that SysID "
         "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
         f"if there are {LEAST_TRIALS} or more. Coverage: the share of the "

@@ -61,7 +61,7 @@ def test_none_of_the_lines_of_models_that_agree_hides_another():
     figure = paths_of({model: still for model in ("regression", "sysid", "resphys")})
     for axes in figure.axes:
         lines = {line.get_label(): line for line in axes.lines}
-        for label in ("Kernel regression", "SysID"):  # dashed, over the thicker line of ResPhys
+        for label in ("Regression", "SysID"):  # dashed, over the thicker line of ResPhys
             assert lines[label].get_linestyle() == "--"
             assert lines[label].get_zorder() > lines["ResPhys"].get_zorder()
             assert lines[label].get_linewidth() < lines["ResPhys"].get_linewidth()

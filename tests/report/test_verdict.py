@@ -95,9 +95,9 @@ class TestSentences:
     def test_what_a_regression_or_a_simpler_model_can_do_needs_no_better_one(self):
         errors = {**self.ERRORS, "regression": [1e-3, 1.2e-3, 1.1e-3, 1e-3, 1.3e-3]}
         first, do = sentences(errors)
-        said = "Kernel regression, without physics, has 99.7 % less error than any corrected simulator"
+        said = "Regression, without physics, has 99.7 % less error than any corrected simulator"
         assert first.startswith(said)
-        assert do == "Kernel regression is enough for trials like these; to judge the simulator, test it on others."
+        assert do == "Regression is enough for trials like these; to judge the simulator, test it on others."
         said = sentences({**self.ERRORS, "resphys": [0.5, 0.6, 0.6, 0.5, 0.6]})
         assert said[1] == "Use SysID, which is simpler than ResPhys and not significantly worse."
         wide = {"sysid": [2.0, 0.1, 0.1, 0.1, 0.1], "resphys": [0.2, 0.2, 0.2, 0.2, 0.2]}
@@ -187,13 +187,13 @@ class TestSentences:
         far = {"range": {"resphys": {"first_s": dict.fromkeys(names, 0.0)}}}
         assert sentences(errors, run, **far) == [
             "Beyond the training loads, ResPhys has 80 % less error than anything without physics (on 5 of 5 trials).",
-            "Within them, kernel regression is enough.",
+            "Within them, regression is enough.",
         ]
         table = results_table(metrics_of(errors, scales={"1": {}, "1.5": {"resphys": {"mean": 2.0}}}), run)
         assert table.head == "My robot: mean error of the vertices [mm]"
         assert table.columns == ["weights of the paper", "other loads", "inputs \N{MULTIPLICATION SIGN} 1.5"]
         heads = {row.head: [cell.text for cell in row.cells] for row in table.rows}
-        assert heads["without physics (kernel regression, a body that does not move)"] == ["0.010", "0.500", ""]
+        assert heads["without physics (regression, a body that does not move)"] == ["0.010", "0.500", ""]
         assert heads["+ learned force (ResPhys)"] == ["0.500", "0.100", "2.00"]
         assert [row.mark for row in table.rows if row.mark] == ["best beyond the training"]
 

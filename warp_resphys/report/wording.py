@@ -40,7 +40,7 @@ MODELS: Final[Mapping[str, ComparedModel]] = {
         "Interpolation", "without physics: straight lines between the training trials", "interpolation"
     ),
     "regression": ComparedModel(
-        "Kernel regression", "without physics: ridge regression over the training trials", "kernel regression"
+        "Regression", "without physics: ridge regression over the training trials", "regression"
     ),
     "linear": ComparedModel(
         "Linear model",

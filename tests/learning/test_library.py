@@ -72,6 +72,13 @@ def test_youngs_modulus_is_recovered(robot):
     assert float(evaluate(beam(180e3), motion).mean()) > 1e-4
 
 
+def test_motions_that_inputs_begin_are_identified_together(robot):
+    inputs = pulled(0.05, 0.1)
+    q = robot.rollout(robot.static_equilibrium(batch=2), STEPS, inputs).q
+    motions = ObservedMotions.of(robot, q, inputs=inputs)
+    assert identify(beam(180e3), motions, STIFF).parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
+
+
 def test_a_law_begins_with_the_material_of_the_simulator_where_nothing_was_identified(robot):
     stiff = Bounds(lower=1e5, upper=1e6, prior=Prior(mean=264e3, deviation=50e3))
     motion = let_go(robot, 0.05, known_start=True)

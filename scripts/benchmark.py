@@ -1,8 +1,10 @@
-"""Times the simulator on this machine: medians over repeats that take turns, beside a yardstick of LAPACK.
+r"""Times the simulator on this machine: medians over repeats that take turns, beside a yardstick of LAPACK.
 
     python scripts/benchmark.py step                                 one beam, by solver and Poisson's ratio
     python scripts/benchmark.py batches --device cuda solver.factors=single
     python scripts/benchmark.py step experiment=sopra --materials configured
+    python scripts/benchmark.py batches experiment=sopra_fibres fibres.stiffness=4e3 time_step=0.02 integrator=bdf2 \
+        simulation.poissons_ratio=0.49 --materials configured --batches 1 6 --pressure 6e4
     python scripts/benchmark.py sizes mesh=beam_tetrahedra --linear-solvers sparse pardiso
     python scripts/benchmark.py twin RUN engine=reduced              a twin on the trials of a run
     python scripts/benchmark.py gripper
@@ -92,6 +94,9 @@ def command_line() -> argparse.ArgumentParser:
         part.add_argument("--solvers", nargs="+", choices=SOLVERS, default=solvers)
         part.add_argument("--batches", nargs="+", type=int, default=counts)
         part.add_argument("--steps", type=int, default=60, help="of a roll-out (default: %(default)s)")
+        part.add_argument(
+            "--pressure", type=float, default=steps.PRESSURE, help="of chambers [Pa] (default: %(default)s)"
+        )
         part.add_argument("--floor", action="store_true", help="the body is lifted, and falls on a floor")
     sizes = parts.add_parser("sizes", parents=[shared, body], help="by size of the body and linear solver")
     sizes.set_defaults(measure=steps.measure_sizes)

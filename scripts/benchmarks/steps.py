@@ -1,6 +1,7 @@
 """A step of an experiment's body, forward and backward: by solver, material and batch, or by linear solver and size."""
 
 import argparse
+import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any, Final
@@ -33,17 +34,23 @@ STEPS: Final = "a step of the whole batch"
 _DEFAULTS: Final = ("solver.relative_tolerance=1e-6", "solver.max_iterations=20000")
 _MODULUS: Final = "youngs_modulus"
 _TIP_MASS: Final = 0.1  # [kg]
-_PRESSURE: Final = 2e4  # [Pa]
+PRESSURE: Final = 2e4  # [Pa]
 
 
 def task_of(
-    settings: RunSettings, solver: str, material: str, batch: int, steps: int, straight: bool = False
+    settings: RunSettings,
+    solver: str,
+    material: str,
+    batch: int,
+    steps: int,
+    straight: bool = False,
+    pressure: float = PRESSURE,
 ) -> tuple[Simulator, Callable[[], dict[str, float]]]:
     """Returns the simulator of an experiment's body, and a task, which has run once and compiled kernels.
 
-    The task times a step of the whole batch without gradients (plain), with them, and in the backward pass. The
-    gradient is that of the sum of squares of the last state, with respect to the first state, a force on every vertex
-    at every step, and Young's modulus.
+    The task times a step of the whole batch without gradients (plain; cpu: processor time of all threads), with them,
+    and in the backward pass. The gradient is that of the sum of squares of the last state, with respect to the first
+    state, a force on every vertex at every step, and Young's modulus.
 
     Args:
         settings: of a run.
@@ -52,21 +59,22 @@ def task_of(
         batch: number of environments.
         steps: of a roll-out.
         straight: whether the body starts from its shape at rest.
+        pressure: largest one in chambers [Pa].
     """
     settings = settings.changed(solver=settings.solver.changed(name=solver))
     law = settings.simulation.changed(**MATERIALS[material])
     simulator = build_simulator(settings, law, build_body(settings))
     start, inputs = simulator.rest_state(batch), Inputs()
     if not straight:
-        start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0)
+        start, inputs = loaded(simulator, batch, steps, -1.0 if settings.obstacles else 1.0, pressure)
     parameters = {_MODULUS: simulator.tensor([law.values[_MODULUS]])} if _MODULUS in law.values else {}
     device = start.q.device
 
     def measure(steps: int = steps, inputs: Inputs = inputs) -> dict[str, float]:
-        began = now(device)
+        began, worked = now(device), time.process_time()
         with torch.no_grad():
             path = simulator.rollout(start, steps, inputs, parameters)
-        plain = now(device) - began
+        plain, worked = now(device) - began, time.process_time() - worked
         q, v = (tensor.detach().clone().requires_grad_() for tensor in (start.q, start.v))
         force = q.new_zeros(steps, *q.shape).requires_grad_()
         moduli = {name: value.clone().requires_grad_() for name, value in parameters.items()}
@@ -77,7 +85,7 @@ def task_of(
         began = now(device)
         torch.autograd.grad(loss, [q, v, force, *moduli.values()])
         backward = now(device) - began
-        times = {"plain_ms": plain, "forward_ms": forward, "backward_ms": backward}
+        times = {"plain_ms": plain, "cpu_ms": worked, "forward_ms": forward, "backward_ms": backward}
         speed = {"steps_per_s": batch * steps / plain, **solves(path)}
         return {**{name: 1e3 * seconds / steps for name, seconds in times.items()}, **speed}
 
@@ -85,7 +93,9 @@ def task_of(
     return simulator, measure
 
 
-def loaded(simulator: Simulator, batch: int, steps: int, sign: float = 1.0) -> tuple[State, Inputs]:
+def loaded(
+    simulator: Simulator, batch: int, steps: int, sign: float = 1.0, largest: float = PRESSURE
+) -> tuple[State, Inputs]:
     """Returns start and inputs of a roll-out: let go under a weight or, with chambers, at rest before pressures rise.
 
     The weight hangs at the end that is farthest from the fixed vertices along the body; it is lighter in each further
@@ -96,7 +106,7 @@ def loaded(simulator: Simulator, batch: int, steps: int, sign: float = 1.0) -> t
     if chambers:
         phase = simulator.tensor(np.arange(steps)[:, None, None] / steps)
         shift = simulator.tensor(np.arange(chambers) / chambers) + shares[:, None]
-        pressure = 0.5 * _PRESSURE * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))  # (T, B, n)
+        pressure = 0.5 * largest * (1.0 - torch.cos(2.0 * torch.pi * (phase + shift)))  # (T, B, n)
         return simulator.static_equilibrium(Inputs(pressure=pressure[0])).detach(), Inputs(pressure=pressure)
     rest = simulator.rest_positions
     along = rest[:, int((rest.amax(0) - rest.amin(0)).argmax())]
@@ -118,7 +128,9 @@ def measure_steps(arguments: argparse.Namespace) -> dict[str, Any]:
     device = choose_device(arguments.device)
     settings = run_settings(arguments, *(FLOOR if arguments.floor else ()))
     cases = [*product(arguments.solvers, arguments.materials, arguments.batches or BATCHES[device.type])]
-    simulators, tasks = zip(*(task_of(settings, *case, arguments.steps) for case in cases), strict=True)
+    simulators, tasks = zip(
+        *(task_of(settings, *case, arguments.steps, pressure=arguments.pressure) for case in cases), strict=True
+    )
     measured, yardstick = take_turns("steps", tasks, arguments.repeats)
     steps, parts = Rows(), Rows()
     for (solver, material, batch), simulator, times in zip(cases, simulators, measured, strict=True):

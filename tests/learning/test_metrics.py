@@ -263,6 +263,28 @@ def test_intervals_grow_with_the_uncertainty_of_the_parameters():
     assert 1.0 <= intervals.variance[-1] < 2.0
 
 
+def test_intervals_grow_beyond_the_training_as_the_errors_of_its_largest_trial_do():
+    """A model lacks a tenth of what it moves beyond its training, which calibration within the training cannot show."""
+
+    def moved(size, reach, seed):
+        along = np.linspace(0.0, size, 60)[:, None, None] * np.array([1.0, 0.0, 0.0])
+        x = REST + along + np.zeros((60, 2, 3))
+        off = 0.1 * np.maximum(np.linalg.norm(along, axis=-1, keepdims=True) - reach, 0.0)
+        noise = np.random.default_rng(seed).normal(scale=1e-4, size=x.shape)
+        return Predicted(x, x + off + noise, np.full(60, np.inf))
+
+    within = Intervals.calibrated({str(k): moved(0.010, 1.0, k) for k in range(5)}, REST)
+    growing = within.growing(moved(0.015, 0.010, 5), 0.010, 0.015, REST)
+    tested, inside = {"x": moved(0.030, 0.015, 6)}, {"x": moved(0.012, 1.0, 7)}
+    assert covered(within, tested)["coverage"] < 0.65
+    assert covered(growing, tested)["coverage"] > 0.9
+    assert growing.growth == pytest.approx(6.31 * 0.1, rel=0.1)  # Student's quantile, as it is known from one trial
+    assert covered(growing, inside) == covered(within, inside)
+    assert Intervals.from_plain(growing.plain()) == growing
+    exact = within.growing(moved(0.015, 1.0, 8), 0.010, 0.015, REST)
+    assert exact.growth < 0.5 * growing.growth
+
+
 class TestHeldOut:
     """A model beside the simulator alone, by mean distances of frames [mm]."""
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ..data.rigid_bodies import as_markers
 from ..dynamics.simulator import Simulator
 from ..io.arrays import FloatArray, IntArray
 from ..io.parts import Parts, TrialPart
@@ -23,7 +24,16 @@ from .identification.sensitivity import (
     parameter_spread,
     sensitivities,
 )
-from .intervals import LEVEL, Intervals, IntervalTable, ModelIntervals, coverage, predicted_trials, rest_places
+from .intervals import (
+    LEVEL,
+    Intervals,
+    IntervalTable,
+    ModelIntervals,
+    Predicted,
+    coverage,
+    predicted_trials,
+    rest_places,
+)
 from .observed_motions import ObservedMotions
 from .residuals.correction import Learned
 from .without_physics import without_physics
@@ -79,6 +89,23 @@ class Comparison:
         return [name for group in self.groups.values() for name in group]
 
     @cached_property
+    def _largest(self) -> list[str]:
+        """Training trials, those with larger displacements first."""
+        sizes = amplitudes(self.motions.trials, self.train)
+        return sorted(sizes, key=sizes.__getitem__, reverse=True)
+
+    @property
+    def _calibrating(self) -> list[str]:
+        """Names of the trials of the calibration, and of the training trial with the largest displacement."""
+        return [*dict.fromkeys([*self.calibration, *self._largest[: 1 if self.calibration else 0]])]
+
+    def _reach(self, names: Sequence[str]) -> float:
+        """Largest observed displacement of some trials [m]."""
+        trials = self.motions.trials
+        moved = as_markers(trials.observed[trials.rows(names)], trials.labels) - rest_places(trials)
+        return float(np.nanmax(np.linalg.norm(moved, axis=-1)))
+
+    @cached_property
     def filmed(self) -> str:
         """Name of the tested trial with the largest motion, whose vertices are kept."""
         sizes = amplitudes(self.motions.trials, self.groups["1"])
@@ -102,7 +129,7 @@ class Comparison:
 
         tested = {model: cut(model, self.names, "") for model in self.models}
         with_intervals = [name for name, model in self.models.items() if model.has_intervals]
-        calibrating = {model: cut(model, self.calibration, "calibration_") for model in with_intervals}
+        calibrating = {model: cut(model, self._calibrating, "calibration_") for model in with_intervals}
         self.parts.run([*chain(*tested.values(), *calibrating.values())])
         return tested, calibrating
 
@@ -207,11 +234,12 @@ class Comparison:
     def _intervals(self) -> IntervalTable:
         """Prediction intervals by model and their coverage of the tested trials, see `intervals`.
 
-        Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`). The
+        Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`), so
+        that the one with the largest displacement shows how errors grow beyond the training of the others. The
         intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
         """
         motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
-        names = [*chain(*trials.batches(self.calibration))]
+        names = [*chain(*trials.batches(self._calibrating))]
         observed, target = trials.observed[trials.rows(names)], counted(motions, self.train, test, self._first_frames)
         rest = rest_places(trials)
         learned = [row for row, name in enumerate(names) if name in self.train]
@@ -227,15 +255,30 @@ class Comparison:
         spreads, models = self._spreads(names, linear, left_out=True), dict[str, ModelIntervals]()
         for model in (model for model in simulated if model in self.simulated):
             predicted = predicted_trials(trials, names, simulated[model], observed, spreads.get(model))
-            if (intervals := Intervals.calibrated(predicted, rest)) is None:
+            known = {name: replace(trial, spread=None) for name, trial in predicted.items()}
+            if (intervals := self._calibrated(predicted, model in changes)) is None:
                 continue
             new = self.simulated[model][: len(test)]
             tested = predicted_trials(trials, test, new, target, self.spreads.get(model))
             covered = coverage({name: intervals.covered(trial, rest) for name, trial in tested.items()})
             models[model] = {**intervals.plain(), **covered}
-            alone = Intervals.calibrated({name: replace(trial, spread=None) for name, trial in predicted.items()}, rest)
-            if model in self.spreads and alone is not None:
+            if model in self.spreads and (alone := self._calibrated(known, True)) is not None:
                 models[model]["without_spread"] = alone.plain()
         without = any(change is not None for change in changes.values())
-        split = "left_out" if without else "training" if learned else "validation"
+        trained = not {*self.calibration}.isdisjoint(self.train)
+        split = ("left_out" if without else "training") if trained else "validation"
         return {"level": LEVEL, "calibrated_on": split, "models": models}
+
+    def _calibrated(self, predicted: Mapping[str, Predicted], identified: bool) -> Intervals | None:
+        """Calibrates intervals, which grow beyond the training if the model's parameters are identified.
+
+        Args:
+            predicted: trials of `_calibrating` that the model predicted without them, by name.
+            identified: whether its parameters are identified.
+        """
+        rest, largest = rest_places(self.motions.trials), self._largest
+        intervals = Intervals.calibrated({name: predicted[name] for name in self.calibration}, rest)
+        if intervals is None or not identified or len(largest) < 2:
+            return intervals
+        before, reach = self._reach(largest[1:]), self._reach([*{*self.train, *self.calibration}])
+        return intervals.growing(predicted[largest[0]], before, reach, rest)

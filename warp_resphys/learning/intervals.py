@@ -9,15 +9,21 @@ The half-width of a marker's coordinates is a quantile times a scale, the deviat
 variance has a constant part and parts that grow with the square of the marker's displacement: one just after a change
 of the inputs, one soon after it, and one long after it; and, if it is known, the variance due to the posterior of the
 parameters, which grows outside of the training. The sizes of the parts are those of the largest likelihood.
+
+Beyond the largest displacement of the training and calibration, half-widths also grow with the excess, as the errors of
+the training trial with the largest displacement did, for a model identified without it. As this is a single trial, the
+growth is Student's quantile with one degree of freedom times the root mean square.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, TypedDict
+from dataclasses import dataclass, replace
+from typing import Final, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
+from scipy.stats import t as student
 
 from ..data.driving import since_change
 from ..data.rigid_bodies import as_markers
@@ -38,6 +44,8 @@ class PlainIntervals(TypedDict):
 
     factor: list[float]
     variance: list[float]
+    reach: NotRequired[float]
+    growth: NotRequired[float]
 
 
 class ModelIntervals(TypedDict, total=False):
@@ -45,6 +53,8 @@ class ModelIntervals(TypedDict, total=False):
 
     factor: list[float]
     variance: list[float]
+    reach: float
+    growth: float
     coverage: float  # share of the coordinates inside their interval
     half_width_mm: float  # mean
     by_trial: dict[str, float]  # coverage
@@ -102,10 +112,14 @@ class Intervals:
         factor: (M,) half-width over the scale.
         variance: constant part of the squared scale [m^2]; its parts over the squared displacement: just after, soon
             after and long after a change of the inputs; and its part over the variance due to the parameters.
+        reach: largest displacement of training and calibration [m].
+        growth: of the half-width per displacement beyond it.
     """
 
     factor: tuple[float, ...]
     variance: tuple[float, ...]
+    reach: float = 0.0
+    growth: float = 0.0
 
     @classmethod
     def calibrated(
@@ -161,16 +175,44 @@ class Intervals:
         if since is None:
             variance[1:4] = variance[1:4].max()
         times = np.zeros(moved.shape[:-1]) if since is None else np.asarray(since)
-        return np.asarray(np.sqrt(_parts(moved, times, spread) @ variance) * np.array(self.factor))
+        within = np.sqrt(_parts(moved, times, spread) @ variance) * np.array(self.factor)
+        return np.asarray(np.hypot(within, self.growth * np.maximum(moved - self.reach, 0.0)))
+
+    def growing(
+        self, beyond: Predicted, before: float, reach: float, rest: FloatArray, level: float = LEVEL
+    ) -> "Intervals":
+        """Returns intervals that grow beyond their reach as the errors of a trial did, if it has any excess.
+
+        Args:
+            beyond: the training trial with the largest displacement, predicted by a model identified without it.
+            before: largest displacement of that model's training [m].
+            reach: largest displacement of training and calibration [m].
+            rest: (M, 3) [m].
+            level: wanted coverage, a share of the coordinates.
+        """
+        moved = np.linalg.norm(beyond.simulated - rest, axis=-1)
+        excess = np.where(beyond.seen, np.maximum(moved - before, 0.0), 0.0)
+        total = float(np.square(excess).sum())
+        errors = float(np.square(beyond.errors[excess > 0.0]).mean(-1).sum())
+        growth = math.sqrt(errors / total) * float(student.ppf(0.5 + 0.5 * level, 1)) if total > 0.0 else 0.0
+        return replace(self, reach=reach, growth=growth)
 
     def plain(self) -> PlainIntervals:
         """Returns the intervals as JSON data."""
-        return {"factor": list(self.factor), "variance": list(self.variance)}
+        return {
+            "factor": list(self.factor),
+            "variance": list(self.variance),
+            "reach": self.reach,
+            "growth": self.growth,
+        }
 
     @classmethod
     def from_plain(cls, plain: PlainIntervals | ModelIntervals | None) -> "Intervals | None":
         """Returns the intervals that `plain` wrote; None without any, as in summaries of folds."""
-        return cls(tuple(plain["factor"]), tuple(plain["variance"])) if plain and "variance" in plain else None
+        if not plain or "variance" not in plain:
+            return None
+        beyond = plain.get("reach", 0.0), plain.get("growth", 0.0)  # earlier versions had none
+        return cls(tuple(plain["factor"]), tuple(plain["variance"]), *beyond)
 
     def covered(self, trial: Predicted, rest: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Measures a trial that was not used for calibration.

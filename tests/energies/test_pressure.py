@@ -14,7 +14,7 @@ from warp_resphys import Body, Corotated, Fibres, Inputs, Pressure, Simulator, S
 from warp_resphys.energies.base import PlacedEnergy
 from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.io.errors import InputError, MeshError
-from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers
+from warp_resphys.mesh.chambers import Chamber, check_chambers, find_chambers, outer_surface
 from warp_resphys.studies.gradient_check import central_difference, check_gradients
 
 SOFT = Corotated(100e3, 0.45, density=1070.0, mass_damping=0.5, stiffness_damping=2e-3)
@@ -112,6 +112,20 @@ def test_fibres_run_around_the_chamber_and_spare_its_ends(kind):
     (points,) = Fibres(find_chambers(mesh, (1.0, 0.0, 0.0))[:1]).points(mesh)
     sides = 2 * (0.01 + 0.02 / 3) * 0.02  # the chamber reaches 2 cm along x
     assert points.weights.sum() == pytest.approx(sides, rel=1e-12)
+    for stretch, expected in (((1.0, 1.1, 1.1), 1.1), ((1.1, 1.0, 1.0), 1.0)):
+        x = mesh.vertices * np.array(stretch)
+        fibre = np.einsum("cki,cqk->cqi", x[points.nodes], points.gradients[..., 0])
+        lengths = np.linalg.norm(fibre, axis=-1).ravel()[points.weights > 0.0]
+        np.testing.assert_allclose(lengths, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fibres_around_the_outside_are_in_its_sides_alone(kind):
+    """Neither in the faces at its ends nor in those of the chambers; a stretch along the body does not stretch them."""
+    mesh = hollow_box(kind)
+    (points,) = Fibres([outer_surface(mesh, (1.0, 0.0, 0.0))], axis=(1.0, 0.0, 0.0)).points(mesh)
+    size = np.ptp(mesh.vertices, axis=0)
+    assert points.weights.sum() == pytest.approx(2.0 * size[0] * (size[1] + size[2]), rel=1e-12)
     for stretch, expected in (((1.0, 1.1, 1.1), 1.1), ((1.1, 1.0, 1.0), 1.0)):
         x = mesh.vertices * np.array(stretch)
         fibre = np.einsum("cki,cqk->cqi", x[points.nodes], points.gradients[..., 0])

@@ -13,10 +13,11 @@ from support.refusals import refuses
 from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh.arm import mesh_arm, section_of
-from warp_resphys.mesh.arm_section import SOLID, section_grids, section_quadrilaterals
-from warp_resphys.mesh.chambers import check_chambers, find_chambers
+from warp_resphys.mesh.arm_section import SOLID
+from warp_resphys.mesh.chambers import check_chambers, find_chambers, outer_surface
 from warp_resphys.mesh.quality import cell_volumes, scaled_jacobian
 from warp_resphys.mesh.readers import read_mesh, read_surfaces
+from warp_resphys.mesh.section_grids import section_grids, section_quadrilaterals
 from warp_resphys.mesh.volume_mesh import boundary_faces, check_mesh, face_triangles
 from warp_resphys.settings.mesh import ArmMesh
 
@@ -29,6 +30,7 @@ SHAPES = [
     ("disc", "round", 3),
     ("sector", "round", 3),
     ("sector", "round", 6),
+    ("wedge", "round", 4),
 ]
 
 
@@ -102,7 +104,7 @@ def test_quadrilaterals_fill_the_solid_and_each_chamber_once(profile, outline, c
     grids, chambers = section_grids(section, divisions)
     places, quads = section_quadrilaterals(grids)
     points = np.concatenate([grid.ravel() for grid in grids])[places]
-    areas = [area(points[corners]) for corners in quads]
+    areas = [area(points[corners[:, [0, 1, 1, 0], [0, 0, 1, 1]]]) for corners in quads]
     assert min(own.min() for own in areas) > 0.0
     for chamber in range(section.count):
         own = sum(part.sum() for part, number in zip(areas, chambers, strict=True) if number == chamber)
@@ -127,6 +129,33 @@ def test_walls_and_webs_are_as_thick_as_asked(profile, outline, count, size):
         assert across.min() == pytest.approx(0.5 * 0.0025, abs=1e-9)  # the middle of the web is at 0
     wall = mesh.vertices[:, 0].max() - mesh.vertices[first, 0].max()
     assert wall == pytest.approx(0.003, abs=1e-3 if size > 0.005 else 1e-4)
+
+
+WALLS = ArmMesh(
+    **{"chamber_lengths": (0.08,), "caps": (0.01, 0.01), "radii": (0.022, 0.022), "outline": "round", "chambers": 4},
+    **{"profile": "wedge", "wall": 0.002, "web": 0.002, "core": 0.009, "bore": 0.007, "layers": 0.03},
+)
+
+
+@pytest.mark.parametrize("nodes", [8, 20, 27])
+def test_a_bore_and_flat_inner_walls(nodes):
+    """The silicone between a circle and a square hole, less four wedges between webs, with single quadratic cells."""
+    mesh, surfaces = mesh_arm(WALLS.changed(nodes=nodes))
+    check_mesh(mesh)
+    half = pi / 4 - np.arcsin(0.001 / 0.020)
+    corner = np.array([0.009, 0.009 - 0.001 * np.sqrt(2.0)])
+    end = 0.020 * np.array([np.cos(half), np.sin(half)])
+    wedge = 0.020**2 * half + (corner[0] * end[1] - corner[1] * end[0]) * -1.0 - corner[0] * corner[1]
+    solid = 0.1 * (pi * 0.022**2 - 4.0 * 0.007**2) - 4.0 * 0.08 * wedge
+    if nodes == 27:  # the nodes lie on the curves
+        assert cell_volumes(mesh).sum() == pytest.approx(solid, rel=2e-3)
+    else:
+        assert cell_volumes(mesh).sum() == pytest.approx(solid, rel=5e-3)
+    outside = outer_surface(mesh)
+    assert len(outside.faces) == len(surfaces["outside"]) // 2  # the other half bounds the bore
+    radii = np.linalg.norm(mesh.vertices[np.unique(outside.faces), :2], axis=1)
+    assert radii.min() == pytest.approx(0.022, rel=1e-9 if nodes > 8 else 0.06)
+    assert [len(chamber.faces) for chamber in find_chambers(mesh)] == [len(surfaces["chamber_1"])] * 4
 
 
 @pytest.mark.parametrize("cells", ["hexahedra", "tetrahedra"])
@@ -185,6 +214,11 @@ def test_without_gmsh_one_sentence(monkeypatch):
         ({"cells": "bricks"}, "cells is 'bricks'"),
         ({"layers": -1.0}, "layers is -1.0"),
         ({"layers": 0.1, "cells": "tetrahedra"}, "layers is for hexahedra"),
+        ({"nodes": 20, "cells": "tetrahedra"}, "nodes and bore are for hexahedra"),
+        ({"profile": "wedge"}, "outline is lobed, which does not go with wedges"),
+        ({"bore": 0.005}, "bore is set, but profile is half_disc"),
+        ({"profile": "wedge", "outline": "round", "bore": 0.02}, "a bore of 20 mm does not fit"),
+        ({"profile": "wedge", "outline": "round", "core": 0.02}, "3 chambers do not fit"),
     ],
 )
 def test_measures_that_make_no_arm(changes, message):

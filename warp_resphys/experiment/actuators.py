@@ -17,7 +17,7 @@ from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from ..mesh.chambers import Chamber, find_chambers
+from ..mesh.chambers import Chamber, find_chambers, outer_surface
 from ..mesh.selection import select_cells, vertices_at
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings
@@ -53,7 +53,9 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None
     if settings.fibres is not None:
         if settings.chambers is None:
             raise InputError("fibres is set, but chambers is null: fibres need chambers, so leave them out.")
-        energies.append(Fibres(chambers, axis=settings.chambers.axis, **dict(settings.fibres)))
+        around = chambers if settings.fibres.around == "chambers" else (outer_surface(mesh, settings.chambers.axis),)
+        wound = {key: value for key, value in settings.fibres if key != "around"}
+        energies.append(Fibres(around, axis=settings.chambers.axis, **wound))
     if settings.tendons is not None:
         energies.append(Tendons(**{key: value for key, value in settings.tendons if key != "commanded"}))
     if settings.muscles is not None:

@@ -15,8 +15,10 @@ import numpy as np
 from ..io.arrays import IntArray
 from ..io.errors import MeshError
 from ..settings.mesh import ArmMesh
-from .arm_section import SOLID, ComplexArray, Section, section_grids, section_quadrilaterals
+from .arm_section import SOLID, ComplexArray, Section
 from .chambers import find_chambers
+from .elements import BY_NODES
+from .section_grids import section_grids, section_quadrilaterals
 from .tetrahedra import tetrahedra_by_gmsh
 from .volume_mesh import Mesh, boundary_faces, check_mesh
 
@@ -34,8 +36,8 @@ def stations_of(arm: ArmMesh) -> list[float]:
 
 def section_of(arm: ArmMesh, radius: float) -> Section:
     """Returns the unrotated cross-section with a given outline radius [m]."""
-    core = None if arm.core is None else arm.core * radius / arm.radii[0]
-    return Section(radius, arm.chambers, arm.profile, arm.outline, arm.wall, arm.web, core)
+    core, bore = (None if size is None else size * radius / arm.radii[0] for size in (arm.core, arm.bore))
+    return Section(radius, arm.chambers, arm.profile, arm.outline, arm.wall, arm.web, core, bore)
 
 
 def section_at(arm: ArmMesh, height: float) -> Section:
@@ -93,32 +95,37 @@ def _hexahedra(arm: ArmMesh) -> Mesh:
         )
     size, layer = arm.size, _SLENDER * arm.size if arm.layers is None else arm.layers
     middle = section_of(arm, 0.5 * (arm.radii[0] + arm.radii[-1]))
-    divisions = middle.divisions(size)
+    order = 1 if arm.nodes == 8 else 2
+    divisions = {edge: order * number for edge, number in middle.divisions(size).items()}
     stations = np.array(stations_of(arm))
     counts = np.maximum(1, np.round(-np.diff(stations) / layer).astype(int))
     if len(list(middle.blocks())) * int(counts.sum()) * max(divisions.values()) ** 2 > _MOST_CELLS:
         raise MeshError(
             f"with size {size:g} m, the arm would have more than {_MOST_CELLS} cells: enlarge size or layers."
         )
-    grids, chamber = section_grids(middle, divisions)
-    place, quads = section_quadrilaterals(grids)
+    grids, chamber = section_grids(middle, divisions, order)
+    place, quads = section_quadrilaterals(grids, order)
     solid = np.concatenate([block for block, number in zip(quads, chamber, strict=True) if number == SOLID])
     full = np.concatenate(quads)
     turn = np.exp(1j * pi / 180.0 * (arm.rotations[0] if arm.rotations else 0.0))
     heights = np.concatenate(
-        [[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in zip(stations, stations[1:], counts, strict=False))]
+        [
+            [0.0],
+            *(np.linspace(a, b, order * n + 1)[1:] for a, b, n in zip(stations, stations[1:], counts, strict=False)),
+        ]
     )
     vertices = np.empty((len(heights), len(place), 3))
     for level, height in enumerate(heights):
         section = section_at(arm, float(height))
-        points = turn * np.concatenate([grid.ravel() for grid in section_grids(section, divisions)[0]])[place]
+        points = turn * np.concatenate([grid.ravel() for grid in section_grids(section, divisions, order)[0]])[place]
         vertices[level] = np.stack([points.real, points.imag, np.full(len(points), height)], axis=1)
+    x, y, z = np.round((BY_NODES[arm.nodes].shape.nodes.T + 1.0) / 2.0 * order).astype(np.int64)
     cells = []
-    for level, part in enumerate(np.repeat(np.arange(len(counts)), counts)):
-        upper = len(place) * level + (full if part % 2 == 0 else solid)  # caps and chambers alternate
-        cells.append(np.concatenate([upper + len(place), upper], axis=1))
+    for layer, part in enumerate(np.repeat(np.arange(len(counts)), counts)):
+        quad = full if part % 2 == 0 else solid  # caps and chambers alternate
+        cells.append(len(place) * (order * (layer + 1) - z) + quad[:, x, y])
     used, numbered = np.unique(np.concatenate(cells), return_inverse=True)
-    return Mesh(vertices.reshape(-1, 3)[used], numbered.reshape(-1, 8))
+    return Mesh(vertices.reshape(-1, 3)[used], numbered.reshape(-1, arm.nodes))
 
 
 def tetrahedra(arm: ArmMesh) -> Mesh:

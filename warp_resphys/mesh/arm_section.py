@@ -17,10 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io.arrays import FloatArray, IntArray
+from ..io.arrays import FloatArray
 from ..io.errors import MeshError
 
 ComplexArray = NDArray[np.complex128]
+# arcs of a chamber by profile: first letters of the names of their ends
+_ARCS = {"half_disc": ("A", "AC"), "disc": ("A", "AC", "CM"), "sector": ("A", "CM"), "wedge": ("A",)}
 Edge = tuple[str, str]  # names of the ends, in alphabetical order if used as a key
 Divisions = Mapping[Edge, int]
 Corner = tuple[str, bool, int]  # name, whether it is mirrored at the middle of its chamber, and index of the wedge
@@ -85,10 +87,11 @@ class Section:
     The half wedge counter-clockwise from the middle of chamber 1 is described by named points, and mirrored:
 
         O            the axis
-        M, C, (E)    inner side of the chamber: its middle, its corner, and the end of a sector's straight side
+        M, C, (E)    inner side of the chamber: its middle, its corner, and the end of a straight side along the web
         A0 to Am     outer arc of the chamber, from its last corner (C or E) to its crown
         B0 to Bm     the outline opposite the arc
         W, (U)       middle of the web opposite C (and E)
+        (N, P, Q)    side of the hole along the axis: its middle, the point opposite C, and its corner
         V            middle of the web on the outline; for a lobed outline the same as B0
         Xm, Xc, X1, X2  inside the chamber, next to M, C, A1 and A2, for the caps
     """
@@ -100,6 +103,7 @@ class Section:
     wall: float  # [m]
     web: float  # [m]
     core: float | None = None  # [m]; None: the smallest that the webs allow
+    bore: float | None = None  # [m]; None: no hole along the axis
 
     @property
     def half_angle(self) -> float:
@@ -107,10 +111,15 @@ class Section:
         return pi / self.count
 
     @property
+    def _between_webs(self) -> bool:
+        """Whether a chamber is bounded by an arc about the axis and by straight webs."""
+        return self.profile in ("sector", "wedge")
+
+    @property
     def arc_centre(self) -> float:
         """Distance from the axis to the centre of the chamber's outer arc [m]."""
         reach, s, c = self.radius - self.wall, sin(self.half_angle), cos(self.half_angle)
-        if self.profile == "sector":
+        if self._between_webs:
             return 0.0
         # With centre d and radius a = reach - d, the distance from the middle of the web is d s - a c for the corner of
         # a half disc and d s - a for a disc; it equals half the web.
@@ -136,16 +145,23 @@ class Section:
         """Raises MeshError if the chambers do not fit."""
         where = f"where the arm's radius is {1e3 * self.radius:.4g} mm"
         d, a, s, c = self.arc_centre, self.arc_radius, sin(self.half_angle), cos(self.half_angle)
-        room = a - self.inner_radius if self.profile == "sector" else a
+        corner = self._beside_web(self.inner_radius) if self.profile == "wedge" else self.inner_radius
+        room = a - abs(corner) if self._between_webs else a
         if room < _LEAST_ROOM * self.radius or self.inner_radius <= 0.0:
             raise MeshError(f"{where}, {self.count} chambers do not fit: make the wall, the web or the core thinner.")
         if self.core is not None:
-            gap = 2.0 * {"half_disc": d * s - a * c, "disc": d * s - a, "sector": self.core * s}[self.profile]
+            gaps = {"half_disc": d * s - a * c, "disc": d * s - a, "sector": self.core * s, "wedge": self.core * s}
+            gap = 2.0 * gaps[self.profile]
             if gap < self.web * (1.0 - 1e-9):
                 raise MeshError(
                     f"{where}, a core of {1e3 * self.core:.4g} mm leaves webs of {1e3 * gap:.4g} mm between chambers, "
                     f"less than the {1e3 * self.web:.4g} mm that are asked for: change the core, or set it to null."
                 )
+        if self.bore is not None and not 0.5 * self.web < self.bore * s < self.inner_radius * s:
+            raise MeshError(
+                f"{where}, a bore of {1e3 * self.bore:.4g} mm does not fit between the webs and the chambers, "
+                f"{1e3 * self.inner_radius:.4g} mm from the axis: change the bore or the core."
+            )
         if self.outline == "lobed" and not (d * s < a + self.wall and d * c < abs(self._valley())):
             raise MeshError(
                 f"{where}, the lobes of the outline do not meet: make the wall thicker or the outline round."
@@ -161,12 +177,12 @@ class Section:
     @property
     def rows(self) -> int:
         """Number m of pieces in half of the outer arc."""
-        return 1 if self.profile == "sector" else 2
+        return 1 if self._between_webs else 2
 
     @property
     def inner_side(self) -> tuple[str, ...]:
         """Names of the points on half of the inner side, from its middle."""
-        return ("M", "C", "E") if self.profile == "sector" else ("M", "C")
+        return ("M", "C", "E") if self._between_webs else ("M", "C")
 
     @cached_property
     def points(self) -> Mapping[str, complex]:
@@ -176,6 +192,9 @@ class Section:
         if self.profile == "sector":
             for name, radius in (("C", self.inner_radius), ("E", a)):
                 point[name] = radius * np.exp(1j * (half - asin(0.5 * self.web / radius)))
+        elif self.profile == "wedge":
+            point["C"] = self._beside_web(self.inner_radius)
+            point["E"] = a * np.exp(1j * (half - asin(0.5 * self.web / a)))
         elif self.profile == "half_disc":
             point["C"] = complex(d, a)
         else:  # the point with the thinnest wall towards the valley, or with the thinnest web
@@ -196,7 +215,13 @@ class Section:
             feet[-1] = max(2.0 * feet[-1] - abs(valley), 0.5 * feet[-1])
         for name, foot in zip("WU", feet, strict=False):
             point[name] = foot * along
+        if self.bore is not None:
+            point |= {"N": complex(self.bore), "P": self._beside_web(self.bore), "Q": self.bore / cos(half) * along}
         return point
+
+    def _beside_web(self, x: float) -> complex:
+        """Returns the point of a distance x along the middle of the chamber on the extended side of the web."""
+        return complex(x, x * np.tan(self.half_angle) - 0.5 * self.web / cos(self.half_angle))
 
     @property
     def _outline_centre(self) -> complex:
@@ -209,7 +234,7 @@ class Section:
         centre: complex | None = None
         if letters == "B" or (letters == "BV" and self.outline == "round"):
             centre = self._outline_centre
-        elif letters in {"half_disc": ("A", "AC"), "disc": ("A", "AC", "CM"), "sector": ("A", "CM")}[self.profile]:
+        elif letters in _ARCS[self.profile]:
             centre = complex(self.arc_centre)
         return Piece(self.points[first], self.points[last], centre)
 
@@ -217,10 +242,10 @@ class Section:
         """Returns the displacement of a named point per unit of growth; corners are fixed, or keep the web's width."""
         point, along = self.points[name], complex(np.exp(1j * self.half_angle))
         if name[0] in "AMCE":
-            if self.profile == "sector" and name not in ("M", "A1"):
+            flat = {"half_disc": ("A0", "C", "M"), "wedge": ("C", "M")}.get(self.profile, ())
+            if self._between_webs and name not in ("M", "A1", *flat):
                 return (point / along).real * along
-            corner = self.profile == "half_disc" and name in ("A0", "C", "M")
-            return 0j if corner else point - self.arc_centre
+            return 0j if name in flat else point - self.arc_centre
         if name[0] in "BV":
             return 0j if self.outline == "lobed" and name in ("B0", "V") else point - self._outline_centre
         if name == "W" and self.profile == "disc":  # moves with the opposite corner, as in `points`
@@ -323,7 +348,8 @@ class Section:
         """Yields the blocks that fill the section: four corners, and the index of the chamber or `SOLID`."""
         m, n = self.rows, self.count
         inner, middle = self.inner_side, ("O", "W", "U")
-        solid = [(middle[i], inner[i], inner[i + 1], middle[i + 1]) for i in range(len(inner) - 1)]
+        solid = [("N", "M", "C", "P"), ("P", "C", "W", "Q")] if self.bore is not None else []
+        solid += [(middle[i], inner[i], inner[i + 1], middle[i + 1]) for i in range(len(solid) // 2, len(inner) - 1)]
         solid += [(f"A{i}", f"B{i}", f"B{i + 1}", f"A{i + 1}") for i in range(m)]
         if self.outline == "round":
             solid.append((middle[len(inner) - 1], inner[-1], "B0", "V"))
@@ -336,6 +362,7 @@ class Section:
                 ("Xm", "X2", "X1", "Xc"),
             ],
             "sector": [("M", "A1", "A0", "C")],
+            "wedge": [("M", "A1", "A0", "C")],
         }[self.profile]
         for j in range(n):
             for mirrored in (False, True):
@@ -346,51 +373,6 @@ class Section:
             if self.outline == "lobed":
                 corner, back = inner[-1], middle[len(inner) - 1]
                 yield [(back, False, j), (corner, False, j), ("V", False, j), (corner, True, (j + 1) % n)], SOLID
-
-
-def section_grids(section: Section, divisions: Divisions) -> tuple[list[ComplexArray], list[int]]:
-    """Returns grids of points in the blocks of a section, by transfinite interpolation (Gordon and Hall 1973).
-
-    Returns:
-        For each block: (k + 1, l + 1) points, with the second axis counter-clockwise of the first, and the index of its
-        chamber, from 0, or `SOLID`.
-    """
-    growth = section.growth(divisions)
-    grids, chambers = [], []
-    for corners, chamber in section.blocks():
-        along, across = (
-            np.linspace(0.0, 1.0, divisions[section.edge(corners[a][0], corners[b][0])] + 1)
-            for a, b in ((0, 1), (0, 3))
-        )
-        sides = ((0, 1, along), (3, 2, along), (0, 3, across), (1, 2, across))
-        low, high, left, right = (section.line(corners[i], corners[k], t, growth) for i, k, t in sides)
-        u, v = along[:, None], across[None, :]
-        grid = (1 - v) * low[:, None] + v * high[:, None] + (1 - u) * left[None, :] + u * right[None, :]
-        grid = grid - (1 - u) * ((1 - v) * low[0] + v * high[0]) - u * ((1 - v) * low[-1] + v * high[-1])
-        p, q, r = grid[0, 0], grid[-1, 0], grid[-1, -1]
-        grids.append(grid if ((q - p).conjugate() * (r - p)).imag > 0.0 else grid.T)
-        chambers.append(chamber)
-    return grids, chambers
-
-
-def section_quadrilaterals(grids: Sequence[ComplexArray]) -> tuple[IntArray, list[IntArray]]:
-    """Numbers the points of grids with shared sides, such as those of `section_grids`.
-
-    Returns:
-        Index (S,) of each distinct point among those of all grids, and for each block the points of its quadrilaterals
-        (Q, 4), counter-clockwise.
-    """
-    flat = np.concatenate([grid.ravel() for grid in grids])
-    unit = 1e-7 * np.abs(flat).max()
-    keys = np.floor(np.stack([flat.real, flat.imag], axis=1) / unit + 0.1234567)  # keeps symmetric points off the steps
-    _, place, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    ends = np.cumsum([grid.size for grid in grids])
-    quads = []
-    for grid, index in zip(grids, np.split(number.ravel(), ends[:-1]), strict=True):
-        i = index.reshape(grid.shape)
-        corners = [i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]]
-        quads.append(np.stack(corners, axis=-1).reshape(-1, 4))
-    return place, quads
 
 
 def _fan(a: ComplexArray, b: ComplexArray) -> float:

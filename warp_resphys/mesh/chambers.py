@@ -66,6 +66,19 @@ def find_chambers(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> tuple
     return tuple(Chamber(f"chamber_{number}", inner[i]) for number, i in enumerate(order, start=1))
 
 
+def outer_surface(mesh: Mesh, axis: Sequence[float] = (0.0, 0.0, -1.0)) -> Chamber:
+    """Returns the faces of a body's boundary that look away from its middle line along an axis, as ``outside``."""
+    faces, along = boundary_faces(mesh), np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    inner = [chamber.faces[:, 0] for chamber in find_chambers(mesh, axis)]
+    faces = faces[~np.isin(faces[:, 0], np.concatenate([*inner, faces[:0, 0]]))]
+    shape, (points, _) = face_rule([Chamber("outside", faces)], 2)
+    tangents = np.einsum("fki,qkj->jfqi", mesh.vertices[faces], shape(points)[1]).mean(axis=2)
+    middle = 0.5 * (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0))
+    away = mesh.vertices[faces].mean(axis=1) - middle
+    away -= np.outer(away @ along, along)
+    return Chamber("outside", faces[(np.cross(*tangents) * away).sum(axis=1) > 1e-9 * np.abs(away).max() ** 3])
+
+
 def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.float64]) -> list[int]:
     """Returns the order of surfaces along and about an axis."""
     along = axis / np.linalg.norm(axis)

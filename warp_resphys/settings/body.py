@@ -140,8 +140,9 @@ class ChamberSettings(Settings):
 
 
 class FibreSettings(Settings):
-    """Fibres wound around the chambers."""
+    """Fibres wound around the chambers, or around the body."""
 
+    around: Literal["chambers", "outside"] = setting("chambers", "surface in which they lie")
     angles: Many[float] = setting(description="angles from the circumference, one per family", unit="degrees")
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
     stiffness: NotNegative = setting(description="stiffness of a family, per length", unit="N/m")
@@ -265,7 +266,7 @@ class BodySettings(Settings):
     fixed: Place | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
     symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
     chambers: ChamberSettings | None = setting(None, "chambers under pressure")
-    fibres: FibreSettings | None = setting(None, "fibres around the chambers")
+    fibres: FibreSettings | None = setting(None, "fibres around the chambers, or around the body")
     tendons: TendonSettings | None = setting(None, "tendons that pull")
     muscles: MuscleSettings | None = setting(None, "contractile fibres")
     medium: MediumSettings | None = setting(None, "fluid around the body")

@@ -36,6 +36,7 @@ _TITLES: Final = {  # of stages, by the first word of their names, and of single
     "reconstruct": "Reconstructing the missing forces",
     "reconstruct_resphys_uncorrected": "Reconstructing, uncorrected simulator",
     "train": "Training the force",
+    "train_actuator": "Training the actuator",
     "train_resphys_uncorrected": "Training, uncorrected simulator",
     "train_simfree": "Training a network without a simulator",
     "evaluate": "Simulating the test trials",

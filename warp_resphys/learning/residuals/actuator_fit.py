@@ -44,7 +44,7 @@ from .training import Snapshot, run_epochs
 
 log = logging.getLogger(__name__)
 
-_CHANGE: Final = 1e-3  # of the largest input, by which the derivatives are computed
+_CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are computed
 _SHARES: Final = (1.0, 0.5, 0.25)  # of a round's change of the weights that are tried
 _ITERATIONS: Final = 200  # of L-BFGS on linearised motions
 _FOLDS: Final = 3  # of the training trials, without validation trials
@@ -198,8 +198,8 @@ class ActuatorFitting:
     def _begun(self, names: Sequence[str], settings: ActuatorSettings, seed: int, name: str, rounds: int) -> Actuator:
         """An actuator that is fitted to linearised motions of some trials.
 
-        A round ends at the first share of its change of the weights that makes the motions closer; without one, the
-        weights stay as they are.
+        A round ends at the first share of its change of the weights that makes the motions closer. Without one, and
+        where a motion has no derivatives, the weights stay as they are.
         """
         values = self.identified.values(self.simulator)
         replays = self._replays(names)
@@ -211,11 +211,15 @@ class ActuatorFitting:
         with torch.no_grad():
             least = float(loss(model))
         with Progress(f"{name}: first weights", rounds, "rounds") as progress:
-            for _ in range(rounds):
+            for number in range(rounds):
                 before = copy.deepcopy(model.network.state_dict())
                 best = least + penalty * float(_squares(model).detach())
                 of_batches = zip(replays, felt, strict=True)
-                linearised = [_Linearised.of(*pair, values, model, inputs) for pair, inputs in of_batches]
+                try:
+                    linearised = [_Linearised.of(*pair, values, model, inputs) for pair, inputs in of_batches]
+                except ConvergenceError as error:
+                    log.info("%s: the first weights are those of %d rounds: %s", name, number, error)
+                    break
                 _fit_linearised(linearised, model, penalty)
                 after = copy.deepcopy(model.network.state_dict())
                 for share in _SHARES:

@@ -137,9 +137,6 @@ def test_a_finer_mesh_has_so_many_times_as_many_cells():
     assert finer(file := FileMesh(kind="file", path="a.vtk"), 2.0) == file.changed(order=2)
     shipped = [ShippedArm(kind="arm", name=f"arm_hexahedra_{size}") for size in (500, 1400, 2000)]
     assert [finer(arm, 1.5) for arm in shipped] == [*shipped[1:], shipped[2]]
-    assert [finer(arm, 0.7) for arm in shipped] == [shipped[0], *shipped[:2]]
-    assert finer(box, 0.5) == box.changed(divisions=[3, 1, 1])
-    assert finer(file, 0.5) == file
 
 
 @pytest.mark.slow

@@ -79,31 +79,6 @@ def test_motions_that_inputs_begin_are_identified_together(robot):
     assert identify(beam(180e3), motions, STIFF).parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
 
 
-def test_a_search_begins_with_a_coarse_mesh(robot, tmp_path, monkeypatch):
-    q = robot.rollout(robot.rest_state(), STEPS).q
-    seen, places = torch.stack([MARKERS(positions) for positions in q]), MARKERS(robot.rest_positions[None])[0].numpy()
-    mesh, wrong = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(4, 1, 1)), beam(180e3)
-    stiff = replace(wrong, body=wr.Body(mesh, fixed=wr.select_vertices(mesh, x=0.0)))
-    fine, rough = (
-        ObservedMotions.of(sim, seen, sim.rest_state(), observation=markers)
-        for sim, markers in ((wrong, MARKERS), (stiff, wr.bind_markers(mesh, places, ["a", "b", "c"])))
-    )
-    alone = identify(wrong, fine, STIFF)
-
-    def identified():
-        return identify(wrong, fine, STIFF, coarse=(stiff, rough), kept=tmp_path / "searches")
-
-    found = identified()
-    assert found.parameters["youngs_modulus"] == pytest.approx(264e3, rel=1e-4)
-    assert found.history[0][0]["youngs_modulus"] == pytest.approx(found.coarse["youngs_modulus"])
-    assert 0.7 < found.coarse["youngs_modulus"] / 264e3 < 0.98
-    assert alone.coarse == {}
-    assert found.history[0][0]["loss"] < 0.5 * alone.history[0][0]["loss"]
-    assert found.first_guess == alone.first_guess
-    monkeypatch.setattr(Misfit, "linearise", None)  # No search is needed again.
-    assert identified() == found
-
-
 def test_a_law_begins_with_the_material_of_the_simulator_where_nothing_was_identified(robot):
     stiff = Bounds(lower=1e5, upper=1e6, prior=Prior(mean=264e3, deviation=50e3))
     motion = let_go(robot, 0.05, known_start=True)

@@ -20,7 +20,7 @@ from warp_resphys.report import sections, wording
 from warp_resphys.report.body_motions import instants
 from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, at_times
-from warp_resphys.report.identification_section import coarse_text, parameter_rows, placement_text, uncertainty_text
+from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import Cell, PageTable, Row
 from warp_resphys.report.run_page import range_table
 from warp_resphys.report.wording import MINUS, NO_BREAK_SPACE, NONE
@@ -147,13 +147,6 @@ class TestIdentification:
         said = uncertainty_text("sysid", replace(identified, uncertainty=tied), None)
         assert "the data do not constrain stiffness damping: set a prior." in said
         assert f"do not separate Young's modulus and stiffness damping (correlation {MINUS}0.95)" in said
-
-    def test_where_a_first_search_with_larger_cells_ended(self, identified):
-        said = coarse_text("sysid", replace(identified, coarse={"youngs_modulus": 231e3, "pressure_rise": 0.02}))
-        assert (
-            said == "SysID: a first search, with larger cells, ended at Young's modulus 231 kPa, pressure rise 20 ms."
-        )
-        assert coarse_text("sysid", identified) == ""
 
     @pytest.mark.parametrize(("deviation", "informs"), [(2.5e3, True), (9.9e3, False)])
     def test_what_the_data_add_nothing_to_is_said_to_be_its_prior(self, identified, deviation, informs):

@@ -10,7 +10,6 @@ from functools import lru_cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -53,8 +52,6 @@ from ..settings.mesh import (
 )
 from ..settings.observed import BindingSettings, MarkerSettings, RigidBodySettings
 from .actuators import build_actuators
-
-Meshed = TypeVar("Meshed", bound=BodySettings)
 
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
 _SHARE_OF_MEMORY = 0.8
@@ -144,17 +141,11 @@ def _check_memory(divisions: Sequence[int]) -> None:
         )
 
 
-def remeshed(settings: Meshed, times: float) -> Meshed:
-    """Returns settings with finer meshes of the body and its parts, or with coarser ones, see `finer`."""
-    parts = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in settings.parts.items()}
-    return settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": parts})
-
-
 def finer(settings: MeshSettings, times: float) -> MeshSettings:
     """Refines the group ``mesh`` by a factor: along the edges of a box, along a rod's axis, or everywhere.
 
-    A factor below one makes it coarser. Linear cells of a file become quadratic, and an arm of the package the next
-    finer or coarser one. Cells that are given and cannot be changed stay as they are.
+    Linear cells of a file become quadratic, and an arm of the package the next finer one. Cells that are given and
+    cannot be refined stay as they are.
     """
     match settings:
         case HexahedralBox() | TetrahedralBox():
@@ -167,9 +158,9 @@ def finer(settings: MeshSettings, times: float) -> MeshSettings:
             layers = None if settings.layers is None else settings.layers / times
             return settings.changed(size=settings.size / times, layers=layers)
         case FileMesh():
-            return settings if times < 1.0 else settings.changed(order=2)
+            return settings.changed(order=2)
         case ShippedArm():
-            by_size = sorted(_shipped_arms(), key=lambda name: int(name.rpartition("_")[2]), reverse=times < 1.0)
+            by_size = sorted(_shipped_arms(), key=lambda name: int(name.rpartition("_")[2]))
             return settings.changed(name=dict(pairwise(by_size)).get(settings.name, settings.name))
 
 

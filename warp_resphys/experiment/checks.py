@@ -26,7 +26,7 @@ from ..settings.performed import Trial
 from ..settings.run import RunSettings
 from .ablation import check_ablation
 from .actuators import Drive, drive_of
-from .build import build_body, build_material, build_simulator, remeshed
+from .build import build_body, build_material, build_simulator
 from .laboratory import check_laboratory
 from .recordings.reader import Reader
 from .shapes import check_shape
@@ -141,8 +141,6 @@ def _check_begins(run: RunSettings, data: RecordedData, begins: set[str]) -> Non
 def _check_identification(
     run: RunSettings, identify: IdentifySettings, simulator: Simulator, sessions: Mapping[str, str | None]
 ) -> None:
-    if identify.coarse is not None and remeshed(run, 1.0 / identify.coarse) == run:
-        raise InputError(f"coarse is {identify.coarse:g}, but the mesh has no coarser one: set it to null.")
     if identify.integrator is not None:
         build_simulator(run.changed(integrator=identify.integrator), run.simulation, simulator.body)
     known = [name for name in identifiable_parameters(simulator) if run.payload_at is not None or name != MASS_FACTOR]

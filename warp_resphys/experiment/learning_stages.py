@@ -19,7 +19,7 @@ from ..learning.residuals import reconstruction
 from ..learning.residuals.actuator_fit import ActuatorFitting
 from ..learning.residuals.fitting import Fitting, Snapshot, fit
 from ..settings.stage_keys import StageSettings
-from .build import choose_device, remeshed
+from .build import choose_device
 from .experiment import LAW, MODELS, SIMFREE, Experiment
 from .files import (
     ACTUATOR_FILE,
@@ -50,13 +50,11 @@ def identify(context: StageContext) -> None:
     experiment, found = Experiment(settings, context.run_dir), {}
     kept = {model: context.run_dir / f"identify_{model}_parts.safetensors" for model in ("sysid", "sysid_elastic")}
     names = names if wanted.trials is None else tuple(evenly(names, wanted.trials))
-    coarse = None if wanted.coarse is None else Experiment(remeshed(settings, 1.0 / wanted.coarse), context.run_dir)
     for model, parameters in {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}.items():
         if not parameters:
             continue
-        kind = MODELS[model][0]
         result = identification.identify(
-            *(experiment.simulator(kind), experiment.motions, parameters, wanted.first_guess),
+            *(experiment.simulator(MODELS[model][0]), experiment.motions, parameters, wanted.first_guess),
             names=names,
             held_out=[name for name in settings.split.names if name not in names],
             accuracy=_accuracy(settings, experiment.trials) if model == "sysid" else None,
@@ -66,7 +64,6 @@ def identify(context: StageContext) -> None:
             max_evaluations=wanted.max_evaluations,
             tolerance=wanted.tolerance,
             seed=settings.seed,
-            coarse=None if coarse is None else (coarse.simulator(kind), coarse.motions),
             kept=kept[model],
         )
         counted(experiment.motions, names, settings.split.test, result.first_frames)  # Raises before any training.

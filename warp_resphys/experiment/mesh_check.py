@@ -14,7 +14,7 @@ from ..learning.error_tables import amplitudes
 from ..learning.metrics import marker_errors, summarise
 from ..report.data import MeshCheck
 from ..settings.stage_keys import StageSettings
-from .build import remeshed
+from .build import finer
 from .experiment import Experiment
 from .files import MESH_CHECK
 
@@ -22,13 +22,15 @@ CHECKED_SECONDS, _CHECKED_POSES = 0.5, 3  # that are simulated with a finer mesh
 
 
 def check_mesh(context: StageContext) -> None:
-    """Writes mesh_check.json: change of the simulation of test trials with a finer mesh, see `build.finer`.
+    """Writes mesh_check.json: change of the simulation of test trials with a finer mesh, see `finer`.
 
     The trial with the largest motion is simulated for half a second from where its inputs begin; of poses, a few are.
     The finer mesh uses the parameters that were identified on the original mesh.
     """
     settings: StageSettings = context.settings
-    other = remeshed(settings, settings.mesh_check)
+    times, parts = settings.mesh_check, settings.parts
+    refined = {name: part.model_copy(update={"mesh": finer(part.mesh, times)}) for name, part in parts.items()}
+    other = settings.model_copy(update={"mesh": finer(settings.mesh, times), "parts": refined})
     model = "simulation" if settings.identify is None else "sysid"
     content: MeshCheck = {"model": model}
     try:

@@ -59,7 +59,6 @@ def identification_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks += [table for result in identified.values() if (table := trials_table(result)) is not None]
     texts = (uncertainty_text(name, result, data.settings.identify) for name, result in identified.items())
     uncertain = list(filter(None, texts))
-    uncertain += filter(None, (coarse_text(name, result) for name, result in identified.items()))
     notes = []
     if uncertain:
         notes.append("± is one standard deviation in the Gauss-Newton approximation, for residuals correlated in time.")
@@ -211,12 +210,6 @@ def placement_text(name: str, placed: PlainPlacement, lengths: Mapping[str, floa
         text += f"; {body} is turned by {math.degrees(angle):.1f}° on what carries it"
     text += "."
     return text.replace(" mm", f"{NO_BREAK_SPACE}mm")
-
-
-def coarse_text(name: str, identified: Identification) -> str:
-    """Returns a sentence on where a first search with larger cells ended; empty without one."""
-    ends = [f"{in_sentence(parameter)} {with_unit(parameter, value)}" for parameter, value in identified.coarse.items()]
-    return f"{MODELS[name].name}: a first search, with larger cells, ended at {', '.join(ends)}." if ends else ""
 
 
 def uncertainty_text(name: str, identified: Identification, settings: IdentifySettings | None) -> str:

@@ -147,9 +147,6 @@ class IdentifySettings(Settings):
     candidates: Count = setting(4, "random candidates")
     max_evaluations: Natural = setting(10, "evaluations of the loss and its gradient per start")
     tolerance: Positive = setting(1.0e-3, "relative decrease of the loss below which a search ends")
-    coarse: Annotated[float, Field(gt=1.0, le=4.0)] | None = setting(
-        None, "how many times larger cells are in a first search, whose end is the start of the other; null: without"
-    )
 
     def key_of(self, parameter: str) -> str:
         """Returns the key of the range of a parameter, which may be that of all parts; empty if it has none."""

@@ -8,11 +8,9 @@ fitted with the parameters (`nuisances`).
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import torch
@@ -44,8 +42,6 @@ from .search import Identification, first_points, refined_searches, search_param
 
 log = logging.getLogger(__name__)
 
-_COARSE = 1e-2  # tolerance of a search with a coarse mesh, whose own error is larger
-
 
 @checks_types
 def identify(
@@ -63,7 +59,6 @@ def identify(
     max_evaluations: int = 30,
     tolerance: float = 1e-6,
     seed: int = 0,
-    coarse: tuple[Simulator, ObservedMotions] | None = None,
     kept: str | Path | None = None,
 ) -> Identification:
     """Finds the parameters with which a simulator comes closest to observed motions.
@@ -88,8 +83,6 @@ def identify(
         max_evaluations: of the loss and its gradient, for each start.
         tolerance: relative decrease of the loss below which a search ends.
         seed: of the random candidates.
-        coarse: simulator of the body with larger cells, and its motions, by which the search begins: its end is the
-            start of the other one. None: the search begins with `simulator`.
         kept: file of the finished searches, from which an interrupted identification goes on; it is not used if
             anything that they depend on has changed. None: nothing is kept.
 
@@ -115,28 +108,21 @@ def identify(
     guess = {name: _guess(name, limits, known) for name, limits in bounds.items()}
     seconds = _learned(motions, replays, seconds)
     first_search = (guess, starts, many, seed)
-    searched = (simulator, motions, bounds, trials, accuracy, seconds, first_search, max_evaluations, tolerance, coarse)
-    finished, roughly = Checkpoint(kept, *searched), None
-    if coarse is not None:
-        options: Any = {**numbers, "tolerance": max(tolerance, _COARSE), "seconds": seconds, "seed": seed}
-        search = partial(identify, *coarse, parameters, first_guess, names=trials, accuracy=accuracy, **options)
-        roughly = Identification.from_plain(finished.once("coarse", lambda: asdict(search())))
+    searched = (simulator, motions, bounds, trials, accuracy, seconds, first_search, max_evaluations, tolerance)
 
-    def begin(last: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
-        before = last or roughly
+    def begin(before: Identification | None) -> tuple[Misfit, list[dict[str, float]]]:
         again = replays if before is None else [(replay, motions.start(replay, before)) for replay, _ in replays]
         misfit = _misfit(motions, again, bounds, seconds, accuracy)
-        first = first_search if before is None else ({**before.parameters, **before.of_trials},)
+        first = first_search if before is None else (before.parameters,)
         return misfit, first_points(misfit, *first)
 
     rounds = refined_searches(
-        *(begin, max_evaluations, tolerance, finished, "identify"),
-        starts=1 if roughly else starts,
+        *(begin, max_evaluations, tolerance, Checkpoint(kept, *searched), "identify"),
+        starts=starts,
         labels=motions.labels,
         released=RELEASED in map(motions.trials.begin_of, trials),
     )
     found = _separated(_joined(rounds, guess, accuracy), ranges)
-    found = found if roughly is None else replace(found, coarse=roughly.parameters)
     for some, limits in shown_first:
         found = _with_first_frames(found, simulator, motions, some, limits, max_evaluations)
     return found

@@ -50,7 +50,6 @@ class Identification(Identified):
         uncertainty: of the shared parameters; None if the simulation fails beside the minimum.
         of_trials_deviation: standard deviations of the values of single trials and sessions.
         first_guess: start of the search.
-        coarse: parameters of the search with a coarse mesh, if that began it.
     """
 
     __pydantic_config__: ClassVar = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
@@ -61,7 +60,6 @@ class Identification(Identified):
     uncertainty: Uncertainty | None = None
     of_trials_deviation: Mapping[str, float] = field(default_factory=dict)
     first_guess: Mapping[str, float] = field(default_factory=dict)
-    coarse: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def deviation(self) -> Mapping[str, float]:

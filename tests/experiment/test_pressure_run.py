@@ -245,7 +245,7 @@ def test_a_robot_has_the_learned_actuator_as_evaluated_from_a_file_and_on_anothe
     [
         ["experiment=sopra_extrapolation", "budget=quick"],
         ["experiment=sopra_overpressure", "budget=quick"],
-        ["+in_the_loop=windows", "parallel.batch=null", "range_guard=false", "timing=true"],
+        ["in_the_loop={epochs:5}", "parallel.batch=null", "range_guard=false", "timing=true"],
         ["data.begins=static"],
         ["data.payload_at={z: -0.276, tolerance: 1e-6}", "+laboratory.trials.t000={payload: 0.02, begins: static}"],
     ],

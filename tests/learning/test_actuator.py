@@ -14,6 +14,7 @@ from warp_resphys.data.input_response import InputResponse
 from warp_resphys.io.errors import InputError
 from warp_resphys.learning.observed_motions import Identified
 from warp_resphys.learning.residuals.actuator_fit import ActuatorFitting, felt_inputs
+from warp_resphys.learning.residuals.in_the_loop import InTheLoop
 from warp_resphys.settings.learning import ActuatorSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -156,6 +157,17 @@ def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, 
         whole.actuator["tendon_tension"].parameters(), again.actuator["tendon_tension"].parameters(), strict=True
     ):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+
+
+def test_the_scale_of_the_loss_changes_nothing(simulator, motions):
+    fitting, weights = ActuatorFitting(simulator, motions, MANY), []
+    for scale in (1.0, 2.0**-30):
+        model, loss = fitting._begun(MANY, QUICK, 0, "fit", 0), fitting._loss(MANY)
+        loss._weights = [scale * weight for weight in loss._weights]
+        InTheLoop(model, loss, loss, QUICK.changed(penalty=0.0)).run_epoch()
+        weights.append(torch.cat([weight.detach().flatten() for weight in model.parameters()]))
+    assert weights[0].any()
+    torch.testing.assert_close(*weights)
 
 
 def test_trials_without_inputs_are_refused(simulator):

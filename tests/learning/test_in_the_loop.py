@@ -1,21 +1,17 @@
 """Learning from markers: observations at the steps, errors of roll-outs, and training through the simulator."""
 
-import copy
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from support.swinging_beam import double, simulated
-from warp_resphys import Body, ConvergenceError, Corotated, Inputs, Simulator, State, box_hexahedra, select_vertices
-from warp_resphys.data.markers import WHOLE_STATE, bind_markers
+from warp_resphys import Body, ConvergenceError, Inputs, Simulator, State, box_hexahedra, select_vertices
+from warp_resphys.data.markers import bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.observed_motions import at_steps
-from warp_resphys.learning.replay import Replay
+from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
-from warp_resphys.learning.starts import Start, Windows
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
@@ -25,16 +21,15 @@ TIP = select_vertices(MESH, x=0.1)
 POINTS = np.array([[0.1, 0.015, 0.036], [0.1, -0.006, 0.024]])
 MARKERS = bind_markers(MESH, POINTS, ["a", "b"], kind="rigid", vertices=TIP)
 STEP = 0.01
-MATERIAL = Corotated(264e3, 0.45)
 LOADS = torch.tensor([[0.0], [0.05]], dtype=torch.float64)
 MODES = {"position_modes": 2, "velocity_modes": 2, "force_modes": 2}
 NETWORK = NetworkSettings(**MODES, layers=0, width=8)
 CONFIG = InTheLoopSettings(epochs=4, penalty=1e-3, memory=5)
 
 
-def simulator(**options):
+def simulator():
     body = Body(MESH, select_vertices(MESH, x=0.0))
-    return Simulator(body, time_step=STEP, relative_tolerance=1e-12, **options)
+    return Simulator(body, time_step=STEP, relative_tolerance=1e-12)
 
 
 def motions_of(times, markers, held=None):
@@ -199,71 +194,3 @@ class TestInTheLoop:
         trainer.begin()
         assert trainer.finished
         assert loss.error_mm(trainer.use_best()) == pytest.approx(loss.error_mm(None), rel=1e-9)
-
-    def test_a_trained_force_is_the_first_candidate(self, loss):
-        """Whatever the scale of its loss, which is that of markers at micrometres here."""
-        config = CONFIG.changed(start="steps", penalty=0.0, epochs=3)
-        trained = InTheLoop(network(), loss, loss, CONFIG.changed(epochs=12))
-        model = finish(trained).use_best()
-        before = loss.error_mm(model)
-        whole = finish(InTheLoop(copy.deepcopy(model), loss, loss, config, after=12))
-        history = whole.history
-        assert [record["epoch"] for record in history] == [12, 13, 14, 15]
-        assert history[0]["rollout_error_mm"] == pytest.approx(before, rel=1e-12)
-        losses = [record["train_loss"] for record in history]
-        assert losses == sorted(losses, reverse=True)
-        assert losses[-1] < 0.99 * losses[0] == pytest.approx(0.99 * float(loss(model).detach()), rel=1e-9)
-        assert whole.best_error <= before
-
-
-class TestWindows:
-    WINDOW, STEPS = 3, 7
-
-    def released(self, integrator, material=MATERIAL):
-        """Two trials of the beam under tip loads of which it is released, whose states are known, and their start."""
-        real = simulator(material=material, integrator=integrator)
-        load = torch.zeros(2, len(MESH.vertices), 3, dtype=torch.float64)
-        load[:, TIP] = torch.tensor([[[0.0, 0.0, -0.02]], [[0.0, 0.01, 0.01]]], dtype=torch.float64)
-        result = real.rollout(real.static_equilibrium(Inputs(load)), self.STEPS)
-        q, v = (field.transpose(0, 1).contiguous() for field in (result.q, result.v))
-        times = (STEP * torch.arange(self.STEPS + 1, dtype=torch.float64)).expand(2, -1)
-        trials = TrialBatch(("a", "b"), times, q, q[:, 0], Inputs())
-        start = Start(State(q[:, 0], v[:, 0]), torch.zeros(2, dtype=torch.float64))
-        return real, trials, start, Windows(q, v, self.WINDOW)
-
-    @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
-    def test_windows_of_the_true_motion_are_the_true_motion(self, integrator):
-        """With creep, whose memory goes on from window to window."""
-        creeping = replace(MATERIAL, prony=[(0.5, 0.05)])
-        real, trials, start, windows = self.released(integrator, creeping)
-        again = Replay(real, WHOLE_STATE, trials)(start, windows=windows)[0]
-        torch.testing.assert_close(again, trials.observed, rtol=0.0, atol=1e-9)
-
-    def test_the_loss_has_the_gradient_of_separate_windows(self):
-        """No gradient passes the beginning of a window."""
-        real, trials, start, windows = self.released("implicit_euler")
-        torch.manual_seed(0)
-        model = build_model(
-            ResidualForce,
-            NETWORK,
-            torch.as_tensor(MESH.vertices),
-            windows.q.flatten(0, 1),
-            windows.v.flatten(0, 1),
-            1e-3 * windows.v.flatten(0, 1),
-        ).double()
-        loss = MotionLoss([TrialGroup(Replay(real, WHOLE_STATE, trials), start, windows=windows)], {})
-        loss(model).backward()
-        gradients = [w.grad.clone() for w in model.network.parameters()]
-        for weight in model.network.parameters():
-            weight.grad = None
-        total = 0.0
-        for first in range(0, self.STEPS, self.WINDOW):
-            state = State(windows.q[:, first], windows.v[:, first])
-            for k in range(first, min(first + self.WINDOW, self.STEPS)):
-                state = real.step(state, Inputs(model(state.q, state.v, None)))
-                squares = (state.q - windows.q[:, k + 1]).square().sum((1, 2))
-                total = total + (squares * trials.loss_weight).sum()
-        total.backward()
-        assert float(loss(model).detach()) == pytest.approx(float(total.detach()), rel=1e-9)
-        for weight, gradient in zip(model.network.parameters(), gradients, strict=True):
-            torch.testing.assert_close(weight.grad, gradient, rtol=1e-6, atol=1e-9 * float(gradient.abs().max()))

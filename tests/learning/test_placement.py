@@ -19,8 +19,7 @@ from warp_resphys.learning import Bounds, Prior, search_parameters
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.nuisances import NuisanceFit
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
-from warp_resphys.learning.replay import Replay
-from warp_resphys.learning.starts import Start
+from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.stepping.rotations import twisted
 

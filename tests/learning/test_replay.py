@@ -17,8 +17,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.parameters import tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, begin_inputs, estimate_release, hold, sideways_shapes
-from warp_resphys.learning.replay import Replay
-from warp_resphys.learning.starts import Start
+from warp_resphys.learning.replay import Replay, Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.settings.learning import Bounds

@@ -92,14 +92,12 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
-        looped, loop, trainer = 0.0, training.in_the_loop, training.trainer
+        loop, trainer = training.in_the_loop, training.trainer
         if loop is not None:
-            held_out = loop.start == "zero" and loop.hold_out and not settings.split.validation
-            looped = (loop.epochs + 1) * (_ITERATION * trained + rolled) * (len(train) if held_out else 1)
-            if loop.start == "zero":
-                return looped, 0.0, 0.0
+            held_out = loop.hold_out and not settings.split.validation
+            return (loop.epochs + 1) * (_ITERATION * trained + rolled) * (len(train) if held_out else 1), 0.0, 0.0
         replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
-        return looped + replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
+        return replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
     if stage == "evaluate":
         tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
         return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0

@@ -20,8 +20,8 @@ from ..stepping.rollout import states
 from ..stepping.state import State
 from .metrics import marker_errors, summarise
 from .observed_motions import Identified, ObservedMotions
+from .replay import Start
 from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
-from .starts import Start
 
 POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
 

@@ -29,9 +29,8 @@ from ..stepping.state import State
 from .parameters import split_name
 from .placement import PlacedMarkers, PlainPlacements, placement_of
 from .release import begin_inputs, estimate_release
-from .replay import Replay
+from .replay import Replay, Start
 from .scores import HeldOutTest
-from .starts import Start
 from .trial_batch import TrialBatch
 
 _STANDS_STILL = 1e-9  # m/s, rad/s

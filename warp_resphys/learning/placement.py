@@ -18,8 +18,7 @@ from typing_extensions import TypedDict, override
 from ..data.markers import Markers, Observation
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from .replay import Replay
-from .starts import Start
+from .replay import Replay, Start
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from ..settings.learning import ReleaseSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .replay import Parameters, Replay
-from .starts import Start
+from .replay import Parameters, Replay, Start
 
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration

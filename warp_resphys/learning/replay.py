@@ -8,7 +8,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,13 +19,13 @@ from ..data.input_response import InputResponse, response_of
 from ..data.markers import Observation
 from ..dynamics.linearisation import Linearisation
 from ..dynamics.simulator import Constants, Simulator
+from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
 from .residuals.correction import equilibrium_under_feedback
-from .starts import Start, Windows
 from .trial_batch import TrialBatch
 
 log = logging.getLogger(__name__)
@@ -39,6 +39,42 @@ Record = Callable[[torch.Tensor, torch.Tensor], None]
 _FIRST, _OTHERS = slice(0, 1), slice(1, None)  # sets of parameters
 _AT_ONCE = 16  # positions that are observed together
 _EXACT = 1e-12  # relative tolerance of a solver, small enough for differences of solutions
+
+
+@dataclass(frozen=True)
+class Start(Brief):
+    """Initial conditions of R trials."""
+
+    state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
+    delay: torch.Tensor  # (R,) between time zero of the frames and the release of the body, or of its inputs [s]
+    # (R, M, 3) true less bound marker places, where a body was held bent but registered as undeformed [m]; None for
+    # no shift
+    shift: torch.Tensor | None = None
+    # whether the bodies begin in equilibrium, which is then solved again for every set of parameters
+    at_rest: bool = False
+
+    @classmethod
+    def resting(cls, guess: torch.Tensor) -> "Start":
+        """Starts in equilibrium, which is solved from a first guess (R, N, 3) [m]."""
+        return cls(State(guess, torch.zeros_like(guess)), guess.new_zeros(len(guess)), at_rest=True)
+
+    def near(self, q: torch.Tensor) -> "Start":
+        """The start with another first guess of its equilibrium [m], (R or E R, N, 3) for E sets of parameters."""
+        return replace(self, state=State(q, torch.zeros_like(q)))
+
+    def select(self, indices: list[int]) -> "Start":
+        """The start of the trials with these indices."""
+        pick = torch.as_tensor(indices, device=self.delay.device)
+        shift = None if self.shift is None else self.shift[pick]
+        return replace(self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift)
+
+    def shifted(self, markers: torch.Tensor) -> torch.Tensor:
+        """(..., R, T, M, 3) true marker positions, from those of bound markers [m]."""
+        return markers if self.shift is None else markers + self.shift[:, None]
+
+    def bound(self, markers: torch.Tensor) -> torch.Tensor:
+        """(R, T, M, 3) positions of bound markers, from true marker positions [m]."""
+        return markers if self.shift is None else markers - self.shift[:, None]
 
 
 def exact(simulator: Simulator) -> Simulator:
@@ -178,11 +214,7 @@ class Replay:
         return round(last) if on_steps(times, self.simulator.time_step) else max(math.ceil(last - 1e-6) + 1, 2)
 
     def __call__(
-        self,
-        start: Start,
-        parameters: Parameters | None = None,
-        force: StepForce | None = None,
-        windows: Windows | None = None,
+        self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
     ) -> torch.Tensor:
         """(E, R, T, M, 3) simulated points at the times of the frames [m]; before its release a body stands still.
 
@@ -190,26 +222,20 @@ class Replay:
             start: of the R trials.
             parameters: (E,) values, by any of `parameter_names`; E = 1 if left out.
             force: (B, N, 3) added force [N] of the state and the number of the step.
-            windows: known states to begin anew at, with one set of parameters; None for none.
 
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        series = self.series(start, parameters, force, windows)
+        series = self.series(start, parameters, force)
         return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
 
     def series(
-        self,
-        start: Start,
-        parameters: Parameters | None = None,
-        force: StepForce | None = None,
-        windows: Windows | None = None,
+        self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
     ) -> torch.Tensor:
         """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on; for the arguments, see a call."""
         constants, inputs, resting = self.prepare(parameters)
 
         def step(state: State, k: int) -> State:
-            state = state if windows is None else windows.begin(state, k)
             added = None if force is None else force(state, k)
             return self.simulator.step(state, inputs.at(k).plus(added), constants)
 

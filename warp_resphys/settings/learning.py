@@ -267,17 +267,9 @@ class LoopSettings(EpochSettings):
 
 
 class InTheLoopSettings(LoopSettings):
-    """Training of the residual force on whole trials or windows of them, through the simulator, by L-BFGS."""
+    """Training of the residual force on whole trials, through the simulator, by L-BFGS."""
 
-    start: Literal["zero", "steps"] = setting(
-        "zero", "force from which it begins: none, or one that was trained on reconstructed steps by the group trainer"
-    )
-    window: Natural | None = setting(
-        None, "steps after which the simulation begins anew at the known or reconstructed state; null: whole trials"
-    )
-    hold_out: bool = setting(
-        True, "from zero, without validation trials, hold out each training trial to choose the epochs"
-    )
+    hold_out: bool = setting(True, "without validation trials, hold out each training trial to choose the epochs")
 
 
 class ActuatorSettings(LoopSettings):

@@ -2,8 +2,8 @@
 
 A stepper is a function (state, inputs of a step) -> next state: the ``step`` of a simulator, a corrected simulator, a
 robot, a scene, a reduced model or a world. All that a step depends on is in the state and the inputs, so that a
-roll-out is differentiable, and continues from any of its states. Where a step depends on its number, as with windows
-that begin anew, its inputs are that number.
+roll-out is differentiable, and continues from any of its states. Where a step depends on its number, its inputs are
+that number.
 """
 
 from collections.abc import Callable, Iterable, Iterator

@@ -35,8 +35,7 @@ from ..parameters import (
     value_name,
 )
 from ..placement import Accuracy, PlainPlacements
-from ..replay import Replay
-from ..starts import Start
+from ..replay import Replay, Start
 from .misfit import Misfit
 from .search import Identification, first_points, refined_searches, search_parameters
 

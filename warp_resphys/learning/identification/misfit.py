@@ -29,8 +29,7 @@ from ...stepping.state import State
 from ..metrics import redundancy
 from ..parameters import check_names, split_name
 from ..placement import Accuracy, DisplacedMarkers
-from ..replay import Replay, exact
-from ..starts import Start
+from ..replay import Replay, Start, exact
 from ..trial_batch import TrialBatch
 from .nuisances import NuisanceFit, Nuisances
 from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, uncertainty_of

@@ -16,8 +16,7 @@ import torch
 from ...io.arrays import FloatArray
 from ...stepping.rollout import sample
 from ..placement import Accuracy, Placement, PlainPlacements, by_placement
-from ..replay import Replay
-from ..starts import Start
+from ..replay import Replay, Start
 
 _FURTHEST, _TRIED = 3.0, 61  # largest delay, in expected deviations, and number of delays from which the search begins
 _TURNS, _STEPS = 4, 6  # Gauss-Newton steps of places, as rotations by a few degrees are nearly linear; with delays

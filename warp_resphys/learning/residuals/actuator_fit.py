@@ -35,9 +35,8 @@ from ...stepping.rollout import sample
 from ..evaluation import HeldOutRollouts
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import HUNG
-from ..replay import Replay
+from ..replay import Replay, Start
 from ..scores import HeldOutTest, held_out_test, text_of
-from ..starts import Start
 from .actuator import Actuator
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .training import Snapshot, run_epochs

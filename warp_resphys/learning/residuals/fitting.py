@@ -1,6 +1,6 @@
 """Fits networks to observed motions: residual forces, and next states in place of the simulator.
 
-On single steps of reconstructed trials, or through the simulator on whole motions or windows (`in_the_loop`).
+On single steps of reconstructed trials, or through the simulator on whole motions (`in_the_loop`).
 """
 
 import logging
@@ -21,9 +21,8 @@ from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
 from ..evaluation import HeldOutRollouts
 from ..observed_motions import Identified, ObservedMotions
-from ..replay import Replay
+from ..replay import Replay, Start
 from ..scores import HeldOutTest, held_out_test, text_of
-from ..starts import Start, Windows
 from .correction import Learned, Range, force_frames
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model
@@ -131,7 +130,7 @@ class Fitting:
 
     def _samples(self, names: Sequence[str]) -> Samples:
         """Samples of trials that begin in the same way, with forces in the world frame."""
-        q, v, force, seen = self._states(names, simulated=self.data_driven)
+        q, v, force, seen = self._states(names)
         base, like = self.motions.base(names, self.simulator), self.simulator.rest_positions
         if base is not None:
             pairs = enumerate(zip(q.unbind(1), v.unbind(1), strict=True))
@@ -156,13 +155,13 @@ class Fitting:
             return Samples(*now, (pick(force[:, 1:]),), inputs)
         return Samples(*now, (pick(q[:, 1:]) - like.to(q), pick(v[:, 1:])), inputs)
 
-    def _states(self, names: Sequence[str], simulated: bool = True) -> tuple[torch.Tensor, ...]:
+    def _states(self, names: Sequence[str]) -> tuple[torch.Tensor, ...]:
         """Positions, velocities and forces (R, K + 1, N, 3) of trials, and (R, K) whether steps were seen.
 
-        States are the reconstructed ones; those of the trials themselves, with zero forces, if `simulated` and known.
+        States are the reconstructed ones; for next states, those of the trials themselves, with zero forces, if known.
         """
         trials = self.motions.trials
-        if simulated and trials.velocity is not None:
+        if self.data_driven and trials.velocity is not None:
             rows = trials.rows(names)
             q, v = (torch.as_tensor(field[rows], device=self.device) for field in (trials.observed, trials.velocity))
             return q, v, q.new_zeros(()).expand_as(q), torch.ones(len(q), q.shape[1] - 1, dtype=torch.bool)
@@ -252,17 +251,16 @@ class Fitting:
     def _through_the_simulator(
         self, samples: Samples, settings: TrainingSettings, loop: InTheLoopSettings, name: str
     ) -> Prepared:
-        """Prepares training through the simulator, on whole trials or on windows; whole trials choose the weights.
+        """Prepares training through the simulator, on whole trials.
 
-        The reconstruction provides the modes of motions and forces, the states at which windows begin, and the force to
-        begin with if it is not zero. From zero and without validation trials, the number of epochs is found by
-        cross-validation, holding out each training trial once; it may be zero.
+        The reconstruction provides the modes of motions and forces. Without validation trials, the number of epochs is
+        found by cross-validation, holding out each training trial once; it may be zero.
         """
         parameters, train, validation = self.identified.values(self.simulator), self.train, self.validation
         replays = self.motions.replays(self.simulator, train + validation, self.identified)
 
-        def loss(names: Sequence[str], window: int | None = None) -> MotionLoss:
-            groups = (self._group(*pair, names, parameters, window) for pair in replays)
+        def loss(names: Sequence[str]) -> MotionLoss:
+            groups = (self._group(*pair, names, parameters) for pair in replays)
             return MotionLoss([group for group in groups if group is not None], parameters)
 
         def make_network() -> ResidualForce:
@@ -270,26 +268,16 @@ class Fitting:
             assert isinstance(network, ResidualForce)
             return network.double()
 
-        epochs, after, test = None, 0, None
-        if loop.start == "steps":
-            first, _ = self._on_steps(samples, settings)
-            run_epochs(f"{name}: steps", first)
-            network, after = first.use_best().double().train(), first.best_epoch
-        elif loop.hold_out and not validation and len(train) > 1:
-            parts = [
-                (make_network(), loss([name for name in train if name != out], loop.window), loss([out]))
-                for out in train
-            ]
+        epochs, test = None, None
+        if loop.hold_out and not validation and len(train) > 1:
+            parts = [(make_network(), loss([name for name in train if name != out]), loss([out])) for out in train]
             with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
                 epochs, (below, errors) = cross_validated_epochs(parts, loop, progress.advance)
             sizes = [size for *_, held_out in parts for size in held_out.amplitudes_mm()]
             test = held_out_test(train, HELD_OUT, errors, below, sizes) if settings.trainer.gate else None
             epochs = epochs if test is None or test["used"] else 0
             log.debug("%s: %d epochs are best for held-out trials", name, epochs)
-            network = make_network()
-        else:
-            network = make_network()
-        trainer = InTheLoop(network, loss(train, loop.window), loss(validation or train), loop, epochs, after)
+        trainer = InTheLoop(make_network(), loss(train), loss(validation or train), loop, epochs)
         trainer.begin()
         return trainer, Learned(trainer.model, self._range_of(trainer.model, samples), self.force_frame, test=test)
 
@@ -319,25 +307,17 @@ class Fitting:
         return held_out_test(names, split, errors, below, sizes)
 
     def _group(
-        self,
-        replay: Replay,
-        start: Start,
-        names: Sequence[str],
-        parameters: Mapping[str, torch.Tensor],
-        window: int | None,
+        self, replay: Replay, start: Start, names: Sequence[str], parameters: Mapping[str, torch.Tensor]
     ) -> TrialGroup | None:
-        """The trials of a replay that are among some, with the windows of the loss; None without any."""
+        """The trials of a replay that are among some; None without any."""
         batch, simulator = replay.trials.names, self.simulator
         rows = [batch.index(name) for name in names if name in batch]
         if not rows:
             return None
-        part, windows = self.motions.learned(replay.changed(trials=replay.trials.select(rows))), None
-        if window is not None:
-            q, v, *_ = self._states(part.trials.names)
-            windows = Windows(q.to(simulator.rest_positions), v.to(simulator.rest_positions), window)
+        part = self.motions.learned(replay.changed(trials=replay.trials.select(rows)))
         inputs, base = self.motions.conditions(part, parameters), self.motions.base(part.trials.names, simulator)
         frames = force_frames(simulator, self.force_frame)
-        return TrialGroup(part, start.select(rows), inputs, frames, base, windows)
+        return TrialGroup(part, start.select(rows), inputs, frames, base)
 
 
 def fit(

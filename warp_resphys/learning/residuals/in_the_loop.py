@@ -1,15 +1,14 @@
 """Training of a residual force through the simulator: the loss is the error of the corrected simulator over motions.
 
-Its gradient goes back through the implicit adjoint of every step (Um et al. 2020, "Solver-in-the-Loop"), over whole
-motions or over windows of some steps, which begin at known states (`starts.Windows`).
+Its gradient goes back through the implicit adjoint of every step (Um et al. 2020, "Solver-in-the-Loop").
 
 An epoch is one iteration of L-BFGS with its line search. Adam's first steps move every weight by the learning rate,
 however small the gradient, which spoils a network that is nearly right; and where the loss comes from the simulator, a
 line search costs less than tuning a schedule of rates.
 
 Few recordings determine only part of a residual force. So the force starts from zero, which is the uncorrected
-simulator, and a penalty on the weights keeps it there as far as the motions allow. A force that was trained on
-reconstructed steps may be the start instead. An `Actuator` is trained in the same way.
+simulator, and a penalty on the weights keeps it there as far as the motions allow. An `Actuator` is trained in the same
+way, from weights that are given.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,9 +22,8 @@ from typing_extensions import override
 from ...dynamics.frames import BaseFrame, VertexFrames
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
-from ...settings.learning import InTheLoopSettings, LoopSettings
-from ..replay import Replay
-from ..starts import Start, Windows
+from ...settings.learning import LoopSettings
+from ..replay import Replay, Start
 from .actuator import Actuator
 from .correction import LearnedPredictor
 from .networks import OwnNetwork, ResidualForce
@@ -40,14 +38,13 @@ _LEAST = 1e-30  # of the loss of the first weights, by which others are divided
 
 @dataclass(frozen=True)
 class TrialGroup:
-    """Trials that begin alike, with the arguments of `LearnedPredictor` for them, and the windows of the loss."""
+    """Trials that begin alike, with the arguments of `LearnedPredictor` for them."""
 
     replay: Replay
     start: Start
     context: torch.Tensor | None = None
     frames: VertexFrames | None = None
     base: BaseFrame | None = None
-    windows: Windows | None = None
 
 
 class MotionLoss:
@@ -79,7 +76,7 @@ class MotionLoss:
             replay = group.replay.changed(actuator=model.inputs) if isinstance(model, Actuator) else group.replay
             if isinstance(model, ResidualForce):
                 force = LearnedPredictor(model, group.context, None, group.frames, group.base)
-            simulated = replay(group.start, self._parameters or None, force=force, windows=group.windows)
+            simulated = replay(group.start, self._parameters or None, force=force)
             errors.append(replay.errors(simulated)[0])
         return errors
 
@@ -113,31 +110,23 @@ class MotionLoss:
 class InTheLoop(EpochTrainer[Corrected]):
     """Minimises a `MotionLoss` and a penalty on the squares of the weights, by L-BFGS.
 
-    From zero force, the last layers have no bias: a constant force would compensate how one trial was held, which does
-    not generalise. From a trained force or actuator, the loss is divided by its first value.
+    A force begins at zero, and its last layers have no bias: a constant force would compensate how one trial was held,
+    which does not generalise. An actuator begins at its weights, and the loss is divided by its first value.
 
     Args:
-        model: to train; for a force from zero, its last layers and the mean force are set to zero.
+        model: to train; last layers and mean force of a residual force are set to zero.
         train: loss on the training motions.
         judge: loss whose error selects the weights, those of the start among them.
-        settings: epochs, the penalty on the weights, and where a force starts.
+        settings: epochs and the penalty on the weights.
         epochs: in place of the configured number; 0 keeps the start.
-        after: number of epochs that the model has been trained before, from which epochs are counted.
     """
 
     settings: LoopSettings
 
     def __init__(
-        self,
-        model: Corrected,
-        train: MotionLoss,
-        judge: MotionLoss,
-        settings: LoopSettings,
-        epochs: int | None = None,
-        after: int = 0,
+        self, model: Corrected, train: MotionLoss, judge: MotionLoss, settings: LoopSettings, epochs: int | None = None
     ) -> None:
-        self._from_zero = isinstance(settings, InTheLoopSettings) and settings.start == "zero"
-        if self._from_zero and isinstance(model, ResidualForce):
+        if isinstance(model, ResidualForce):
             with torch.no_grad():
                 _remove_force(model)
         self._train = train
@@ -151,9 +140,8 @@ class InTheLoop(EpochTrainer[Corrected]):
             tolerance_grad=0.0,
             tolerance_change=0.0,
         )
-        last = after + (settings.epochs if epochs is None else epochs)
+        last = settings.epochs if epochs is None else epochs
         super().__init__(model, self._lbfgs, judge.error_mm, settings.model_copy(update={"epochs": last}))
-        self.epoch = after
         self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
 
     def begin(self) -> None:
@@ -174,7 +162,7 @@ class InTheLoop(EpochTrainer[Corrected]):
     @property
     def _unit(self) -> float:
         """Loss by which that of the optimiser is divided."""
-        return 1.0 if self._from_zero else max(self.history[0]["train_loss"], _LEAST)
+        return max(self.history[0]["train_loss"], _LEAST) if isinstance(self.model, Actuator) else 1.0
 
     def _loss(self) -> torch.Tensor:
         squares = [w.square().sum() for w in self.model.network.parameters()]

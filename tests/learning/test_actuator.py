@@ -147,6 +147,21 @@ def test_an_actuator_that_has_nothing_to_learn_is_not_used(simulator):
     assert (found.test["split"], len(found.test["trials"])) == ("left-out training", 3)
 
 
+def test_poses_at_rest_teach_what_acts_in_the_end(simulator):
+    commands = torch.as_tensor(np.random.default_rng(1).uniform(0.0, 1.0, (8, 2)))
+    still = wr.Inputs(tendon_tension=1.1 * commands - 0.4 * commands * commands.flip(-1))
+    seen = MARKERS(simulator.static_equilibrium(still).q).expand(2, -1, -1, -1)
+    given = wr.Inputs(tendon_tension=commands)
+    motions = ObservedMotions.of(simulator, seen, None, given, given, observation=MARKERS)
+    rest = MARKERS(simulator.rest_state(8).q).numpy()
+    trials = replace(motions.trials, begins=("static",) * 8, times=0.0 * motions.trials.times, held=rest)
+    motions = replace(motions, trials=trials)
+    poses = trials.names
+    found = fit_actuator(simulator, motions, train=poses[:6], validation=poses[6:7], settings=QUICK.changed(epochs=0))
+    errors = [evaluate(simulator, motions, names=poses[7:], parameters=one)[0].mean() for one in (None, found)]
+    assert errors[1] < 0.5 * errors[0]
+
+
 def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, motions):
     fitting, kept = ActuatorFitting(simulator, motions, MANY, ("motion 3",)), []
     whole, training = fitting.fit(QUICK, save=kept.append)

@@ -29,8 +29,9 @@ def load(path: str | Path, model: str | None = None, device: str = "cpu", on_fai
 
     Args:
         path: of the run folder, such as ``runs/sopra/default``, of one of its folds, or of the file.
-        model: ``resphys`` (default), the identified simulator with its learned force; ``sysid``, the identified
-            simulator; ``simulation``, the uncorrected one; ``simfree``, a network alone. A file contains one model.
+        model: ``resphys`` (default), the identified simulator with its learned force; ``actuator``, with its learned
+            actuator alone; ``sysid``, the identified simulator; ``simulation``, the uncorrected one; ``simfree``, a
+            network alone. A file contains one model.
         device: of the simulation: ``cpu``, ``cuda`` or ``auto``.
         on_failure: ``raise``, or ``count``, see `Robot`.
 

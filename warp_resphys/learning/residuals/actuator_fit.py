@@ -136,13 +136,12 @@ class ActuatorFitting:
         trainer.begin()
         run_epochs(name, trainer, save)
         found = replace(self.identified, actuator=trainer.use_best().requires_grad_(False).inputs)
-        if test is None:
+        if test is None and settings.gate:
             names, split = self.validation or self.train, "validation" if self.validation else "training"
             errors, below = (self._rolled_out(identified, names) for identified in (found, self.identified))
             test = self._tested(names, split, errors, below)
-        if not settings.gate:
-            test = None
-        elif not test["used"]:
+        test = test if settings.gate else None
+        if test is not None and not test["used"]:
             log.warning("%s: the learned actuator is no clear gain: %s", name, text_of(test))
         error = trainer.best_error if math.isfinite(trainer.best_error) else None
         kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}

@@ -1,6 +1,7 @@
 """A batch is what its environments are one by one, whatever threads share it, and solves on a device those of a CPU."""
 
 import time
+from threading import get_ident
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.materials import Corotated
 from warp_resphys.energies.potential import IncrementalPotential
 from warp_resphys.io.errors import ConvergenceError
-from warp_resphys.linalg.threads import in_threads, shards_of
+from warp_resphys.linalg.threads import in_threads, shards_of, thread_count, threads_for
 from warp_resphys.studies.gradient_check import pose
 
 MESH = box_hexahedra((0.06, 0.02, 0.02), (4, 2, 2))
@@ -126,6 +127,39 @@ def test_shards_are_not_shared_again(monkeypatch):
     inner = in_threads(lambda _: (shards_of(8, torch.device("cpu")), in_threads(lambda n: n, [1, 2])), range(3))
     assert inner == [([], [1, 2])] * 3
     assert len(shards_of(8, torch.device("cpu"))) == 4
+
+
+@pytest.fixture
+def three_torch_threads(monkeypatch):
+    monkeypatch.delenv("WARP_RESPHYS_THREADS", raising=False)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("three_torch_threads")
+def test_a_batch_is_shared_by_as_many_threads_as_torch_has(motion, monkeypatch):
+    """Although torch has a single one while they work."""
+    used, solve = set(), Minimiser.solve
+    monkeypatch.setattr(Minimiser, "solve", lambda *given: used.add(get_ident()) or solve(*given))
+    rolled(motion, slice(None))
+    assert len(used) > 1
+    assert torch.get_num_threads() == thread_count() == 3
+    with threads_for(1):
+        assert torch.get_num_threads() == 1
+        with threads_for(1, shards=2):
+            assert len(simulator().workspace(SIZE).shards) == 3  # also in steps within a reconstruction's
+        assert thread_count() == 3
+    torch.set_num_threads(2)
+    assert thread_count() == 2
+
+
+def test_a_simulator_first_used_within_a_shard_shares_later_batches(monkeypatch):
+    threads(monkeypatch, 2)
+    sim = simulator()
+    assert in_threads(lambda _: len(sim.workspace(SIZE).shards), range(2)) == [0, 0]
+    assert len(sim.workspace(SIZE).shards) == 2
 
 
 @pytest.mark.parametrize(("name", "limit"), [("quasi_newton", 1), ("newton", 2), ("projective_dynamics", 3)])

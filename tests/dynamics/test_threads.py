@@ -51,7 +51,7 @@ def test_threads_have_the_results_of_one(count, energies):
     assert len(set(alone)) == 12
     with ThreadPoolExecutor(count) as pool:
         np.testing.assert_allclose(list(pool.map(lambda number: results(sim, number), range(12))), alone, **CLOSE)
-    assert 1 < len({thread for thread, _ in sim._equations.workspaces}) <= count + 1
+    assert 1 < len({thread for thread, *_ in sim._equations.workspaces}) <= count + 1
 
 
 def test_a_gradient_in_another_thread_does_not_disturb_a_step():

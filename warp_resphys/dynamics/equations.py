@@ -14,7 +14,7 @@ from ..energies.materials import Material
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..io.errors import InputError
-from ..linalg.threads import shards_of
+from ..linalg.threads import is_shared, shards_of
 from ..settings.body import SolverSettings
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
@@ -92,14 +92,14 @@ class EquationsOfMotion:
         self._make_workspace = partial(
             Workspace, placed, body.coordinates, self.fixed, pattern, device=device, dtype=dtype
         )
-        self.workspaces: dict[tuple[int, int], Workspace] = {}  # by thread and batch size
+        self.workspaces: dict[tuple[int, int, bool], Workspace] = {}  # by thread, batch size and `is_shared`
 
     def workspace(self, batch: int) -> Workspace:
         """Returns the calling thread's buffers for a batch size, made at their first use, also in inference mode.
 
         Threads that have ended leave theirs to new ones, whose identifiers are the same.
         """
-        key = get_ident(), batch
+        key = get_ident(), batch, is_shared()
         if key not in self.workspaces:
             with lasting():
                 workspace = self._make_workspace(batch=batch)

@@ -29,8 +29,9 @@ def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
     Threads that spin-wait for microseconds of work cost milliseconds when the cores are busy, and a banded factor gains
     nothing from a second thread.
     """
-    before = torch.get_num_threads()
+    before, outer = torch.get_num_threads(), getattr(_OF_THREAD, "unlimited", None)
     limit_torch = before > 1 and not (unknowns >= _WORTH_SHARING and shards == 1)
+    _OF_THREAD.unlimited = outer or before
     _LIMIT.begin()
     if limit_torch:
         torch.set_num_threads(1)
@@ -39,6 +40,7 @@ def threads_for(unknowns: int, shards: int = 1) -> Iterator[None]:
     finally:
         if limit_torch:
             torch.set_num_threads(before)
+        _OF_THREAD.unlimited = outer
         _LIMIT.end()
 
 
@@ -90,7 +92,7 @@ def shards_of(batch: int, device: torch.device, unknowns: int = 1) -> list[slice
     """
     most = max(1, _IN_CACHE // unknowns)  # environments of a slice
     least = min(most, _LEAST_ENVIRONMENTS)
-    threads = 1 if _is_shared() else thread_count()
+    threads = 1 if is_shared() else thread_count()
     count = max(min(threads, batch // least), -(-batch // most))
     if device.type != "cpu" or count < 2:
         return []
@@ -99,22 +101,25 @@ def shards_of(batch: int, device: torch.device, unknowns: int = 1) -> list[slice
 
 
 def thread_count() -> int:
-    """Returns the number of threads that share a batch: torch's, or ``WARP_RESPHYS_THREADS``.
+    """Returns the number of threads that share a batch: torch's outside `threads_for`, or ``WARP_RESPHYS_THREADS``.
 
     Raises:
         InputError: the environment variable is not a whole number.
     """
-    threads = os.environ.get("WARP_RESPHYS_THREADS", str(torch.get_num_threads()))
+    unlimited = getattr(_OF_THREAD, "unlimited", None) or torch.get_num_threads()
+    threads = os.environ.get("WARP_RESPHYS_THREADS", str(unlimited))
     if not threads.isdecimal():
         raise InputError(f"WARP_RESPHYS_THREADS is {threads!r}: it must be a whole number of threads.")
     return max(1, int(threads))
 
 
-_SHARING = local()  # of each thread: whether it works on one of several shards
+# Of each thread: whether it is `sharing`, at work on one of several shards, and torch's `unlimited` number of threads.
+_OF_THREAD = local()
 
 
-def _is_shared() -> bool:
-    return getattr(_SHARING, "now", False)
+def is_shared() -> bool:
+    """Returns whether this thread works on one of several shards, which are not shared again."""
+    return getattr(_OF_THREAD, "sharing", False)
 
 
 @cache
@@ -139,17 +144,17 @@ def in_threads(work: Callable[[S], T], shards: Sequence[S]) -> list[T]:
     further shards are not shared again.
     """
     threads = min(thread_count(), len(shards))
-    if threads == 1 or _is_shared():
+    if threads == 1 or is_shared():
         return [work(shard) for shard in shards]
     grad_enabled = torch.is_grad_enabled()  # a thread-local setting
 
     def work_on(mine: Sequence[S]) -> list[T]:
-        _SHARING.now = True
+        _OF_THREAD.sharing = True
         try:
             with torch.set_grad_enabled(grad_enabled):
                 return [work(shard) for shard in mine]
         finally:
-            _SHARING.now = False
+            _OF_THREAD.sharing = False
 
     *first, last = (shards[number::threads] for number in range(threads))
     others = [_pool(threads - 1).submit(work_on, mine) for mine in first]

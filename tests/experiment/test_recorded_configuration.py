@@ -128,6 +128,9 @@ def test_folds_and_splits(tmp_path):
     named = {"train": ["bare", "load52"], "validation": [], "test": ["load101"]}
     config["data"] |= {"splits": {"heavier": named}, "split": "heavier"}  # in place of the lists
     assert split_of(parse(RunSettings, config)) == Split(**named)
+    config["data"]["folds"] = "leave_one_out"
+    refuses(InputError, "split and folds exclude each other", check, config)
+    config["data"]["folds"] = None
     named["test"] = ["load102"]
     refuses(InputError, r"data\.splits\.heavier\.test names .*'load102', .* not in data\.trials", check, config)
     config["data"]["split"] = "lighter"

@@ -218,7 +218,9 @@ def test_without_gmsh_one_sentence(monkeypatch):
         ({"profile": "wedge"}, "outline is lobed, which does not go with wedges"),
         ({"bore": 0.005}, "bore is set, but profile is half_disc"),
         ({"profile": "wedge", "outline": "round", "bore": 0.02}, "a bore of 20 mm does not fit"),
+        ({"profile": "wedge", "outline": "round", "core": 0.009, "bore": 0.0085}, "a bore of 8.5 mm does not fit"),
         ({"profile": "wedge", "outline": "round", "core": 0.02}, "3 chambers do not fit"),
+        ({"profile": "wedge", "outline": "round", "chambers": 2}, "chambers is 2, but wedges have flat sides"),
     ],
 )
 def test_measures_that_make_no_arm(changes, message):

@@ -95,11 +95,11 @@ def _hexahedra(arm: ArmMesh) -> Mesh:
         )
     size, layer = arm.size, _SLENDER * arm.size if arm.layers is None else arm.layers
     middle = section_of(arm, 0.5 * (arm.radii[0] + arm.radii[-1]))
-    order = 1 if arm.nodes == 8 else 2
-    divisions = {edge: order * number for edge, number in middle.divisions(size).items()}
+    order, cells_along = 1 if arm.nodes == 8 else 2, middle.divisions(size)
+    divisions = {edge: order * number for edge, number in cells_along.items()}
     stations = np.array(stations_of(arm))
     counts = np.maximum(1, np.round(-np.diff(stations) / layer).astype(int))
-    if len(list(middle.blocks())) * int(counts.sum()) * max(divisions.values()) ** 2 > _MOST_CELLS:
+    if len(list(middle.blocks())) * int(counts.sum()) * max(cells_along.values()) ** 2 > _MOST_CELLS:
         raise MeshError(
             f"with size {size:g} m, the arm would have more than {_MOST_CELLS} cells: enlarge size or layers."
         )

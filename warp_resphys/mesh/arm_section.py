@@ -157,7 +157,7 @@ class Section:
                     f"{where}, a core of {1e3 * self.core:.4g} mm leaves webs of {1e3 * gap:.4g} mm between chambers, "
                     f"less than the {1e3 * self.web:.4g} mm that are asked for: change the core, or set it to null."
                 )
-        if self.bore is not None and not 0.5 * self.web < self.bore * s < self.inner_radius * s:
+        if self.bore is not None and not 0.5 * self.web / s < self.bore < self.inner_radius - 0.5 * self.web * s:
             raise MeshError(
                 f"{where}, a bore of {1e3 * self.bore:.4g} mm does not fit between the webs and the chambers, "
                 f"{1e3 * self.inner_radius:.4g} mm from the axis: change the bore or the core."

@@ -142,7 +142,7 @@ class ChamberSettings(Settings):
 class FibreSettings(Settings):
     """Fibres wound around the chambers, or around the body."""
 
-    around: Literal["chambers", "outside"] = setting("chambers", "surface in which they lie")
+    around: Literal["chambers", "outside"] = setting("chambers", "surface in which they lie; both need chambers")
     angles: Many[float] = setting(description="angles from the circumference, one per family", unit="degrees")
     toe: Positive = setting(1.0e-3, "strain over which fibres become taut")
     stiffness: NotNegative = setting(description="stiffness of a family, per length", unit="N/m")

@@ -176,6 +176,8 @@ class RecordedData(ReadingSettings):
             raise ValueError(
                 f"split is {self.split!r}: choose from {', '.join(self.splits) or 'splits, which is empty'}."
             )
+        if self.split is not None and self.folds:
+            raise ValueError("split and folds exclude each other: set data.folds to null, or leave data.split out.")
         if 1.0 in self.input_scales:
             raise ValueError("input_scales has 1, which is always tested: leave it out.")
         if self.input_scales and self.folds:

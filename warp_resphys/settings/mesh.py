@@ -215,6 +215,8 @@ class ArmMesh(Settings):
             raise ValueError("nodes and bore are for hexahedra: leave them out, or set cells to hexahedra.")
         if self.bore is not None and self.profile != "wedge":
             raise ValueError(f"bore is set, but profile is {self.profile}: set it to wedge, or bore to null.")
+        if self.profile == "wedge" and self.chambers == 2:
+            raise ValueError("chambers is 2, but wedges have flat sides towards the axis: take three, or sectors.")
         return self
 
 

@@ -11,7 +11,10 @@ from support.refusals import refuses
 from warp_resphys import ObservedMotions, evaluate, fit_actuator
 from warp_resphys.data.input_network import InputNetwork
 from warp_resphys.data.input_response import InputResponse
+from warp_resphys.energies import Sphere
 from warp_resphys.io.errors import InputError
+from warp_resphys.learning.identification.search import Identification
+from warp_resphys.learning.identification.sensitivity import sensitivities
 from warp_resphys.learning.observed_motions import Identified
 from warp_resphys.learning.residuals.actuator_fit import ActuatorFitting, felt_inputs
 from warp_resphys.learning.residuals.in_the_loop import InTheLoop
@@ -145,6 +148,57 @@ def test_an_actuator_that_has_nothing_to_learn_is_not_used(simulator):
     found = fit_actuator(simulator, motions, train=MANY, settings=QUICK.changed(rounds=1, epochs=1))
     assert not found.test["used"]
     assert (found.test["split"], len(found.test["trials"])) == ("left-out training", 3)
+
+
+def test_trials_of_several_sessions_are_tested_under_their_own_names(simulator, motions):
+    """Errors of trials left out in turn, of sessions that alternate, and a session that is never driven."""
+    trials = replace(motions.trials, sessions=("a", "b", "a", "b", "a", "b"))
+    trials.inputs["tendon_tension"][1] = 0.0
+    mixed = replace(motions, trials=trials)
+    fitting = ActuatorFitting(simulator, mixed, trials.names)
+    folds = fitting._folds()
+    _, test = fitting._held_out(folds, QUICK.changed(rounds=1, epochs=0), 0, "fit")
+    assert sorted(test["trials"]) == sorted(trials.names)
+    below = dict(zip(fitting._in_batches(trials.names), fitting._rolled_out(Identified(), trials.names), strict=True))
+    losses = [fitting._loss(fold) for fold in folds]
+    for fold, loss in zip(folds, losses, strict=True):
+        loss.error_mm(None)
+        for name, row in zip(fitting._in_batches(fold), loss.judged[-1], strict=True):
+            assert row.mean() == pytest.approx(below[name].mean(), rel=1e-6)
+
+
+def test_known_starts_and_a_part_of_each_trial_can_be_learned_from(simulator, motions):
+    start = simulator.static_equilibrium(wr.Inputs(tendon_tension=acting(tensions())[0]))
+    initial = torch.stack([start.q, start.v], 1).numpy()
+    given = replace(motions.trials, begins=("given",) * TRIALS, initial=initial)
+    part = replace(motions, trials=given, train_fraction=0.73)
+    found = fit_actuator(simulator, part, train=MANY, settings=QUICK.changed(rounds=1, epochs=1))
+    assert found.test["error_mm"] < found.test["below_mm"]
+
+
+def test_a_network_may_take_the_inputs_alone_and_obstacles_are_no_actuators(simulator, motions):
+    settings = QUICK.changed(filters=(), rounds=1, epochs=0)
+    found = fit_actuator(simulator, motions, train=MANY, validation=["motion 3"], settings=settings)
+    assert found.test["error_mm"] != found.test["below_mm"]
+    response = InputResponse(STEP, network=found.actuator["tendon_tension"])
+    commands = tensions()
+    assert response(response.steady(commands[0]), commands)[0].shape == commands.shape
+    wall = Sphere(position=(0.05, 0.01, -0.05), radius=0.01, moves=True)
+    floor = wr.Body(MESH, fixed=BODY.fixed_vertices, energies=[wr.Contact({"wall": wall})])
+    bare = wr.Simulator(floor, wr.Corotated(264e3, 0.45), time_step=STEP)
+    q = bare.rollout(bare.rest_state(), 3).q
+    moved = ObservedMotions.of(bare, q, bare.rest_state(), wr.Inputs(obstacle_move_z=torch.zeros(3, 1, 1).double()))
+    refuses(InputError, "no inputs whose actuator could be learned", fit_actuator, bare, moved)
+
+
+def test_derivatives_by_parameters_are_those_of_the_motion_with_the_actuator(simulator, motions, learned):
+    alone = Identification({"youngs_modulus": 264e3})
+    both = replace(alone, actuator=learned.actuator), alone
+    points = [sensitivities(simulator, motions, ["motion 4"], one)["motion 4"].points for one in both]
+    replay = motions.replay(simulator, ["motion 4"], learned)
+    shown = replay(motions.start(replay, learned))
+    np.testing.assert_allclose(points[0], shown[0, 0].numpy(), atol=1e-6)
+    assert np.abs(np.subtract(*points)).max() > 1e-4
 
 
 def test_poses_at_rest_teach_what_acts_in_the_end(simulator):

@@ -220,8 +220,8 @@ class InputResponse:
             acting = _lagged(memory["behind"], acting, self._kept_lag, self._reach)
             later["behind"] = acting[-1]
         if self._network is not None:
-            felt = _means(memory["felt"], acting, self._kept_felt)
-            acting, later["felt"] = self._changed(acting, felt), felt[:, -1]
+            felt = _means(memory["felt"], acting, self._kept_felt) if self._kept_felt else acting[None][:0]
+            acting, later = self._changed(acting, felt), later | ({"felt": felt[:, -1]} if len(felt) else {})
         if not self.filters:
             return acting, acting[None][:0], later
         means = _means(memory["means"], acting, self._kept_means)

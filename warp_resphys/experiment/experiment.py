@@ -24,6 +24,7 @@ from ..learning.residuals.correction import Learned
 from ..learning.residuals.networks import NextState, ResidualForce, StateMap
 from ..learning.residuals.reconstruction import ReconstructedTrials
 from ..settings.body import MaterialSettings, SimulatorSettings
+from ..settings.run import RunSettings
 from ..settings.run_keys import models_of
 from ..settings.stage_keys import StageSettings
 from .build import bound_markers, build_body, build_simulator, marker_view_of
@@ -70,9 +71,10 @@ def read_actuator(folder: Path) -> dict[str, InputNetwork]:
     return {name: InputNetwork.of_plain(network) for name, network in plain.items()}
 
 
-def training_files(folder: Path) -> dict[str, Path]:
-    """Files that have the epochs of what was learned and the weights that were kept, by model; some may be missing."""
-    return {ACTUATOR: folder / ACTUATOR_FILE, **{model: folder / training_file(model) for model in LEARNED}}
+def training_files(folder: Path, run: RunSettings) -> dict[str, Path]:
+    """Files with the epochs of what a run learned and the weights that were kept, by model; some may be missing."""
+    files = {ACTUATOR: folder / ACTUATOR_FILE} if run.with_actuator else {}
+    return {**files, **{model: folder / training_file(model) for model in LEARNED}}
 
 
 @dataclass(frozen=True)

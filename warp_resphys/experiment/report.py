@@ -109,7 +109,7 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     if stages is None:
         records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
         stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
-    files = training_files(folder)
+    files = training_files(folder, run)
     common, identified = common_folder(folder), Identification.read(folder / IDENTIFICATION)
     errors: ErrorTables = read_json(folder / ERRORS)
     metrics: Metrics = {
@@ -203,7 +203,9 @@ class RunReader:
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
         assert run.tip is not None
         names = {name for result in identification.values() for name in result.parameters}
-        histories = {model: read_if_there(path).get("epochs") for model, path in training_files(self.folder).items()}
+        histories = {
+            model: read_if_there(path).get("epochs") for model, path in training_files(self.folder, run).items()
+        }
         return RunReport(
             metrics=metrics,
             settings=run,

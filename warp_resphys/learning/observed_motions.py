@@ -45,7 +45,7 @@ class Identified(Brief):
         of_trials: values of single trials and sessions, by `parameters.value_name`.
         placement: of the markers, see `placement.placement_of`; None if it is exact.
         first_frames: first seconds of the trials from which values of a trial or session were estimated that nothing
-            else was identified from, by its name and that of the trial [s]; these frames count in no error.
+            else was identified from, by its name and that of the trial [s]; these frames count in no test error.
         actuator: learned changes of the inputs, by input; from `fit_actuator`.
         test: of the actuator on held-out trials; None: it was not tested.
     """

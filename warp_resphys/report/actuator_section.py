@@ -79,9 +79,12 @@ def risen_and_fallen(data: RunReport, driven: Driven) -> tuple[FloatArray, Float
     ramp = np.linspace(0.0, 1.0, _STEPS)
     ramp = np.concatenate([ramp, ramp[::-1]])
     parameters = data.identification["sysid"].parameters if "sysid" in data.identification else {}
+    if "law" in data.metrics["errors_mm"]:
+        parameters = data.metrics["law"]["others"]
     arguments = response_of(driven.quantity, parameters, driven.channels, data.actuator)
     response = InputResponse(_SECONDS / _STEPS, **arguments)
     each = np.tile(mean, (len(ramp), count, 1))  # (T, C, C): part by part
     each[:, range(count), range(count)] = ramp[:, None] * high
-    acting, _, _ = response(response.steady(each[0]), each)
+    moves = data.trials is None or data.trials.moves
+    acting = response(response.steady(each[0]), each)[0] if moves else response.still(each)
     return ramp[:, None] * high, acting[:, range(count), range(count)]

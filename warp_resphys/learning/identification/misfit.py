@@ -377,7 +377,7 @@ def _parts(replay: Replay, start: Start) -> list[tuple[Replay, Start]]:
     trials, count = replay.trials, len(replay.trials.names)
     parts = min(thread_count(), count) if start.delay.device.type == "cpu" else 1
     chosen = [part.tolist() for part in np.array_split(np.arange(count), parts)]
-    return [(Replay(replay.simulator, replay.observe, trials.select(part)), start.select(part)) for part in chosen]
+    return [(replay.changed(trials=trials.select(part)), start.select(part)) for part in chosen]
 
 
 def _moves_of(names: Iterable[str]) -> list[list[int]]:

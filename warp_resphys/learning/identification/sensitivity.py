@@ -9,7 +9,7 @@ the actuator did.
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypedDict
 
 import numpy as np
@@ -107,7 +107,8 @@ def _of_batch(
         if identified.placement is not None:
             placement = placement_of(identified.placement, trials.labels, trials.session(names[0]))
             placement = placement.to(simulator.rest_positions)
-        replay, start = DisplacedMarkers.replay(motions.replay(simulator, names), start)
+        unplaced = motions.replay(simulator, names, replace(identified, placement=None))
+        replay, start = DisplacedMarkers.replay(unplaced, start)
     configured = {name: simulator.tensor([x]) for name, x in configured_parameters(simulator, moved).items()}
     sets = {name: x.repeat(1 + len(moved)) for name, x in {**configured, **identified.values(simulator)}.items()}
     rows, of_parts = {parameter: row for row, parameter in enumerate(moved, 1)}, parameters_of_parts(simulator)

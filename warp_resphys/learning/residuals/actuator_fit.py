@@ -26,6 +26,7 @@ import torch
 from ...data.input_network import InputNetwork
 from ...data.input_response import InputResponse, with_means
 from ...dynamics.simulator import Simulator
+from ...energies.contact.contact_points import MOTION
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError, checks_types
 from ...io.progress import Progress
@@ -43,6 +44,7 @@ from .training import Snapshot, run_epochs
 
 log = logging.getLogger(__name__)
 
+_OTHERS: Final = frozenset({*HUNG, *(quantity.name for quantity in MOTION)})  # inputs that drive no actuator
 _CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are computed
 _SHARES: Final = (1.0, 0.5, 0.25)  # of a round's change of the weights that are tried
 _ITERATIONS: Final = 200  # of L-BFGS on linearised motions
@@ -139,7 +141,7 @@ class ActuatorFitting:
         if test is None and settings.gate:
             names, split = self.validation or self.train, "validation" if self.validation else "training"
             errors, below = (self._rolled_out(identified, names) for identified in (found, self.identified))
-            test = self._tested(names, split, errors, below)
+            test = self._tested(self._in_batches(names), split, errors, below)
         test = test if settings.gate else None
         if test is not None and not test["used"]:
             log.warning("%s: the learned actuator is no clear gain: %s", name, text_of(test))
@@ -157,28 +159,28 @@ class ActuatorFitting:
         self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, seed: int, name: str
     ) -> tuple[int, HeldOutTest]:
         """Number of epochs with the smallest error on trials that are left out in turn, and the test on these."""
-        parts = []
+        parts, names, below = [], list[str](), list[FloatArray]()
         for number, left_out in enumerate(folds):
             rest = [one for one in self.train if one not in left_out]
             model = self._begun(rest, settings, seed, f"{name}: without {number + 1} of {len(folds)}", settings.rounds)
-            parts.append((model, self._loss(rest), self._loss(left_out)))
-        names = [one for left_out in folds for batch in self.motions.trials.batches(left_out) for one in batch]
-        below = [row for left_out in folds for row in self._rolled_out(self.identified, left_out)]
+            held_out = self._loss(left_out)
+            held_out.error_mm(None)
+            names, below = names + self._in_batches(left_out), below + held_out.judged[-1]
+            parts.append((model, self._loss(rest), held_out))
         with Progress(f"{name}: held out", len(folds) * settings.epochs, "epochs at most") as progress:
             epochs, (_, errors) = cross_validated_epochs(parts, settings, progress.advance)
         return epochs, self._tested(names, "left-out training", errors, below)
 
+    def _in_batches(self, names: Sequence[str]) -> list[str]:
+        """Names of trials in the order of their batches, which is that of their errors."""
+        return [name for batch in self.motions.trials.batches(names) for name in batch]
+
     def _tested(
         self, names: Sequence[str], split: str, errors: Sequence[FloatArray], below: Sequence[FloatArray]
     ) -> HeldOutTest:
-        names = [name for batch in self.motions.trials.batches(names) for name in batch]
-        sizes = [1e3 * size for size in self._amplitudes(names)]
+        """Compares the errors (T,) of trials [mm] with those without the actuator."""
+        sizes = [1e3 * float(self.motions.batch([name], self.simulator).amplitude) for name in names]
         return held_out_test(names, split, errors, below, sizes)
-
-    def _amplitudes(self, names: Sequence[str]) -> list[float]:
-        """Amplitudes of trials [m]."""
-        of_batches = (self.motions.batch(batch, self.simulator) for batch in self.motions.trials.batches(names))
-        return [size for batch in of_batches for size in batch.amplitude.tolist()]
 
     def _rolled_out(self, identified: Identified, names: Sequence[str]) -> list[FloatArray]:
         """Mean distances (T,) by frame of trials [mm], in the order of their batches."""
@@ -220,10 +222,11 @@ class ActuatorFitting:
                     break
                 _fit_linearised(linearised, model, penalty)
                 after = copy.deepcopy(model.network.state_dict())
-                for share in _SHARES:
+                for share in _SHARES if all(bool(torch.isfinite(x).all()) for x in after.values()) else ():
                     model.network.load_state_dict({k: torch.lerp(before[k], x, share) for k, x in after.items()})
-                    least = _loss_of(loss, model)
-                    if least + penalty * float(_squares(model).detach()) < best:
+                    found = _loss_of(loss, model)
+                    if found < least and found + penalty * float(_squares(model).detach()) < best:
+                        least = found
                         break
                 else:
                     model.network.load_state_dict(before)
@@ -246,14 +249,20 @@ def felt_inputs(
         InputError: the trials have no inputs of actuators.
     """
     _, inputs, resting = replay.changed(actuator={}).prepare(parameters)
-    response, felt = InputResponse(replay.simulator.time_step, filters=filters), {}
+    step = replay.simulator.time_step
+    response, felt = InputResponse(step, filters=filters), dict[str, torch.Tensor]()
     for name, acting in inputs.actuation.items():
-        if name in HUNG:
+        if name in _OTHERS:
             continue
-        acting = acting if acting.ndim == 3 else acting[None]
-        memory = response.steady(resting.actuation.get(name, 0.0 * acting[0]))
-        before = with_means(*response(memory, resting.actuation.get(name, 0.0 * acting[0])[None])[:2])
-        felt[name] = torch.cat([before, with_means(*response(memory, acting)[:2])])
+        before = resting.actuation.get(name, 0.0 * (acting if acting.ndim == 2 else acting[0]))
+        still = before if replay.is_static else acting
+        if still.ndim == 2:
+            steps = math.ceil(float(replay.trials.times.max()) / step) + 2
+            felt[name] = with_means(still, [still] * len(filters)).expand(steps, -1, -1)
+            continue
+        memory = response.steady(before)
+        first = with_means(before, [before] * len(filters))
+        felt[name] = torch.cat([first[None], with_means(*response(memory, acting)[:2])])
     if not felt:
         raise InputError(f"the trials {', '.join(replay.trials.names)} have no inputs whose actuator could be learned.")
     return felt
@@ -264,7 +273,10 @@ def _untrained(felt: Sequence[Mapping[str, torch.Tensor]], settings: ActuatorSet
     networks = {}
     for name in felt[0]:
         values = torch.cat([batch[name].flatten(0, 1) for batch in felt])
-        networks[name] = InputNetwork(values.amin(0), values.amax(0), settings.filters, settings.width)
+        if bool(values.any()):
+            networks[name] = InputNetwork(values.amin(0), values.amax(0), settings.filters, settings.width)
+    if not networks:
+        raise InputError("all inputs of the training trials are zero: name trials in which the robot is driven.")
     return Actuator(networks).to(next(iter(felt[0].values())).device)
 
 
@@ -291,7 +303,7 @@ class _Linearised:
         """Simulates trials, with the derivatives by lasting changes of the inputs."""
         replay = replay.changed(actuator=model.inputs)
         states, prepared = replay.states(start, parameters), replay.prepare(parameters)
-        sizes = {name: _CHANGE * float(x[..., : model.inputs[name].parts].abs().max()) for name, x in felt.items()}
+        sizes = {name: _CHANGE * network.unit for name, network in model.inputs.items()}
         columns = [name for name in sizes for _ in range(model.inputs[name].parts)]
         repeated = {name: x.repeat(len(columns)) for name, x in parameters.items()}
         constants, *fields = replay.prepare(
@@ -301,11 +313,11 @@ class _Linearised:
         series = replay.varied_points(start, prepared, (constants, during, before), len(columns), states)
         first, *rest = replay.at_frames(series, start).unflatten(0, (1 + len(columns), -1))
         times = (replay.trials.times - start.delay[:, None]).clamp_min(0.0)
-        slopes: dict[str, list[torch.Tensor]] = {name: [] for name in felt}
+        slopes: dict[str, list[torch.Tensor]] = {name: [] for name in sizes}
         for name, moved in zip(columns, rest, strict=True):
             slopes[name].append((moved - first) / sizes[name])
         step, count = replay.simulator.time_step, series.shape[1]
-        shown = {name: sample(x[:count].swapaxes(0, 1), times, step) for name, x in felt.items()}
+        shown = {name: sample(felt[name][:count].swapaxes(0, 1), times, step) for name in sizes}
         added = {name: model.inputs[name](x) for name, x in shown.items()}
         return cls(replay, first, {name: torch.stack(x, -1) for name, x in slopes.items()}, shown, added)
 

@@ -1,6 +1,7 @@
 """Identification, reconstruction, training and evaluation as functions, on beams."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from warp_resphys.data.markers import WHOLE_STATE
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Parts
+from warp_resphys.learning import comparison
 from warp_resphys.learning.comparison import Comparison, Model
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.observed_motions import Identified
 from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.residuals.fitting import Fitting, fit_force
+from warp_resphys.learning.without_physics import without_physics
 from warp_resphys.settings.learning import (
     Bounds,
     InTheLoopSettings,
@@ -260,6 +263,42 @@ def test_models_of_one_simulator_have_the_derivatives_of_their_parameters(robot)
     calibrated = Comparison(models, motions, names[:1], {"1": names[1:]}, names[:1])
     assert [*calibrated.errors()["per_marker"]["close"]] == ["a", "b", "c"]
     assert calibrated.errors()["intervals"]["models"].keys() == {"rest", *models}
+
+
+def test_intervals_grow_for_simulators_identified_without_the_largest_trial(robot, monkeypatch):
+    """And for networks on them; only with what the training used."""
+    motions = replace(let_go(robot, 0.04, 0.12, 0.07, 0.1, 0.09, markers=MARKERS), train_fraction=0.4)
+    motions.trials.observed[0, 15:] += 1.0  # not trained on
+    motions.trials.observed[2, 3, 0] += 0.05  # a large displacement for a moment: the size of a trial is its largest
+    names, simulator = motions.trials.names, beam(180e3)
+    train, test, validation = names[:3], names[3:4], names[4:]
+    found = identify(simulator, motions, {"youngs_modulus": (1e5, 1e6)}, names=train)
+    models = {
+        "force": Model(simulator, found, SimpleNamespace(replaces_simulator=False)),
+        "sysid": Model(simulator, found),
+        "simfree": Model(simulator, found, SimpleNamespace(replaces_simulator=True)),
+        "actuator": Model(simulator, replace(found, actuator={"tendon_tension": object()})),
+        "guess": Model(simulator, replace(found, uncertainty=None)),
+        "other": Model(beam(170e3), replace(found, uncertainty=None)),
+    }
+    made = Comparison(models, motions, train, {"1": test}, validation)
+    below = {"force": "sysid", "sysid": "sysid", "simfree": None, "actuator": "sysid", "guess": None, "other": None}
+    assert {model: made._below(model) for model in [*models, "rest"]} == {**below, "rest": None}
+    assert {model: made._calibrating(model) for model in models} == {
+        model: [*validation, names[2]] if model == "sysid" else [*validation] for model in models
+    }
+    moved = motions.trials.observed - motions.trials.bound
+    moved[0, 11:] = moved[1, 11:] = moved[2, 11:] = np.nan
+    reach = np.nanmax(np.linalg.norm(moved[[0, 1, 2, 4]], axis=-1))
+    simple, asked = {model: models[model] for model in ("other", "sysid")}, []
+    monkeypatch.setattr(comparison, "without_physics", lambda *a, **b: asked.append(a[1]) or without_physics(*a, **b))
+    errors = Comparison(simple, motions, train, {"1": test}, validation).errors()["intervals"]["models"]
+    assert errors["sysid"]["reach"] == errors["sysid"]["without_spread"]["reach"] == pytest.approx(reach)
+    assert {errors[model]["reach"] for model in errors if model != "sysid"} == {0.0}
+    without = Comparison(simple, motions, train, {"1": test}, train).errors()["intervals"]
+    assert without["calibrated_on"] == "left_out"
+    assert without["models"]["sysid"]["reach"] == pytest.approx(np.nanmax(np.linalg.norm(moved[:3], axis=-1)))
+    assert {*map(tuple, asked)} == {test, validation, train}  # Models without physics may need all training trials.
 
 
 def test_forces_from_markers_bring_the_markers_there(robot):

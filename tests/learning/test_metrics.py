@@ -282,7 +282,10 @@ def test_intervals_grow_beyond_the_training_as_the_errors_of_its_largest_trial_d
     assert covered(growing, inside) == covered(within, inside)
     assert Intervals.from_plain(growing.plain()) == growing
     exact = within.growing(moved(0.015, 1.0, 8), 0.010, 0.015, REST)
-    assert exact.growth < 0.5 * growing.growth
+    assert exact.growth < 0.2 * growing.growth
+    assert within.growing(moved(0.0101, 1.0, 9), 0.010, 0.0101, REST).growth == 0.0  # 0.1 mm show nothing
+    unsure = Intervals(within.factor, (0.25e-6, 0.0, 0.0, 0.0, 0.0))  # what the scale contains does not count again
+    assert unsure.growing(moved(0.015, 0.010, 5), 0.010, 0.015, REST).growth < 0.2 * growing.growth
 
 
 class TestHeldOut:

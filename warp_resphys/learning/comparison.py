@@ -91,19 +91,52 @@ class Comparison:
     @cached_property
     def _largest(self) -> list[str]:
         """Training trials, those with larger displacements first."""
-        sizes = amplitudes(self.motions.trials, self.train)
-        return sorted(sizes, key=sizes.__getitem__, reverse=True)
+        return sorted(self.train, key=lambda name: self._reach([name]), reverse=True)
 
-    @property
-    def _calibrating(self) -> list[str]:
-        """Names of the trials of the calibration, and of the training trial with the largest displacement."""
-        return [*dict.fromkeys([*self.calibration, *self._largest[: 1 if self.calibration else 0]])]
+    @cached_property
+    def _growing(self) -> list[str]:
+        """Models whose errors in the largest training trial are known as if they were identified without it.
+
+        Not those with a network, which has seen the trial.
+        """
+
+        def grows(model: Model) -> bool:
+            known, trained = model.identified.uncertainty, model.learned is not None or model.identified.actuator
+            return model.has_intervals and not trained and known is not None and self._largest[0] in known.left_out
+
+        many = self.calibration and len(self.train) > 1
+        return [name for name, model in self.models.items() if grows(model)] if many else []
+
+    def _below(self, model: str) -> str | None:
+        """Name of the model whose growth a model has: itself, or the simulator that its networks correct, if any."""
+        used = self.models.get(model)
+        if used is None or model in self._growing:
+            return None if used is None else model
+        corrected = bool(used.identified.actuator) if used.learned is None else not used.learned.replaces_simulator
+        for other in self._growing if corrected else ():
+            simulator, identified = self.models[other].simulator, self.models[other].identified
+            if simulator is used.simulator and identified.parameters == used.identified.parameters:
+                return other
+        return None
+
+    def _calibrating(self, model: str) -> list[str]:
+        """Names of the trials of the calibration, and of the largest training trial if the model grows by it."""
+        return [*dict.fromkeys([*self.calibration, *self._largest[: 1 if model in self._growing else 0]])]
+
+    def _used(self, names: Sequence[str]) -> FloatArray:
+        """(R, T, M, 3) observed points of some trials [m], NaN in frames that may be tested or gave first values."""
+        motions, trials = self.motions, self.motions.trials
+        observed = trials.observed[trials.rows(names)]
+        learned = [row for row, name in enumerate(names) if name in self.train]
+        observed[learned, motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan
+        observed[used_frames(trials, names, self._first_frames)] = np.nan
+        return observed
 
     def _reach(self, names: Sequence[str]) -> float:
-        """Largest observed displacement of some trials [m]."""
+        """Largest observed displacement of some trials of the training or calibration [m]."""
         trials = self.motions.trials
-        moved = as_markers(trials.observed[trials.rows(names)], trials.labels) - rest_places(trials)
-        return float(np.nanmax(np.linalg.norm(moved, axis=-1)))
+        moved = as_markers(self._used(names), trials.labels) - rest_places(trials)
+        return float(np.nanmax(np.linalg.norm(moved, axis=-1), initial=0.0))
 
     @cached_property
     def filmed(self) -> str:
@@ -129,7 +162,7 @@ class Comparison:
 
         tested = {model: cut(model, self.names, "") for model in self.models}
         with_intervals = [name for name, model in self.models.items() if model.has_intervals]
-        calibrating = {model: cut(model, self._calibrating, "calibration_") for model in with_intervals}
+        calibrating = {name: cut(name, self._calibrating(name), "calibration_") for name in with_intervals}
         self.parts.run([*chain(*tested.values(), *calibrating.values())])
         return tested, calibrating
 
@@ -235,50 +268,60 @@ class Comparison:
         """Prediction intervals by model and their coverage of the tested trials, see `intervals`.
 
         Trials of the training are predicted as if the parameters were identified without them (`left_out_changes`), so
-        that the one with the largest displacement shows how errors grow beyond the training of the others. The
-        intervals of a robot, which does not know the variance due to the parameters, are `without_spread`.
+        that the one with the largest displacement shows how errors grow beyond the training of the others. Models with
+        a network have the growth of the simulator below it. The intervals of a robot, which does not know the variance
+        due to the parameters, are `without_spread`.
         """
-        motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
-        names = [*chain(*trials.batches(self._calibrating))]
-        observed, target = trials.observed[trials.rows(names)], counted(motions, self.train, test, self._first_frames)
-        rest = rest_places(trials)
-        learned = [row for row, name in enumerate(names) if name in self.train]
-        observed[learned, motions.learned_steps(observed.shape[1] - 1) + 1 :] = np.nan  # The rest may be tested.
-        observed[used_frames(trials, names, self._first_frames)] = np.nan
+        motions, trials, test, rest = (
+            self.motions,
+            self.motions.trials,
+            self.groups["1"],
+            rest_places(self.motions.trials),
+        )
+        target = counted(motions, self.train, test, self._first_frames)
+        names = [*dict.fromkeys(chain(self.calibration, *map(self._calibrating, self._growing)))]
         linear = self._linearised(names, uncertain=True)
         changes = {m: left_out_changes(trials, names, self.models[m].identified, x) for m, x in linear.items()}
-        simulated, *_ = without_physics(motions, names, self.train, self._first_frames, left_out=True)
+        plain, *_ = without_physics(motions, self.calibration, self.train, self._first_frames, left_out=True)
+        simulated: dict[str, tuple[Sequence[str], FloatArray]] = {m: (self.calibration, x) for m, x in plain.items()}
         for model, parts in self._rolled_out[1].items():
-            change = changes.get(model)
-            simulated[model] = self.parts.joined(parts, "observed", trials.observed.shape[1])
-            simulated[model] += 0.0 if change is None else change
-        spreads, models = self._spreads(names, linear, left_out=True), dict[str, ModelIntervals]()
-        for model in (model for model in simulated if model in self.simulated):
-            predicted = predicted_trials(trials, names, simulated[model], observed, spreads.get(model))
+            of_parts, change = [*chain(*(part.names for part in parts))], changes.get(model)
+            made = self.parts.joined(parts, "observed", trials.observed.shape[1])
+            simulated[model] = of_parts, made if change is None else made + change[[names.index(n) for n in of_parts]]
+        spreads = self._spreads(names, linear, left_out=True)
+        whole, alone = dict[str, Intervals | None](), dict[str, Intervals | None]()
+        for model, (shown, made) in simulated.items():
+            spread = None if model not in spreads else spreads[model][[names.index(name) for name in shown]]
+            predicted = predicted_trials(trials, shown, made, self._used(shown), spread)
+            whole[model] = self._calibrated(model, predicted)
             known = {name: replace(trial, spread=None) for name, trial in predicted.items()}
-            if (intervals := self._calibrated(predicted, model in changes)) is None:
+            alone[model] = self._calibrated(model, known) if model in self.spreads else None
+        models = dict[str, ModelIntervals]()
+        for model in (model for model in simulated if model in self.simulated):
+            if (intervals := self._grown(model, whole)) is None:
                 continue
             new = self.simulated[model][: len(test)]
             tested = predicted_trials(trials, test, new, target, self.spreads.get(model))
             covered = coverage({name: intervals.covered(trial, rest) for name, trial in tested.items()})
             models[model] = {**intervals.plain(), **covered}
-            if model in self.spreads and (alone := self._calibrated(known, True)) is not None:
-                models[model]["without_spread"] = alone.plain()
+            if (of_robot := self._grown(model, alone)) is not None:
+                models[model]["without_spread"] = of_robot.plain()
         without = any(change is not None for change in changes.values())
         trained = not {*self.calibration}.isdisjoint(self.train)
         split = ("left_out" if without else "training") if trained else "validation"
         return {"level": LEVEL, "calibrated_on": split, "models": models}
 
-    def _calibrated(self, predicted: Mapping[str, Predicted], identified: bool) -> Intervals | None:
-        """Calibrates intervals, which grow beyond the training if the model's parameters are identified.
-
-        Args:
-            predicted: trials of `_calibrating` that the model predicted without them, by name.
-            identified: whether its parameters are identified.
-        """
-        rest, largest = rest_places(self.motions.trials), self._largest
+    def _calibrated(self, model: str, predicted: Mapping[str, Predicted]) -> Intervals | None:
+        """Calibrates intervals of a model on trials that it predicted, of which the largest one shows any growth."""
+        rest = rest_places(self.motions.trials)
         intervals = Intervals.calibrated({name: predicted[name] for name in self.calibration}, rest)
-        if intervals is None or not identified or len(largest) < 2:
+        if intervals is None or model not in self._growing:
             return intervals
-        before, reach = self._reach(largest[1:]), self._reach([*{*self.train, *self.calibration}])
-        return intervals.growing(predicted[largest[0]], before, reach, rest)
+        largest, *others = self._largest
+        reach = self._reach([*{*self.train, *self.calibration}])
+        return intervals.growing(predicted[largest], self._reach(others), reach, rest)
+
+    def _grown(self, model: str, calibrated: Mapping[str, Intervals | None]) -> Intervals | None:
+        """Returns the intervals of a model with the growth of the one that shows it, see `_below`."""
+        own, below = calibrated[model], calibrated.get(self._below(model) or "")
+        return own if own is None or below is None else replace(own, reach=below.reach, growth=below.growth)

@@ -11,8 +11,10 @@ of the inputs, one soon after it, and one long after it; and, if it is known, th
 parameters, which grows outside of the training. The sizes of the parts are those of the largest likelihood.
 
 Beyond the largest displacement of the training and calibration, half-widths also grow with the excess, as the errors of
-the training trial with the largest displacement did, for a model identified without it. As this is a single trial, the
-growth is Student's quantile with one degree of freedom times the root mean square.
+the training trial with the largest displacement did, as far as the scale does not contain them, for a simulator whose
+parameters are identified without it, to first order. As this is a single trial, the growth is Student's quantile with
+one degree of freedom times the root mean square. A learned force or actuator has the growth of the simulator below, as
+it was trained on the trial; other models have none.
 """
 
 import math
@@ -36,6 +38,7 @@ _QUARTERS: Final = 4  # parts of a single trial
 _LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level to the largest value
 _LEAST: Final = 1e-3  # of the mean variance: part that is always there
 _PENALTY: Final = 1e-3  # of the negative log-likelihood, for each part as large as the mean variance
+_LEAST_EXCESS: Final = 3.0  # beyond the training, over the scale of the errors within: less shows no growth
 _SMALLEST: Final = -12.0  # logarithm of a part over the mean variance
 
 
@@ -181,7 +184,7 @@ class Intervals:
     def growing(
         self, beyond: Predicted, before: float, reach: float, rest: FloatArray, level: float = LEVEL
     ) -> "Intervals":
-        """Returns intervals that grow beyond their reach as the errors of a trial did, if it has any excess.
+        """Returns intervals that grow beyond their reach as the errors of a trial did, if its excess is large enough.
 
         Args:
             beyond: the training trial with the largest displacement, predicted by a model identified without it.
@@ -192,10 +195,12 @@ class Intervals:
         """
         moved = np.linalg.norm(beyond.simulated - rest, axis=-1)
         excess = np.where(beyond.seen, np.maximum(moved - before, 0.0), 0.0)
-        total = float(np.square(excess).sum())
-        errors = float(np.square(beyond.errors[excess > 0.0]).mean(-1).sum())
-        growth = math.sqrt(errors / total) * float(student.ppf(0.5 + 0.5 * level, 1)) if total > 0.0 else 0.0
-        return replace(self, reach=reach, growth=growth)
+        at, total = excess > 0.0, float(np.square(excess).sum())
+        within = float((_parts(moved, beyond.since, beyond.spread) @ np.array(self.variance))[at].sum())
+        errors = max(float(np.square(beyond.errors[at]).mean(-1).sum()) - within, 0.0)
+        if total <= _LEAST_EXCESS**2 * within:
+            return replace(self, reach=reach)
+        return replace(self, reach=reach, growth=math.sqrt(errors / total) * float(student.ppf(0.5 + 0.5 * level, 1)))
 
     def plain(self) -> PlainIntervals:
         """Returns the intervals as JSON data."""

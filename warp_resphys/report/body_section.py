@@ -22,7 +22,7 @@ _DRAWN: Final = (*BASELINES, "simulation", "sysid", "law", "actuator", "simfree"
 _CALIBRATED: Final = {  # Source of prediction intervals.
     "validation": "the errors in the validation trials",
     "training": "the errors in the training trials, which tend to be too small",
-    "left_out": "the errors in the training trials, with the parameters identified without each of them",
+    "left_out": "the errors in the training trials, with the parameters, but no network, learned without each of them",
     "folds": "the errors of the other folds",
 }
 _MOST_MARKERS: Final = 6  # Markers whose coordinates are drawn.

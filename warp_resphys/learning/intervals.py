@@ -11,7 +11,7 @@ of the inputs, one soon after it, and one long after it; and, if it is known, th
 parameters, which grows outside of the training. The sizes of the parts are those of the largest likelihood.
 
 Beyond the largest displacement of the training and calibration, half-widths also grow with the excess, as the errors of
-the training trial with the largest displacement did, as far as the scale does not contain them, for a simulator whose
+the training trial with the largest displacement did, less what the half-widths contain, for a simulator whose
 parameters are identified without it, to first order. As this is a single trial, the growth is Student's quantile with
 one degree of freedom times the root mean square. A learned force or actuator has the growth of the simulator below, as
 it was trained on the trial; other models have none.
@@ -25,6 +25,7 @@ from typing import Final, NotRequired, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
+from scipy.stats import norm
 from scipy.stats import t as student
 
 from ..data.driving import since_change
@@ -38,7 +39,7 @@ _QUARTERS: Final = 4  # parts of a single trial
 _LEVELS: Final = 11  # number of quantiles that are tried, from the wanted level to the largest value
 _LEAST: Final = 1e-3  # of the mean variance: part that is always there
 _PENALTY: Final = 1e-3  # of the negative log-likelihood, for each part as large as the mean variance
-_LEAST_EXCESS: Final = 3.0  # beyond the training, over the scale of the errors within: less shows no growth
+_LEAST_EXCESS: Final = 3.0  # beyond the training, over the deviation of the errors within: less shows no growth
 _SMALLEST: Final = -12.0  # logarithm of a part over the mean variance
 
 
@@ -196,7 +197,8 @@ class Intervals:
         moved = np.linalg.norm(beyond.simulated - rest, axis=-1)
         excess = np.where(beyond.seen, np.maximum(moved - before, 0.0), 0.0)
         at, total = excess > 0.0, float(np.square(excess).sum())
-        within = float((_parts(moved, beyond.since, beyond.spread) @ np.array(self.variance))[at].sum())
+        widths = replace(self, growth=0.0).half_widths(beyond.simulated, rest, beyond.since, beyond.spread)
+        within = float(np.square(widths[at] / norm.ppf(0.5 + 0.5 * level)).sum())  # variance of normal errors
         errors = max(float(np.square(beyond.errors[at]).mean(-1).sum()) - within, 0.0)
         if total <= _LEAST_EXCESS**2 * within:
             return replace(self, reach=reach)

@@ -121,7 +121,7 @@ class Comparison:
 
     def _calibrating(self, model: str) -> list[str]:
         """Names of the trials of the calibration, and of the largest training trial if the model grows by it."""
-        return [*dict.fromkeys([*self.calibration, *self._largest[: 1 if model in self._growing else 0]])]
+        return [*dict.fromkeys([*self.calibration, *(self._largest[:1] if model in self._growing else ())])]
 
     def _used(self, names: Sequence[str]) -> FloatArray:
         """(R, T, M, 3) observed points of some trials [m], NaN in frames that may be tested or gave first values."""

@@ -32,9 +32,7 @@ from .uncertainty import Uncertainty
 Report = Callable[[int, float, Mapping[str, float]], None]
 IsLast = Callable[[float], bool]
 
-_SIMILAR = 0.7  # ratio of old and new weights of the priors above which another descent is not worth its time
-_MOST_DESCENTS = 3  # after the rough one
-_ROUGH = 0.1  # relative decrease below which the weights of the priors are computed again
+_SIMILAR = 0.7  # ratio of old and new weights of the priors above which a second descent is not worth its time
 _MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
 _AT_A_BOUND = 1e-4  # of the range
 
@@ -244,7 +242,7 @@ def _descend(
         if report is not None:
             report(number, loss, values)
 
-    def minimum(x: torch.Tensor, most: int, tolerance: float) -> Point:
+    def minimum(x: torch.Tensor, most: int) -> Point:
         problem = UnitBox(misfit.objective, tolerance, evaluated)
         begin = problem.evaluate(x)
         if not math.isfinite(float(begin.value)):
@@ -255,16 +253,11 @@ def _descend(
     misfit.prior_weight = 0.0
     misfit.forget()
     misfit.update_prior_weight(first)
-    # Priors are weighted by the residuals at their start, which are too large, until the loss hardly falls.
-    begin = max(tolerance, _ROUGH) if misfit.has_priors else tolerance
-    point = minimum(torch.as_tensor(first)[None], max_evaluations, begin)
-    for descent in range(_MOST_DESCENTS if begin > tolerance else 0):
-        left, weight = max_evaluations - len(history), misfit.prior_weight
-        if left <= 1 or not math.isfinite(float(point.value)):
-            break
+    point = minimum(torch.as_tensor(first)[None], max_evaluations)
+    left, weight = max_evaluations - len(history), misfit.prior_weight
+    if misfit.has_priors and left > 1 and math.isfinite(float(point.value)):
         misfit.update_prior_weight(point.x[0].numpy())
-        if descent and _SIMILAR < misfit.prior_weight / weight < 1.0 / _SIMILAR:
-            break
-        refined = minimum(point.x, left, tolerance)
-        point = refined if math.isfinite(float(refined.value)) else point
+        if not _SIMILAR * weight < misfit.prior_weight < weight / _SIMILAR:
+            refined = minimum(point.x, left)
+            point = refined if math.isfinite(float(refined.value)) else point
     return _Attempt(point.x[0].numpy(), float(point.value), history, misfit.prior_weight)

@@ -8,7 +8,7 @@ import pytest
 
 from support.configured import settings
 from support.main_job import run_without_report
-from warp_resphys.experiment.experiment import LAW
+from warp_resphys.experiment.experiment import ACTUATOR, LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.mesh_check import check_mesh
 from warp_resphys.experiment.splits import split_of
@@ -24,7 +24,7 @@ from warp_resphys.report.wording import NO_BREAK_SPACE
 from warp_resphys.settings.stage_keys import StageSettings
 
 PLAIN = ("rest", "interpolation", "linear")  # two training trials are too few for a regression
-MODELS = [model for model in ALL_MODELS if model not in (LAW, "resphys_uncorrected")]
+MODELS = [model for model in ALL_MODELS if model not in (LAW, ACTUATOR, "resphys_uncorrected")]
 TRAINED = ("resphys", "simfree")
 
 TINY = [

@@ -263,9 +263,8 @@ class _SplitStages:
 
 def _without_simulator(run: RunSettings, target: TargetSettings) -> RunSettings:
     """Returns the settings of a network that replaces the simulator, without those that identify the latter."""
-    without: dict[str, Any] = {"simulation": target.material, "identify": None, "law": None, "shapes": {}}
-    without["actuator"] = None
-    return run.model_copy(update=without)
+    without = dict.fromkeys(("identify", "law", "actuator"))
+    return run.model_copy(update={"simulation": target.material, "shapes": {}, **without})
 
 
 def prepare(run: RunSettings) -> None:

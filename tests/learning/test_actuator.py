@@ -13,6 +13,7 @@ from warp_resphys.data.input_network import InputNetwork
 from warp_resphys.data.input_response import InputResponse
 from warp_resphys.energies import Sphere
 from warp_resphys.io.errors import InputError
+from warp_resphys.learning.evaluation import left_out_in_turn
 from warp_resphys.learning.identification.search import Identification
 from warp_resphys.learning.identification.sensitivity import sensitivities
 from warp_resphys.learning.observed_motions import Identified
@@ -156,7 +157,7 @@ def test_trials_of_several_sessions_are_tested_under_their_own_names(simulator, 
     trials.inputs["tendon_tension"][1] = 0.0
     mixed = replace(motions, trials=trials)
     fitting = ActuatorFitting(simulator, mixed, trials.names)
-    folds = fitting._folds()
+    folds = left_out_in_turn(trials, trials.names)
     _, test = fitting._held_out(folds, QUICK.changed(rounds=1, epochs=0), 0, "fit")
     assert sorted(test["trials"]) == sorted(trials.names)
     below = dict(zip(fitting._in_batches(trials.names), fitting._rolled_out(Identified(), trials.names), strict=True))

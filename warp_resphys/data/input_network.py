@@ -1,4 +1,4 @@
-"""A network that changes the inputs of a body: the residual in its actuators."""
+"""Networks that change the inputs of a body: the residual in its actuators."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
@@ -12,7 +12,7 @@ _MARGIN = 0.25  # of the width of the training range, by which values may exceed
 
 
 class InputNetwork(torch.nn.Module):
-    """What an input (C,) of a body has besides its identified response x: f(x, means of x) - f(0, 0).
+    """The change of an input (C,) of a body beyond its identified response x: f(x, means of x) - f(0, 0).
 
     f has a linear part and a hidden layer, and begins as zero. Its values are clamped to zero and the range of the
     training, widened by a quarter on either side. Inputs that have long been zero are not changed.
@@ -65,3 +65,17 @@ class InputNetwork(torch.nn.Module):
         network = cls(values["low"], values["high"], plain["filters"], len(values["hidden.bias"]))
         network.load_state_dict(values)
         return network.eval().requires_grad_(False)
+
+
+class Actuator(torch.nn.Module):
+    """Networks by the names of the inputs that they change, which are trained together."""
+
+    def __init__(self, networks: Mapping[str, InputNetwork]) -> None:
+        super().__init__()
+        self.network = torch.nn.ModuleDict(networks)
+
+    @property
+    def inputs(self) -> dict[str, InputNetwork]:
+        """The networks by input."""
+        networks: Any = self.network.items()
+        return dict(networks)

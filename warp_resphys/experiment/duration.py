@@ -18,6 +18,7 @@ from ..data.trials import UNDER_INPUTS, evenly
 from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
+from ..learning.evaluation import FOLDS
 from ..learning.residuals.reconstruction import make_reconstructor
 from ..report.wording import duration_text
 from ..settings.stage_keys import StageSettings
@@ -29,7 +30,7 @@ _SHORT = 8e6  # steps times vertices that take less than that
 _RECONSTRUCTION = 8.0  # steps that take as long as a reconstructed one, before that is timed
 _VARIED = 0.2  # time of one more set of parameters, over that of a step
 _ITERATION = 2.0  # of L-BFGS: losses with their gradients, over roll-outs
-_FOLDS, _PARTS = 3, 6  # of a training without validation trials; inputs by which motions are linearised
+_PARTS = 6  # inputs by which motions are linearised
 _BATCH = 1e-3  # time of a batch of a small network [s]
 _SUPPORTED, _MOST_TRIALS, _MOST_STEPS = 0.2, 16, 5  # share of the weight; trials and steps that are timed
 
@@ -84,7 +85,7 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage.startswith("reconstruct_"):
         return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
     if stage == "train_actuator":
-        actuator, folds = settings.actuator, 0 if settings.split.validation else _FOLDS
+        actuator, folds = settings.actuator, 0 if settings.split.validation else FOLDS
         trained, rolled = (steps_of(experiment, "actuator", names) for names in (train, judged))
         first = actuator.rounds * (2.0 + _VARIED * _PARTS) * trained
         looped = (actuator.epochs + 1) * (_ITERATION * trained + rolled)

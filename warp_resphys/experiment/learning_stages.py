@@ -1,6 +1,8 @@
 """Stages of the learning: each reads files, calls a function of the library and writes files."""
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -125,12 +127,7 @@ def train_actuator(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     experiment, name, split = Experiment(settings, context.run_dir), context.name, settings.split
-    checkpoint = context.run_dir / f"{name}.safetensors"
-    resumed = resume_checkpoint(checkpoint, "training", context.fingerprint)
-
-    def save(kept: Snapshot) -> None:
-        write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
-
+    checkpoint, resumed, save = _kept_training(context)
     below = LAW if experiment.has_law else "sysid"
     made_of = experiment.model_simulator(below), experiment.motions, split.train, split.validation
     fitting = ActuatorFitting(*made_of, experiment.identified(below))
@@ -172,16 +169,21 @@ def train(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     model, folder, name = settings.model, context.run_dir, context.name
-    checkpoint = folder / f"{name}.safetensors"
-    resumed = resume_checkpoint(checkpoint, "training", context.fingerprint)
-
-    def save(kept: Snapshot) -> None:
-        write_checkpoint(checkpoint, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
-
+    checkpoint, resumed, save = _kept_training(context)
     learned = fit(fitting_of(Experiment(settings, folder), model), settings.training, name, resumed, save)
     write_json(folder / training_file(model), learned.training)
     learned.write(folder / weights_file(model), context.fingerprint)
     checkpoint.unlink(missing_ok=True)
+
+
+def _kept_training(context: StageContext) -> tuple[Path, Snapshot | None, Callable[[Snapshot], None]]:
+    """Returns the file of an interrupted training of a stage, its last snapshot or None, and what saves others."""
+    path = context.run_dir / f"{context.name}.safetensors"
+
+    def save(kept: Snapshot) -> None:
+        write_checkpoint(path, "training", kept[0], {**kept[1], "fingerprint": context.fingerprint})
+
+    return path, resume_checkpoint(path, "training", context.fingerprint), save
 
 
 def fitting_of(experiment: Experiment, model: str) -> Fitting:

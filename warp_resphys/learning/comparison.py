@@ -272,12 +272,8 @@ class Comparison:
         a network have the growth of the simulator below it. The intervals of a robot, which does not know the variance
         due to the parameters, are `without_spread`.
         """
-        motions, trials, test, rest = (
-            self.motions,
-            self.motions.trials,
-            self.groups["1"],
-            rest_places(self.motions.trials),
-        )
+        motions, trials, test = self.motions, self.motions.trials, self.groups["1"]
+        rest = rest_places(trials)
         target = counted(motions, self.train, test, self._first_frames)
         names = [*dict.fromkeys(chain(self.calibration, *map(self._calibrating, self._growing)))]
         linear = self._linearised(names, uncertain=True)

@@ -23,6 +23,8 @@ from .observed_motions import Identified, ObservedMotions
 from .replay import Start
 from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
 
+HELD_OUT: Final = "left-out training"
+FOLDS: Final = 3  # of the training trials, without validation trials
 POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
 
 
@@ -267,6 +269,21 @@ def used_frames(trials: Trials, names: Sequence[str], first_frames: Mapping[str,
     seconds = {name: until for shown in first_frames.values() for name, until in shown.items()}
     last = np.array([seconds.get(name, -math.inf) for name in names])
     return np.asarray(trials.times[trials.rows(names)] <= last[:, None] + 1e-9)
+
+
+def left_out_in_turn(trials: Trials, names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Divides the training trials that begin alike among the folds of a test without validation trials.
+
+    Args:
+        trials: of all names.
+        names: of the training trials.
+
+    Returns:
+        Names that are left out of a fit together; nothing if each trial begins in its own way.
+    """
+    alike = [batch for batch in trials.batches(names) if len(batch) > 1]
+    count = min(max(map(len, alike), default=0), FOLDS)
+    return [tuple(name for batch in alike for name in batch[number::count]) for number in range(count)]
 
 
 class HeldOutRollouts:

@@ -85,7 +85,7 @@ class Bounds(Settings):
 
     @property
     def owner(self) -> str:
-        """What has a value of its own beside parts: session, trial, material or lens; empty if all share one."""
+        """The kind of owners of values besides parts: session, trial, material or lens; empty if all share one."""
         word = self.per if isinstance(self.per, str) else self.per[1]
         return "" if word in ("all", "part") else word
 

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import torch
 
-from ...data.input_network import InputNetwork
+from ...data.input_network import Actuator, InputNetwork
 from ...data.input_response import InputResponse, with_means
 from ...dynamics.simulator import Simulator
 from ...energies.contact.contact_points import MOTION
@@ -33,12 +33,11 @@ from ...io.progress import Progress
 from ...settings.learning import ActuatorSettings
 from ...stepping.inputs import Inputs
 from ...stepping.rollout import sample
-from ..evaluation import HeldOutRollouts
+from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import HUNG
 from ..replay import Replay, Start
 from ..scores import HeldOutTest, held_out_test, text_of
-from .actuator import Actuator
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .training import Snapshot, run_epochs
 
@@ -48,7 +47,6 @@ _OTHERS: Final = frozenset({*HUNG, *(quantity.name for quantity in MOTION)})  # 
 _CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are computed
 _SHARES: Final = (1.0, 0.5, 0.25)  # of a round's change of the weights that are tried
 _ITERATIONS: Final = 200  # of L-BFGS on linearised motions
-_FOLDS: Final = 3  # of the training trials, without validation trials
 
 
 @checks_types
@@ -126,13 +124,13 @@ class ActuatorFitting:
         Returns:
             The parameters with the actuator and its test, and ``training`` as of `Learned`.
         """
-        epochs, test, folds = None, None, self._folds()
+        epochs, test = None, None
+        folds = [] if self.validation else left_out_in_turn(self.motions.trials, self.train)
         if folds:
             epochs, test = self._held_out(folds, settings, seed, name)
         model = self._begun(self.train, settings, seed, name, settings.rounds if resumed is None else 0)
-        trainer = InTheLoop(
-            *(model, self._loss(self.train), self._loss(self.validation or self.train), settings, epochs)
-        )
+        train = self._loss(self.train)
+        trainer = InTheLoop(model, train, self._loss(self.validation) if self.validation else train, settings, epochs)
         if resumed is not None:
             trainer.resume(*resumed)
         trainer.begin()
@@ -149,12 +147,6 @@ class ActuatorFitting:
         kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
         return replace(found, test=test), {"kept": {**kept, "test": test}, "epochs": trainer.history}
 
-    def _folds(self) -> list[tuple[str, ...]]:
-        """Training trials that are left out in turn, each begun as another one; none with validation trials."""
-        alike = [batch for batch in self.motions.trials.batches(self.train) if len(batch) > 1]
-        count = 0 if self.validation else min(max(map(len, alike), default=0), _FOLDS)
-        return [tuple(name for batch in alike for name in batch[number::count]) for number in range(count)]
-
     def _held_out(
         self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, seed: int, name: str
     ) -> tuple[int, HeldOutTest]:
@@ -169,7 +161,7 @@ class ActuatorFitting:
             parts.append((model, self._loss(rest), held_out))
         with Progress(f"{name}: held out", len(folds) * settings.epochs, "epochs at most") as progress:
             epochs, (_, errors) = cross_validated_epochs(parts, settings, progress.advance)
-        return epochs, self._tested(names, "left-out training", errors, below)
+        return epochs, self._tested(names, HELD_OUT, errors, below)
 
     def _in_batches(self, names: Sequence[str]) -> list[str]:
         """Names of trials in the order of their batches, which is that of their errors."""
@@ -188,7 +180,10 @@ class ActuatorFitting:
         return HeldOutRollouts(counting, self.motions, names, identified).errors(None)
 
     def _loss(self, names: Sequence[str]) -> MotionLoss:
-        return MotionLoss([TrialGroup(*pair) for pair in self._replays(names)], self.identified.values(self.simulator))
+        return self._loss_of(self._replays(names))
+
+    def _loss_of(self, replays: Sequence[tuple[Replay, Start]]) -> MotionLoss:
+        return MotionLoss([TrialGroup(*pair) for pair in replays], self.identified.values(self.simulator))
 
     def _replays(self, names: Sequence[str]) -> list[tuple[Replay, Start]]:
         """Replays of the frames that are learned from, one for each batch of trials, each with its start."""
@@ -207,7 +202,7 @@ class ActuatorFitting:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             model = _untrained(felt, settings)
-        loss, penalty = self._loss(names), settings.penalty
+        loss, penalty = self._loss_of(replays), settings.penalty
         with torch.no_grad():
             least = float(loss(model))
         with Progress(f"{name}: first weights", rounds, "rounds") as progress:
@@ -224,7 +219,7 @@ class ActuatorFitting:
                 after = copy.deepcopy(model.network.state_dict())
                 for share in _SHARES if all(bool(torch.isfinite(x).all()) for x in after.values()) else ():
                     model.network.load_state_dict({k: torch.lerp(before[k], x, share) for k, x in after.items()})
-                    found = _loss_of(loss, model)
+                    found = _value(loss, model)
                     if found < least and found + penalty * float(_squares(model).detach()) < best:
                         least = found
                         break
@@ -360,7 +355,7 @@ def _fit_linearised(linearised: Sequence[_Linearised], model: Actuator, penalty:
     lbfgs.step(evaluate)
 
 
-def _loss_of(loss: MotionLoss, model: Actuator) -> float:
+def _value(loss: MotionLoss, model: Actuator) -> float:
     """Loss of an actuator; infinite where the simulation fails."""
     try:
         with torch.no_grad():

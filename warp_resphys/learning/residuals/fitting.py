@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any
 
 import torch
 
@@ -19,7 +19,7 @@ from ...io.errors import InputError, checks_types
 from ...io.progress import Progress
 from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
-from ..evaluation import HeldOutRollouts
+from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay, Start
 from ..scores import HeldOutTest, held_out_test, text_of
@@ -30,8 +30,6 @@ from .reconstruction import ReconstructedTrials
 from .training import EpochTrainer, Samples, Snapshot, Trainer, run_epochs
 
 log = logging.getLogger(__name__)
-_FOLDS: Final = 3  # of the training trials, without validation trials
-HELD_OUT: Final = "left-out training"
 
 Prepared = tuple[EpochTrainer[Any], Learned]  # a trainer, ready to run, and its network with settings of roll-outs
 
@@ -287,23 +285,20 @@ class Fitting:
         Without validation trials, a third of the training trials that begin alike is left out of a fit each time, with
         the modes of all; a single one is tested on itself.
         """
-        alike = [batch for batch in self.motions.trials.batches(self.train) if len(batch) > 1]
-        parts, count = [(learned, self.validation or self.train)], min(max(map(len, alike), default=0), _FOLDS)
-        if not self.validation and count:
-            parts = []
-            for number in range(count):
-                left_out = tuple(name for batch in alike for name in batch[number::count])
-                rest = tuple(name for name in self.train if name not in left_out)
-                trainer, fitted = replace(self, train=rest, coded=self.train).trainer(settings, name)
-                run_epochs(f"{name}: without {number + 1} of {count}", trainer)
-                parts.append((replace(fitted, network=trainer.use_best()), left_out))
+        folds = [] if self.validation else left_out_in_turn(self.motions.trials, self.train)
+        parts = [] if folds else [(learned, self.validation or self.train)]
+        for number, left_out in enumerate(folds, 1):
+            rest = tuple(name for name in self.train if name not in left_out)
+            trainer, fitted = replace(self, train=rest, coded=self.train).trainer(settings, name)
+            run_epochs(f"{name}: without {number} of {len(folds)}", trainer)
+            parts.append((replace(fitted, network=trainer.use_best()), left_out))
         counting = replace(self.simulator, solver=self.simulator.settings.changed(on_failure="count"))
         names, errors, below, sizes = list[str](), list[FloatArray](), list[FloatArray](), list[float]()
         for fitted, trials in parts:
             runs = HeldOutRollouts(counting, self.motions, trials, self.identified)
             names, sizes = names + runs.names, sizes + runs.amplitudes_mm()
             errors, below = errors + runs.errors(fitted), below + runs.errors(None)
-        split = "validation" if self.validation else HELD_OUT if count else "training"
+        split = "validation" if self.validation else HELD_OUT if folds else "training"
         return held_out_test(names, split, errors, below, sizes)
 
     def _group(

@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ...data.input_network import Actuator
 from ...dynamics.frames import BaseFrame, VertexFrames
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...settings.learning import LoopSettings
 from ..replay import Replay, Start
-from .actuator import Actuator
 from .correction import LearnedPredictor
 from .networks import OwnNetwork, ResidualForce
 from .training import EpochTrainer

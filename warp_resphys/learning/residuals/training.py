@@ -11,10 +11,10 @@ from typing import Any, Generic, TypeVar
 import torch
 from typing_extensions import override
 
+from ...data.input_network import Actuator
 from ...io.errors import InputError
 from ...io.progress import Progress
 from ...settings.learning import EpochSettings, TrainerSettings
-from .actuator import Actuator
 from .networks import Model, StateMap
 
 _SAVE_SECONDS = 10.0

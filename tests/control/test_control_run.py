@@ -20,7 +20,6 @@ from warp_resphys.control.control_stages import controllers_of, driven_settings,
 from warp_resphys.control.controllers import Estimator
 from warp_resphys.control.polynomials import SquaredPolynomial
 from warp_resphys.control.reduction import reduce
-from warp_resphys.control.sampling import check_plannable
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import Laboratory, ReducedWorld
 from warp_resphys.io.safe_files import read_array, read_hdf5
@@ -145,13 +144,6 @@ class TestReducedModel:
         )
         assert off < 0.03 * np.linalg.norm(true)
         assert without > 0.2 * np.linalg.norm(true)
-
-    def test_plans_need_a_linear_response(self, robot):
-        word = "dead_band"
-        check_plannable(robot)
-        robot = robot.with_parameters()
-        robot.parameters[f"tendon_tension_{word}"] = robot.parameters["tendon_tension_rise"]
-        refuses(InputError, f"tendon_tension_{word} is identified", check_plannable, robot)
 
     def test_it_comes_to_rest_where_the_corrected_robot_does(self, robot, model):
         inputs = np.array([0.6, 0.0, 0.3])

@@ -45,10 +45,10 @@ from .control_files import (
 from .control_files import Arrays as MotionArrays
 from .controllers import Controller, JacobianFeedback, LinearRecedingHorizon, RecedingHorizon
 from .linear_model import fit_linear
-from .plan import follow, tracked_of
+from .plan import check_chosen, follow, tracked_of
 from .reduction import reduce
 from .sampling import check_plannable, driven_input
-from .task import Task, motion_name, motions_of
+from .task import Task, motions_of
 from .worlds import Laboratory
 
 _RECEDING: Final = (1e-2, 1)  # weight of the inputs in plans with a receding horizon, and iterations
@@ -90,9 +90,9 @@ def plan_motions(context: StageContext) -> None:
     total = (plan.corrections + 1) * sum(map(task.steps, settings.control.seconds))
     with Progress(context.name, total, "steps") as progress:
         for seconds in settings.control.seconds:
-            paths = np.stack([task.timed(path, seconds, start) for path in task.paths])
+            paths = np.stack([path.timed(seconds, task.time_step, start) for path in task.paths])
             followed = follow(robot, reduced, partial(task.planner, reduced), paths, plan.corrections, progress.advance)
-            plans |= dict(zip(_names(task, seconds), followed, strict=True))
+            plans |= dict(zip(motions_of(settings.control, seconds), followed, strict=True))
     write_motions(context.run_dir / plans_file(model), PLANNED, plans)
     driven = driven_input(robot)
     for name, motion in plans.items():
@@ -156,7 +156,7 @@ def drive(context: StageContext, workers: Workers = ALONE) -> None:
     robot = load(context.run_dir, control.models[-1], settings.device)
     task, cut_up = Task(control, robot), list[TrialPart]()
     for seconds in control.seconds:
-        for name in _names(task, seconds):
+        for name in motions_of(control, seconds):
             steps = task.steps(seconds)
             cut_up.append(TrialPart(name, (name,), steps + 1, partial(_driven, settings, context.run_dir, name, steps)))
     parts = Parts.of(context, workers)
@@ -232,7 +232,7 @@ def _summary(
     """Content of control.json: errors [mm] by speed and controller, computing times, quality of the reduced models."""
     by_speed: dict[str, dict[str, TrackingErrors]] = {}
     for seconds in control.seconds:
-        names = [motion_name(shape, seconds) for shape in control.shapes]
+        names = motions_of(control, seconds)
         errors = {name: 1e3 * np.linalg.norm(motions[name]["points"] - motions[name]["path"], axis=2) for name in names}
         by_speed[f"{seconds:g}"] = {
             controller: {
@@ -258,11 +258,6 @@ def _summary(
         "reduced": models,
         "linear_validation_mm": read_baselines(folder / BASELINES)[0].validation_mm,
     }
-
-
-def _names(task: Task, seconds: float) -> list[str]:
-    """Names of the motions whose curves take so long."""
-    return [motion_name(path.name, seconds) for path in task.paths]
 
 
 def driven_settings(folder: Path) -> StageSettings:
@@ -296,8 +291,8 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
     settings = driven_settings(folder)
     control = settings.control
     names = controllers_of(control)
-    _check("motion", [motion], motions_of(control))
-    _check("controllers", controllers, names)
+    check_chosen("motion", [motion], motions_of(control))
+    check_chosen("controllers", controllers, names)
     robot = load(folder, control.models[-1], settings.device)
     driven, rows = read_motion(folder / DRIVEN, PLAYED, motion), [names.index(name) for name in controllers]
     steps = max(int(min(len(driven["path"]), seconds / robot.time_step)), 1)
@@ -317,9 +312,3 @@ def replay(folder: Path, motion: str, controllers: Sequence[str], seconds: float
         np.array([control.right, control.up], dtype=np.float64),
         np.asarray(robot.simulator.gravity, dtype=np.float64),
     )
-
-
-def _check(key: str, wanted: Sequence[str], choices: Sequence[str]) -> None:
-    unknown = [name for name in wanted if name not in choices]
-    if unknown or not wanted:
-        raise InputError(f"{key} names {unknown[0] if unknown else 'none'}: choose from {', '.join(choices)}.")

@@ -2,7 +2,8 @@
 
 The inputs of a plan are piecewise linear between knots. Each iteration solves a quadratic program for the change of
 the knots: it minimises the distance of the points from the path, plus small penalties on the inputs and their changes.
-Derivatives are differences of motions that are predicted at once.
+Derivatives are differences of motions that are predicted at once. Of the change, its half, quarter and eighth the best
+is taken, as inputs need not follow their commands linearly: a learned actuator changes them, and a valve is slow.
 
 A reduced model plans whole motions by a receding horizon in which it is the robot itself. The robot's simulator plays
 the plan, and the difference of its point from the model's is added to the model's in the next plan (iterative learning
@@ -27,6 +28,7 @@ from .sampling import OnProgress
 _TOLERANCE: Final = 1e-5  # of a quadratic program
 _ENOUGH: Final = 1e-3  # change of a plan, as a share of the inputs' ranges, below which the iterations stop
 _DIFFERENCE: Final = 1e-3  # of knots for derivatives, as a share of the inputs' ranges
+_SHARES: Final = 0.5 ** np.arange(4.0)  # of a change of the knots, of which the best is taken
 _SHORTER: Final = 0.25  # factor on a correction that made the motion worse
 _PLAYED: Final = 3  # plans begin anew after one of so many parts of the horizon
 
@@ -40,13 +42,10 @@ class Planner:
         limits: of each input; the first plan begins at the lower ones.
         path: (T, d) reference of the points after each step [m], NaN where they are free.
         steps: H, of the horizon; past the end of the path, its last point is repeated.
-        pieces: of the piecewise linear inputs.
+        pieces: of the piecewise linear inputs, from 1 to H.
         weight: of the mean squares of the inputs, as shares of their ranges, and of their changes between knots, as
             shares of the rate limits, beside squared distances in millimetres.
         iterations: of Gauss-Newton, at most.
-
-    Raises:
-        InputError: more pieces than steps, or none.
     """
 
     def __init__(
@@ -60,14 +59,14 @@ class Planner:
         weight: float = 1e-2,
         iterations: int = 1,
     ) -> None:
-        if not 1 <= pieces <= steps:
-            raise InputError(f"a plan of {steps} steps cannot have {pieces} pieces: give from 1 to {steps}.")
         self.model, self.tracked, self.limits, self.path = model, tracked, limits, path
         self.steps, self._weight, self._iterations = steps, weight, iterations
         ends = np.arange(1, steps + 1) / steps * pieces  # of the steps, in pieces
         self._lines = np.maximum(1.0 - np.abs(ends[:, None] - np.arange(pieces + 1.0)), 0.0)
         self._most = limits.rate * (steps * model.time_step / pieces) / limits.range
-        self._difference = np.kron(np.eye(pieces) - np.eye(pieces, k=-1), np.eye(model.parts))
+        # From knots as shares of the ranges to their changes as shares of the rate limits, (P, P).
+        jumps = np.kron(np.eye(pieces) - np.eye(pieces, k=-1), np.eye(model.parts))
+        self._jumps = np.asarray(jumps / self._most, dtype=np.float64)
         self._knots = np.full((pieces + 1, model.parts), limits.low)
 
     def plan(
@@ -90,17 +89,27 @@ class Planner:
         if offset is not None:
             goal = goal - (offset if offset.ndim == 1 else offset[rows])
         limits, first = self.limits, self._knots[0]
+
+        def knots_of(shares: FloatArray) -> FloatArray:
+            """Knots (B, K, n) of B plans, the first of which is known."""
+            knots = limits.low + limits.range * shares.reshape(len(shares), -1, len(first))
+            return np.concatenate([np.broadcast_to(first, (len(knots), 1, len(first))), knots], axis=1)
+
+        def points_of(shares: FloatArray) -> FloatArray:
+            """Points (H, B, d) of B plans [m]."""
+            inputs = np.einsum("tk,bkn->tbn", self._lines, knots_of(shares))
+            return np.asarray(self.model.respond(start, inputs, bias) @ self.tracked.T)
+
         shares = ((self._knots[1:] - limits.low) / limits.range).ravel()
         for _ in range(self._iterations):
-            knots = limits.low + limits.range * around(shares, _DIFFERENCE).reshape(1 + len(shares), -1, len(first))
-            knots = np.concatenate([np.broadcast_to(first, (len(knots), 1, len(first))), knots], axis=1)
-            points = self.model.respond(start, np.einsum("tk,bkn->tbn", self._lines, knots), bias) @ self.tracked.T
+            points = points_of(around(shares, _DIFFERENCE))
             slopes = np.moveaxis(points[:, 1:] - points[:, :1], 1, 2) / _DIFFERENCE
             step = self._step(slopes, points[:, 0] - goal, shares)
-            shares = shares + step
+            trials = shares + _SHARES[:, None] * step
+            shares = trials[self._costs(points_of(trials) - goal[:, None], trials).argmin()]
             if np.abs(step).max() < _ENOUGH:
                 break
-        knots = np.concatenate([first[None], limits.low + limits.range * shares.reshape(-1, len(first))])
+        (knots,) = knots_of(shares[None])
         inputs = self._lines @ knots
         series, at = np.concatenate([knots[:1], inputs]), np.arange(len(knots)) / (len(knots) - 1) * self.steps
         later = np.minimum(at + played, self.steps)
@@ -109,16 +118,24 @@ class Planner:
 
     def _step(self, slopes: FloatArray, errors: FloatArray, shares: FloatArray) -> FloatArray:
         """Change (P,) of the knots after the first, as shares (P,) of the inputs' ranges."""
-        first = (self._knots[0] - self.limits.low) / self.limits.range
         finite = np.isfinite(errors).ravel()
         j = 1e3 * slopes.reshape(errors.size, -1) * finite[:, None]
         pull = j.T @ (1e3 * np.where(finite, errors.ravel(), 0.0))
-        d = np.asarray(self._difference / self._most, dtype=np.float64)
-        jump = d @ shares - np.concatenate([first, np.zeros(len(shares) - len(first))]) / self._most
-        weight = self._weight * max(errors.size, 1) / len(shares)
+        d, jump = self._jumps, self._changes(shares)
+        weight = self._weight * errors.size / len(shares)
         hessian = j.T @ j + weight * (np.eye(len(shares)) + d.T @ d)
         pull = pull + weight * (shares + d.T @ jump)
         return solve_program(hessian, pull, d, -1.0 - jump, 1.0 - jump, -shares, 1.0 - shares)
+
+    def _changes(self, shares: FloatArray) -> FloatArray:
+        """Changes (..., P) between knots, as shares of the rate limits."""
+        first = (self._knots[0] - self.limits.low) / self.limits.range
+        return np.asarray(shares @ self._jumps.T - np.pad(first, (0, shares.shape[-1] - len(first))) / self._most)
+
+    def _costs(self, errors: FloatArray, shares: FloatArray) -> FloatArray:
+        """What the plans (B, P) minimise, (B,), for errors (H, B, d) of their points [m]."""
+        size = (shares**2).mean(1) + (self._changes(shares) ** 2).mean(1)
+        return np.asarray(np.nansum(1e6 * errors**2, axis=(0, 2)) + self._weight * errors[:, 0].size * size)
 
 
 def solve_program(
@@ -157,12 +174,16 @@ def tracked_of(labels: Sequence[str], chosen: Sequence[str]) -> FloatArray:
     Raises:
         InputError: an unknown marker, or none.
     """
-    unknown = [label for label in chosen if label not in labels]
-    if unknown or not chosen:
-        what = f"names {unknown[0]!r}" if unknown else "names no marker"
-        raise InputError(f"tracked {what}: choose from {', '.join(labels)}.")
+    check_chosen("tracked", chosen, labels)
     weights = [[chosen.count(label) / len(chosen) for label in labels]]
     return np.asarray(np.kron(weights, np.eye(3)), dtype=np.float64)
+
+
+def check_chosen(key: str, chosen: Sequence[str], known: Sequence[str]) -> None:
+    """Raises an `InputError` about a setting unless it has names, all of which are known."""
+    unknown = [name for name in chosen if name not in known]
+    if unknown or not chosen:
+        raise InputError(f"{key} names {unknown[0] if unknown else 'none'}: choose from {', '.join(known)}.")
 
 
 def follow(

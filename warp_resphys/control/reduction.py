@@ -131,6 +131,7 @@ def fingerprint(robot: Robot) -> str:
     if learned is not None:
         arrays |= {name: value.numpy(force=True) for name, value in learned.network.state_dict().items()}
     plain = [about.settings.plain(), about.material.plain(), about.seen, about.placement, robot.labels]
+    plain += [{name: network.plain()} for name, network in about.actuator.items()]
     made = hashlib.sha256(json.dumps(to_plain([*plain, robot.simulator.integrator, robot.time_step])).encode())
     for name, array in sorted(arrays.items()):
         made.update(name.encode() + np.ascontiguousarray(array, dtype=np.float32).tobytes())

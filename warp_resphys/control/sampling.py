@@ -9,7 +9,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
-from ..data.input_response import SLOPES, InputResponse, draw_inputs, response_of
+from ..data.input_response import InputResponse, draw_inputs, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
 from ..io.arrays import FloatArray
@@ -120,22 +120,17 @@ def _value(robot: Robot, name: str) -> torch.Tensor:
 
 
 def check_plannable(robot: Robot) -> None:
-    """Refuses a robot whose input does not follow its commands linearly: plans need the derivatives.
+    """Refuses a robot whose input does not change with some of its commands, where plans have no derivatives.
 
     Raises:
         InputError: such a response, or no input, or several.
     """
     driven = driven_input(robot)
-    if driven.name in robot.description.actuator:
-        raise InputError(
-            f"the {driven.quantity.words} is changed by a learned actuator, but plans need an input that follows its "
-            "commands linearly: plan with control.models=[sysid], or set actuator=null or control=none."
-        )
-    for word in ("slew", "dead_band", "zero", "backlash", *SLOPES):
+    for word in ("dead_band", "zero", "backlash"):
         if any(f"{name}_".startswith(f"{driven.name}_{word}_") for name in robot.parameters):
             raise InputError(
-                f"{driven.name}_{word} is identified, but plans need an input without slew rate, curve, dead band, "
-                "zero or backlash: take it out of identify.parameters, or set control=none."
+                f"{driven.name}_{word} is identified, but plans need an input without dead band, zero or backlash: "
+                "take it out of identify.parameters, or set control=none."
             )
 
 
@@ -149,17 +144,15 @@ class Source:
 
     def __init__(self, robot: Robot, driven: RobotInput) -> None:
         self.robot, self.input, simulator = robot, driven, robot.simulator
-        assert driven.low is not None
-        assert driven.high is not None
-        self._low, self._high = (np.asarray(bound, dtype=np.float64) for bound in (driven.low, driven.high))
         self.parts, self.rest = len(driven.parts), simulator.rest_positions
         self.learned: Learned | None = robot.description.learned
         self.filters = robot.description.filters if self.learned is not None else ()
         values = {name: float(value[0]) for name, value in robot.parameters.items()}
-        self.range, self.moving = np.stack([self._low, self._high]), np.flatnonzero(self._high > self._low)
+        self.range = np.array([driven.low, driven.high], dtype=np.float64)
+        self.moving = np.flatnonzero(np.ptp(self.range, axis=0))
         self.acts = response_of(driven.quantity, values, driven.parts, robot.description.actuator)
         self.response = InputResponse(robot.time_step, **self.acts)
-        reach = np.abs(self.response.still(np.stack([self._low, self._high]))).max(0)
+        reach = np.abs(self.response.still(self.range)).max(0)
         self.scale = np.where(reach > 0.0, reach, 1.0)
         damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))}
         words = {name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name}
@@ -179,7 +172,7 @@ class Source:
 
     def commands(self, shares: FloatArray) -> FloatArray:
         """Commands (..., n) for shares of the range of the trials."""
-        return self._low + shares * (self._high - self._low)
+        return np.asarray(self.range[0] + shares * np.ptp(self.range, axis=0))
 
     def acting(self, commands: FloatArray) -> FloatArray:
         """Moving inputs (..., n') under constant commands (..., n), in units of the scale."""

@@ -88,8 +88,8 @@ class Path:
         second /= np.linalg.norm(second)
         return np.asarray(np.asarray(self.centre) + flat[:, :1] * first + flat[:, 1:] * second)
 
-    def timed(self, seconds: float, time_step: float, lead: FloatArray | None = None) -> FloatArray:
-        """Positions of the point (T + 1, 3) at the time steps [m]; it starts and ends at rest.
+    def timed(self, seconds: float, time_step: float, lead: FloatArray) -> FloatArray:
+        """Reference (T, 3) of the point after each step [m]; it starts and ends at rest.
 
         Args:
             seconds: duration of the curve.
@@ -105,10 +105,8 @@ class Path:
         curve = self.points
         at = _eased(np.arange(steps + 1) / steps) * (len(curve) - 1)
         points = _interpolated(at, np.arange(len(curve)), curve)
-        if lead is None:
-            return points
         before = max(steps // 4, 5)
-        share = _smooth(np.arange(before) / before)[:, None]
+        share = _smooth(np.arange(1, before) / before)[:, None]
         return np.concatenate([lead + share * (points[0] - lead), points])
 
 
@@ -179,11 +177,7 @@ class Task:
 
     def steps(self, seconds: float) -> int:
         """Number T of steps of a motion whose curve takes so long."""
-        return len(self.timed(self.paths[0], seconds, np.zeros(3)))
-
-    def timed(self, path: Path, seconds: float, start: FloatArray) -> FloatArray:
-        """Reference (T, 3) after each step of a motion from a start (3,) [m]."""
-        return path.timed(seconds, self.time_step, lead=start)[1:]
+        return len(self.paths[0].timed(seconds, self.time_step, np.zeros(3)))
 
     def planner(
         self,
@@ -254,11 +248,6 @@ class Task:
         return best, places(best[None])[0]
 
 
-def motions_of(figures: FigureSettings) -> list[str]:
-    """Returns the names of all motions: each curve at each speed, such as ``eight_4s``."""
-    return [motion_name(shape, seconds) for seconds in figures.seconds for shape in figures.shapes]
-
-
-def motion_name(shape: str, seconds: float) -> str:
-    """Returns the name of a motion in files and tables."""
-    return f"{shape}_{seconds:g}s"
+def motions_of(figures: FigureSettings, *durations: float) -> list[str]:
+    """Returns the names of all motions, or of those of some durations: each curve at each speed, as ``eight_4s``."""
+    return [f"{shape}_{seconds:g}s" for seconds in durations or figures.seconds for shape in figures.shapes]

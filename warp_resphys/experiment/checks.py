@@ -62,11 +62,6 @@ def check_run(run: RunSettings) -> None:
     if run.actuator is not None and drive is None:
         raise InputError("a learned actuator needs a robot with pressures, tendons or muscles: set actuator=null.")
     if run.control is not None:
-        if run.actuator is not None and {"actuator", "resphys"} & {*run.control.models, *run.control.receding}:
-            raise InputError(
-                "plans need inputs that follow their commands linearly, which those of a learned actuator do not: set "
-                "control.models and control.receding to [sysid], or actuator=null."
-            )
         if find_spec("piqp") is None:
             raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
         if drive is None:

@@ -175,7 +175,7 @@ class _SplitStages:
 
     def identification(self) -> None:
         """Adds the identification of parameters and law, its test on other bodies, and the learned actuator."""
-        run, digests = self.run.model_copy(update={"actuator": None}), self._common["files"]
+        run, digests = self.run.model_copy(update={"actuator": None, "control": None}), self._common["files"]
         if run.identify is not None:
             self.add("identify", identify, (files.IDENTIFICATION,), ("seed",), run=run.model_copy(update={"law": None}))
             self._identified = ("identify",)

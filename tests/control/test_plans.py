@@ -8,12 +8,10 @@ import torch
 
 from support.configured import settings
 from support.main_job import DRIVEN, ROD
-from support.refusals import refuses
-from warp_resphys import InputError, Robot
+from warp_resphys import Robot
 from warp_resphys.control import plan
 from warp_resphys.control.control_files import read_reduced, write_reduced
 from warp_resphys.control.reduction import fingerprint, reduce
-from warp_resphys.control.sampling import check_plannable
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import laboratory_robot
 from warp_resphys.data.input_network import InputNetwork
@@ -89,13 +87,6 @@ def test_a_response_with_kinks_is_planned_with(model, task, path, response, most
     inputs = plan._planned(bent, task.planner(bent, path), 0.0 * path)
     points = bent.respond(bent.rest(), inputs[:, None])[:, 0] @ task.tracked.T
     assert 1e3 * np.linalg.norm(points - path, axis=1).mean() < most
-
-
-def test_only_inputs_that_stay_while_commands_change_are_refused(robot):
-    check_plannable(robot.with_parameters(tendon_tension_slew=0.1, tendon_tension_slope_2=0.8))
-    for word in ("dead_band", "zero", "backlash"):
-        idle = robot.with_parameters(**{f"tendon_tension_{word}_front": 0.1})
-        refuses(InputError, f"tendon_tension_{word} is identified", check_plannable, idle)
 
 
 def test_a_robot_with_another_actuator_has_another_reduced_model(robot, model):

@@ -184,6 +184,7 @@ CASES = {
         ("control.reduction.modes", "control.reduction.modes=[4,4]"),
         ("control is for a robot with markers", "data.folds=leave_one_out"),
         ("reduced model, which has no contact", FLOOR.replace("005", "5")),
+        ("tendon_tension_zero_front is id.* plans", "+identify.parameters.tendon_tension_zero_front={lower:0,upper:1}"),
     ],
     ("experiment=crawler",): [
         ("phases has 2 values, but the body has 3 muscles: give", "laboratory.trials.fast.waves.phases=[0,1]"),

@@ -47,7 +47,7 @@ from .controllers import Controller, JacobianFeedback, LinearRecedingHorizon, Re
 from .linear_model import fit_linear
 from .plan import check_chosen, follow, tracked_of
 from .reduction import reduce
-from .sampling import check_plannable, driven_input
+from .sampling import driven_input
 from .task import Task, motions_of
 from .worlds import Laboratory
 
@@ -64,7 +64,6 @@ def reduce_robot(context: StageContext) -> None:
     """
     settings: StageSettings = context.settings
     robot = load(context.run_dir, settings.model, settings.device)
-    check_plannable(robot)
     with Progress(context.name, settings.control.reduction.total, "samples") as progress:
         reduced = reduce(robot, settings.control.reduction, settings.seed, progress.advance)
     write_reduced(context.run_dir / reduced_file(settings.model), reduced)

@@ -119,21 +119,6 @@ def _value(robot: Robot, name: str) -> torch.Tensor:
     return torch.as_tensor(known, dtype=torch.float64)
 
 
-def check_plannable(robot: Robot) -> None:
-    """Refuses a robot whose input does not change with some of its commands, where plans have no derivatives.
-
-    Raises:
-        InputError: such a response, or no input, or several.
-    """
-    driven = driven_input(robot)
-    for word in ("dead_band", "zero", "backlash"):
-        if any(f"{name}_".startswith(f"{driven.name}_{word}_") for name in robot.parameters):
-            raise InputError(
-                f"{driven.name}_{word} is identified, but plans need an input without dead band, zero or backlash: "
-                "take it out of identify.parameters, or set control=none."
-            )
-
-
 class Source:
     """Samples a robot.
 

@@ -16,7 +16,7 @@ from ..energies.catalogue import read_material
 from ..energies.convex_material import ConvexMaterial
 from ..fem.bodies import Body
 from ..io.errors import InputError, naming, number_of
-from ..learning.parameters import MASS_FACTOR, check_names, check_ranges, identifiable_parameters
+from ..learning.parameters import MASS_FACTOR, check_names, check_ranges, command_of, identifiable_parameters
 from ..learning.residuals.networks import core_factory
 from ..learning.residuals.reconstruction import make_reconstructor
 from ..mesh.selection import vertices_at
@@ -34,6 +34,7 @@ from .simulate import substeps_of, target_settings, vertices_in
 from .splits import trials_of
 
 _ELASTIC = ("youngs_modulus", "poissons_ratio")
+_IDLE = ("dead_band", "zero", "backlash")  # responses that leave an input where it is while commands change
 
 
 def check_run(run: RunSettings) -> None:
@@ -66,6 +67,12 @@ def check_run(run: RunSettings) -> None:
             raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
         if drive is None:
             raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
+        for name in () if run.identify is None else run.identify.parameters:
+            if command_of(simulator, name)[1] in _IDLE:
+                raise InputError(
+                    f"{name} is identified, but plans need an input without dead band, zero or backlash, which changes "
+                    "with every command: take it out of identify.parameters, or set control=none."
+                )
 
 
 def _check_target(run: RunSettings, body: Body, drive: Drive | None) -> None:

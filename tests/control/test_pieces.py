@@ -94,6 +94,18 @@ class TestPrograms:
         np.testing.assert_allclose(tracked_of("abc", ["a", "c"]) @ markers.ravel(), markers[[0, 2]].mean(0))
         refuses(InputError, "tracked names d: choose from a, b, c", tracked_of, "abc", ["d"])
 
+    def test_a_plan_keeps_out_of_inputs_for_which_the_model_diverges(self):
+        class Model:
+            """A point that is where its input is, up to 0.6."""
+
+            parts, time_step = 1, 0.1
+
+            def respond(self, start, inputs, bias):
+                return np.where(inputs > 0.6, np.nan, inputs)
+
+        planner = Planner(Model(), np.eye(1), LimitsOfInputs(low=0.0, high=1.0, rate=100.0), np.ones((4, 1)), 4, 1)
+        np.testing.assert_allclose(planner.plan(0, None)[-1], 0.5, rtol=0.1)  # half of the whole step
+
 
 @pytest.mark.parametrize(("activation", "blocks"), [("silu", 1), ("normalised_elu", 3)])
 def test_the_evaluator_is_the_network(activation, blocks):

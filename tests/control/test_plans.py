@@ -12,6 +12,7 @@ from warp_resphys import Robot
 from warp_resphys.control import plan
 from warp_resphys.control.control_files import read_reduced, write_reduced
 from warp_resphys.control.reduction import fingerprint, reduce
+from warp_resphys.control.sampling import Source, driven_input
 from warp_resphys.control.task import Task
 from warp_resphys.control.worlds import laboratory_robot
 from warp_resphys.data.input_network import InputNetwork
@@ -93,3 +94,9 @@ def test_a_robot_with_another_actuator_has_another_reduced_model(robot, model):
     again, other = (Robot(replace(robot.description, actuator=actuator(-0.3, creep))) for creep in (0.15, 0.2))
     assert fingerprint(again) == model.robot
     assert fingerprint(other) != model.robot
+
+
+def test_tensions_that_cancel_when_all_are_commanded_still_have_a_scale(robot):
+    cancelling = Robot(replace(robot.description, actuator=actuator(-0.3, 0.0, -0.35)))
+    source = Source(cancelling, driven_input(cancelling))
+    np.testing.assert_allclose(source.scale, 0.7 * LIMIT)

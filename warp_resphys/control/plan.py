@@ -2,8 +2,8 @@
 
 The inputs of a plan are piecewise linear between knots. Each iteration solves a quadratic program for the change of
 the knots: it minimises the distance of the points from the path, plus small penalties on the inputs and their changes.
-Derivatives are differences of motions that are predicted at once. Of the change, its half, quarter and eighth the best
-is taken, as inputs need not follow their commands linearly: a learned actuator changes them, and a valve is slow.
+Derivatives are differences of motions that are predicted at once. The best of the whole change, its half, quarter and
+eighth is taken, as inputs need not follow their commands linearly, as with a learned actuator or a slow valve.
 
 A reduced model plans whole motions by a receding horizon in which it is the robot itself. The robot's simulator plays
 the plan, and the difference of its point from the model's is added to the model's in the next plan (iterative learning
@@ -106,7 +106,7 @@ class Planner:
             slopes = np.moveaxis(points[:, 1:] - points[:, :1], 1, 2) / _DIFFERENCE
             step = self._step(slopes, points[:, 0] - goal, shares)
             trials = shares + _SHARES[:, None] * step
-            shares = trials[self._costs(points_of(trials) - goal[:, None], trials).argmin()]
+            shares = trials[self._costs(points_of(trials), goal, trials).argmin()]
             if np.abs(step).max() < _ENOUGH:
                 break
         (knots,) = knots_of(shares[None])
@@ -132,10 +132,12 @@ class Planner:
         first = (self._knots[0] - self.limits.low) / self.limits.range
         return np.asarray(shares @ self._jumps.T - np.pad(first, (0, shares.shape[-1] - len(first))) / self._most)
 
-    def _costs(self, errors: FloatArray, shares: FloatArray) -> FloatArray:
-        """What the plans (B, P) minimise, (B,), for errors (H, B, d) of their points [m]."""
+    def _costs(self, points: FloatArray, goal: FloatArray, shares: FloatArray) -> FloatArray:
+        """Costs (B,) of plans (B, P) with points (H, B, d) [m] and goals (H, d); infinite where the model diverges."""
+        errors = np.where(np.isfinite(goal)[:, None], points - goal[:, None], 0.0)
         size = (shares**2).mean(1) + (self._changes(shares) ** 2).mean(1)
-        return np.asarray(np.nansum(1e6 * errors**2, axis=(0, 2)) + self._weight * errors[:, 0].size * size)
+        costs = 1e6 * (errors**2).sum((0, 2)) + self._weight * goal.size * size
+        return np.where(np.isfinite(costs), costs, np.inf)
 
 
 def solve_program(

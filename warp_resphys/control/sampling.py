@@ -137,7 +137,9 @@ class Source:
         self.moving = np.flatnonzero(np.ptp(self.range, axis=0))
         self.acts = response_of(driven.quantity, values, driven.parts, robot.description.actuator)
         self.response = InputResponse(robot.time_step, **self.acts)
-        reach = np.abs(self.response.still(self.range)).max(0)
+        # Parts are also commanded one at a time, as a learned actuator may let one part reduce the input of another.
+        alone = self.range[0] + np.diag(np.ptp(self.range, axis=0))
+        reach = np.abs(self.response.still(np.concatenate([self.range, alone]))).max(0)
         self.scale = np.where(reach > 0.0, reach, 1.0)
         damping = {name: 0.0 for name in simulator.parameters if name.endswith((*VISCOUS, MASS_DAMPING))}
         words = {name: word for name in simulator.parameters for word in PRONY_RATIOS if word in name}

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 import warp_resphys as wr
 from support.refusals import refuses
 from warp_resphys import ObservedMotions, evaluate, fit_actuator
-from warp_resphys.data.input_network import InputNetwork
+from warp_resphys.data.input_network import Actuator, InputNetwork
 from warp_resphys.data.input_response import InputResponse
 from warp_resphys.energies import Sphere
 from warp_resphys.io.errors import InputError
@@ -19,6 +20,7 @@ from warp_resphys.learning.identification.sensitivity import sensitivities
 from warp_resphys.learning.observed_motions import Identified
 from warp_resphys.learning.residuals.actuator_fit import ActuatorFitting, felt_inputs
 from warp_resphys.learning.residuals.in_the_loop import InTheLoop
+from warp_resphys.learning.residuals.linearised import Linearised, gauss_newton_factor
 from warp_resphys.settings.learning import ActuatorSettings
 
 MESH = wr.box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
@@ -136,7 +138,7 @@ def test_the_actuator_is_learned_and_predicts_other_motions(simulator, motions, 
 
 def test_the_first_weights_alone_bring_the_motions_closer(simulator, motions):
     fitting = ActuatorFitting(simulator, motions, MANY, ("motion 3",))
-    begun = replace(Identified(), actuator=fitting._begun(MANY, QUICK, 0, "fit", 3).inputs)
+    begun = replace(Identified(), actuator=fitting._begun(MANY, QUICK, 0, "fit", 3)[0].inputs)
     errors = [np.mean([row.mean() for row in fitting._rolled_out(one, OTHERS)]) for one in (begun, Identified())]
     assert errors[0] < 0.4 * errors[1]
 
@@ -232,12 +234,97 @@ def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, 
 def test_the_scale_of_the_loss_changes_nothing(simulator, motions):
     fitting, weights = ActuatorFitting(simulator, motions, MANY), []
     for scale in (1.0, 2.0**-30):
-        model, loss = fitting._begun(MANY, QUICK, 0, "fit", 0), fitting._loss(MANY)
-        loss._weights = [scale * weight for weight in loss._weights]
+        (model, _), loss = fitting._begun(MANY, QUICK, 0, "fit", 0), fitting._loss(MANY)
+        loss.weights = [scale * weight for weight in loss.weights]
         InTheLoop(model, loss, loss, QUICK.changed(penalty=0.0)).run_epoch()
         weights.append(torch.cat([weight.detach().flatten() for weight in model.parameters()]))
     assert weights[0].any()
     torch.testing.assert_close(*weights)
+
+
+def linearised_motions(simulator, motions, network):
+    """Motions under a network, the observed ones of two trials marked as not seen in part."""
+    fitting = ActuatorFitting(simulator, motions, MANY)
+    ((replay, start),) = fitting._replays(MANY)
+    felt = felt_inputs(replay, {}, QUICK.filters)
+    model = Actuator({"tendon_tension": network(felt["tendon_tension"])})
+    one = Linearised.of(replay, start, {}, model, felt)
+    seen = one.points.clone()
+    seen[0, 3:9, 1], seen[2, -5:] = torch.nan, torch.nan
+    return replace(one, replay=replay.changed(trials=replace(replay.trials, observed=seen))), model
+
+
+def test_the_gauss_newton_matrix_is_the_hessian_where_the_motions_are_met(simulator, motions):
+    def network(felt):
+        made = InputNetwork(felt.amin((0, 1)), felt.amax((0, 1)), QUICK.filters, 3)
+        torch.manual_seed(0)
+        for weight in made.parameters():
+            torch.nn.init.normal_(weight, std=0.3)
+        return made
+
+    one, model = linearised_motions(simulator, motions, network)
+    penalty, unit, weights = 1e-3, 0.1, [*model.parameters()]
+    weights_of_trials = one.replay.trials.loss_weight
+    factor = gauss_newton_factor([one], [weights_of_trials], model, penalty, unit)
+    torch.testing.assert_close(
+        gauss_newton_factor([one, one], [0.5 * weights_of_trials] * 2, model, penalty, unit), factor
+    )
+    at, gradients = parameters_to_vector(weights).detach(), []
+    along = torch.randn(len(at), generator=torch.Generator().manual_seed(1)).double()
+    for sign in (1.0, -1.0):
+        vector_to_parameters(at + sign * 1e-5 * along, weights)
+        errors = one.errors(model)[0].square().sum((1, 2, 3))
+        loss = (errors * weights_of_trials).sum() + penalty * sum(w.square().sum() for w in weights)
+        gradients.append(parameters_to_vector(torch.autograd.grad(loss / unit, weights)))
+    expected = (gradients[0] - gradients[1]) / 2e-5
+    torch.testing.assert_close(
+        factor @ (factor.T @ along), expected, rtol=1e-5, atol=1e-6 * float(expected.abs().max())
+    )
+
+
+class Quadratic:
+    """A loss of the weights w of an actuator with the Hessian H."""
+
+    def __init__(self, hessian, least):
+        self._hessian, self._least = hessian, least
+
+    def __call__(self, model):
+        off = parameters_to_vector(model.parameters()) - self._least
+        return 0.5 * off @ self._hessian @ off
+
+    def error_mm(self, model):
+        return float(self(model))
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_training_in_the_factor_of_the_hessian_ends_after_one_step(resumed):
+    torch.manual_seed(0)
+    model = Actuator({"pressure": InputNetwork(torch.zeros(2), torch.ones(2), (), 3)})
+    least = torch.randn(len(parameters_to_vector(model.parameters()))).double()
+    root = torch.randn(len(least), len(least)).double() * torch.logspace(-3, 0, len(least)).double()
+    loss = Quadratic(root @ root.T + 1e-6 * torch.eye(len(least)).double(), least)
+    unit = float(loss(model))
+    factor = torch.linalg.cholesky(loss._hessian / unit)
+    settings = ActuatorSettings(penalty=0.0)
+    trainer = InTheLoop(model, loss, loss, settings, 1, factor)
+    trainer.begin()
+    if resumed:
+        again = InTheLoop(model, loss, loss, settings, 1)
+        again.resume(*trainer.snapshot())
+        trainer = again
+    assert trainer.run_epoch()["train_loss"] < 1e-9 * unit
+
+
+def test_the_gauss_newton_matrix_makes_the_training_faster(simulator, motions):
+    fitting, losses = ActuatorFitting(simulator, motions, MANY), []
+    settings = QUICK.changed(epochs=3)
+    for preconditioned in (True, False):
+        model, factor = fitting._begun(MANY, settings, 0, "fit", 1)
+        trainer = InTheLoop(
+            model, fitting._loss(MANY), fitting._loss(MANY), settings, 3, factor if preconditioned else None
+        )
+        losses.append([trainer.run_epoch()["train_loss"] for _ in range(3)])
+    assert losses[0][-1] < 0.7 * losses[1][-1]
 
 
 def test_trials_without_inputs_are_refused(simulator):

@@ -11,7 +11,7 @@ derivatives J_k of the points p_k of each frame by lasting changes of the inputs
     sum_k |p_k + J_k (f_w - f)_k - y_k|^2 + penalty |w|^2,
 
 in a few rounds, each from a new roll-out. L-BFGS through the simulator (`InTheLoop`) then also sees what the inputs do
-in a step, as when they excite a vibration.
+in a step, as when they excite a vibration; it is preconditioned by the Gauss-Newton matrix of the sum above.
 """
 
 import copy
@@ -31,22 +31,19 @@ from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError, checks_types
 from ...io.progress import Progress
 from ...settings.learning import ActuatorSettings
-from ...stepping.inputs import Inputs
-from ...stepping.rollout import sample
 from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import HUNG
 from ..replay import Replay, Start
 from ..scores import HeldOutTest, held_out_test, text_of
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
+from .linearised import Linearised, fit_linearised, gauss_newton_factor, squares_of
 from .training import Snapshot, run_epochs
 
 log = logging.getLogger(__name__)
 
 _OTHERS: Final = frozenset({*HUNG, *(quantity.name for quantity in MOTION)})  # inputs that drive no actuator
-_CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are computed
 _SHARES: Final = (1.0, 0.5, 0.25)  # of a round's change of the weights that are tried
-_ITERATIONS: Final = 200  # of L-BFGS on linearised motions
 
 
 @checks_types
@@ -128,9 +125,10 @@ class ActuatorFitting:
         folds = [] if self.validation else left_out_in_turn(self.motions.trials, self.train)
         if folds:
             epochs, test = self._held_out(folds, settings, seed, name)
-        model = self._begun(self.train, settings, seed, name, settings.rounds if resumed is None else 0)
+        model, factor = self._begun(self.train, settings, seed, name, settings.rounds if resumed is None else 0)
         train = self._loss(self.train)
-        trainer = InTheLoop(model, train, self._loss(self.validation) if self.validation else train, settings, epochs)
+        judge = self._loss(self.validation) if self.validation else train
+        trainer = InTheLoop(model, train, judge, settings, epochs, factor)
         if resumed is not None:
             trainer.resume(*resumed)
         trainer.begin()
@@ -154,11 +152,12 @@ class ActuatorFitting:
         parts, names, below = [], list[str](), list[FloatArray]()
         for number, left_out in enumerate(folds):
             rest = [one for one in self.train if one not in left_out]
-            model = self._begun(rest, settings, seed, f"{name}: without {number + 1} of {len(folds)}", settings.rounds)
+            label = f"{name}: without {number + 1} of {len(folds)}"
+            model, factor = self._begun(rest, settings, seed, label, settings.rounds)
             held_out = self._loss(left_out)
             held_out.error_mm(None)
             names, below = names + self._in_batches(left_out), below + held_out.judged[-1]
-            parts.append((model, self._loss(rest), held_out))
+            parts.append((model, self._loss(rest), held_out, factor))
         with Progress(f"{name}: held out", len(folds) * settings.epochs, "epochs at most") as progress:
             epochs, (_, errors) = cross_validated_epochs(parts, settings, progress.advance)
         return epochs, self._tested(names, HELD_OUT, errors, below)
@@ -190,8 +189,10 @@ class ActuatorFitting:
         replays = self.motions.replays(self.simulator, names, self.identified)
         return [(self.motions.learned(replay), start) for replay, start in replays]
 
-    def _begun(self, names: Sequence[str], settings: ActuatorSettings, seed: int, name: str, rounds: int) -> Actuator:
-        """An actuator that is fitted to linearised motions of some trials.
+    def _begun(
+        self, names: Sequence[str], settings: ActuatorSettings, seed: int, name: str, rounds: int
+    ) -> tuple[Actuator, torch.Tensor | None]:
+        """An actuator that is fitted to linearised motions of some trials, and the factor of `InTheLoop` from the last.
 
         A round ends at the first share of its change of the weights that makes the motions closer. Without one, and
         where a motion has no derivatives, the weights stay as they are.
@@ -202,32 +203,33 @@ class ActuatorFitting:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             model = _untrained(felt, settings)
-        loss, penalty = self._loss_of(replays), settings.penalty
+        loss, penalty, linearised = self._loss_of(replays), settings.penalty, list[Linearised]()
         with torch.no_grad():
             least = float(loss(model))
         with Progress(f"{name}: first weights", rounds, "rounds") as progress:
             for number in range(rounds):
                 before = copy.deepcopy(model.network.state_dict())
-                best = least + penalty * float(_squares(model).detach())
+                best = least + penalty * float(squares_of(model).detach())
                 of_batches = zip(replays, felt, strict=True)
                 try:
-                    linearised = [_Linearised.of(*pair, values, model, inputs) for pair, inputs in of_batches]
+                    linearised = [Linearised.of(*pair, values, model, inputs) for pair, inputs in of_batches]
                 except ConvergenceError as error:
                     log.info("%s: the first weights are those of %d rounds: %s", name, number, error)
                     break
-                _fit_linearised(linearised, model, penalty)
+                fit_linearised(linearised, loss.weights, model, penalty)
                 after = copy.deepcopy(model.network.state_dict())
                 for share in _SHARES if all(bool(torch.isfinite(x).all()) for x in after.values()) else ():
                     model.network.load_state_dict({k: torch.lerp(before[k], x, share) for k, x in after.items()})
                     found = _value(loss, model)
-                    if found < least and found + penalty * float(_squares(model).detach()) < best:
+                    if found < least and found + penalty * float(squares_of(model).detach()) < best:
                         least = found
                         break
                 else:
                     model.network.load_state_dict(before)
                     break
                 progress.advance()
-        return model
+        total = least + penalty * float(squares_of(model).detach())
+        return model, gauss_newton_factor(linearised, loss.weights, model, penalty, total) if linearised else None
 
 
 def felt_inputs(
@@ -275,86 +277,6 @@ def _untrained(felt: Sequence[Mapping[str, torch.Tensor]], settings: ActuatorSet
     return Actuator(networks).to(next(iter(felt[0].values())).device)
 
 
-@dataclass(frozen=True)
-class _Linearised:
-    """Simulated points (R, T, M, D) of trials as a linear function of changes of their inputs."""
-
-    replay: Replay
-    points: torch.Tensor  # (R, T, M, D), under the inputs with the actuator
-    slopes: dict[str, torch.Tensor]  # (R, T, M, D, C) by the inputs
-    felt: dict[str, torch.Tensor]  # what the networks take, (R, T, C (1 + F))
-    added: dict[str, torch.Tensor]  # by the actuator, (R, T, C)
-
-    @classmethod
-    @torch.no_grad()
-    def of(
-        cls,
-        replay: Replay,
-        start: Start,
-        parameters: Mapping[str, torch.Tensor],
-        model: Actuator,
-        felt: Mapping[str, torch.Tensor],
-    ) -> "_Linearised":
-        """Simulates trials, with the derivatives by lasting changes of the inputs."""
-        replay = replay.changed(actuator=model.inputs)
-        states, prepared = replay.states(start, parameters), replay.prepare(parameters)
-        sizes = {name: _CHANGE * network.unit for name, network in model.inputs.items()}
-        columns = [name for name in sizes for _ in range(model.inputs[name].parts)]
-        repeated = {name: x.repeat(len(columns)) for name, x in parameters.items()}
-        constants, *fields = replay.prepare(
-            repeated or {f"{columns[0]}_factor": replay.trials.times.new_ones(len(columns))}
-        )
-        during, before = (_changed(inputs, sizes, columns) for inputs in fields)
-        series = replay.varied_points(start, prepared, (constants, during, before), len(columns), states)
-        first, *rest = replay.at_frames(series, start).unflatten(0, (1 + len(columns), -1))
-        times = (replay.trials.times - start.delay[:, None]).clamp_min(0.0)
-        slopes: dict[str, list[torch.Tensor]] = {name: [] for name in sizes}
-        for name, moved in zip(columns, rest, strict=True):
-            slopes[name].append((moved - first) / sizes[name])
-        step, count = replay.simulator.time_step, series.shape[1]
-        shown = {name: sample(felt[name][:count].swapaxes(0, 1), times, step) for name in sizes}
-        added = {name: model.inputs[name](x) for name, x in shown.items()}
-        return cls(replay, first, {name: torch.stack(x, -1) for name, x in slopes.items()}, shown, added)
-
-    def errors(self, model: Actuator) -> torch.Tensor:
-        """Points with an actuator less the observed ones (1, R, T, M, D)."""
-        moved = self.points
-        for name, slope in self.slopes.items():
-            change = model.inputs[name](self.felt[name]) - self.added[name]
-            moved = moved + (slope @ change[:, :, None, :, None])[..., 0]
-        return self.replay.errors(moved[None])
-
-
-def _changed(inputs: Inputs, sizes: Mapping[str, float], columns: Sequence[str]) -> Inputs:
-    """Inputs of C R environments, in which each of C parts is changed in turn; its input is named in the columns."""
-    for name in sizes.keys() & inputs.actuation.keys():
-        values = inputs.actuation[name]
-        rows = [row for row, column in enumerate(columns) if column == name]
-        change = values.new_zeros(len(columns), len(rows))
-        change[rows] = sizes[name] * torch.eye(len(rows)).to(values)
-        inputs = inputs.replace(**{name: values + change.repeat_interleave(values.shape[-2] // len(columns), 0)})
-    return inputs
-
-
-def _fit_linearised(linearised: Sequence[_Linearised], model: Actuator, penalty: float) -> None:
-    """Minimises the squared error of linearised motions and the penalty."""
-    weights = [*model.parameters()]
-    lbfgs = torch.optim.LBFGS(weights, max_iter=_ITERATIONS, history_size=20, line_search_fn="strong_wolfe")
-    count = sum(len(one.replay.trials.names) for one in linearised)
-
-    def evaluate() -> float:
-        lbfgs.zero_grad()
-        squares = []
-        for one in linearised:
-            weight = one.replay.trials.loss_weight * len(one.replay.trials.names) / count
-            squares.append((one.errors(model)[0].square().sum((1, 2, 3)) * weight).sum())
-        loss = torch.stack(squares).sum() + penalty * _squares(model)
-        loss.backward()
-        return float(loss.detach())
-
-    lbfgs.step(evaluate)
-
-
 def _value(loss: MotionLoss, model: Actuator) -> float:
     """Loss of an actuator; infinite where the simulation fails."""
     try:
@@ -362,8 +284,3 @@ def _value(loss: MotionLoss, model: Actuator) -> float:
             return float(loss(model))
     except ConvergenceError:
         return float("inf")
-
-
-def _squares(model: Actuator) -> torch.Tensor:
-    """Sum of the squared weights."""
-    return torch.stack([weight.square().sum() for weight in model.parameters()]).sum()

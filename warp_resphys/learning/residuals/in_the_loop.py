@@ -4,7 +4,8 @@ Its gradient goes back through the implicit adjoint of every step (Um et al. 202
 
 An epoch is one iteration of L-BFGS with its line search. Adam's first steps move every weight by the learning rate,
 however small the gradient, which spoils a network that is nearly right; and where the loss comes from the simulator, a
-line search costs less than tuning a schedule of rates.
+line search costs less than tuning a schedule of rates. The variables are the weights, or for an actuator C^T w with
+the Cholesky factor C of an approximate Hessian of the loss.
 
 Few recordings determine only part of a residual force. So the force starts from zero, which is the uncorrected
 simulator, and a penalty on the weights keeps it there as far as the motions allow. An `Actuator` is trained in the same
@@ -17,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from torch.nn.utils import parameters_to_vector
 from typing_extensions import override
 
 from ...data.input_network import Actuator
@@ -55,6 +57,7 @@ class MotionLoss:
         parameters: (1,) identified physical parameters.
 
     Attributes:
+        weights: (R,) of the squared errors of each group's trials.
         judged: for each call of `error_mm`, the mean distances (T,) by frame of each trial [mm], NaN where it diverged.
     """
 
@@ -62,7 +65,7 @@ class MotionLoss:
         self._groups, self._parameters, self.judged = groups, parameters, list[list[FloatArray]]()
         counts = [len(group.replay.trials.names) for group in groups]
         shares = [count / sum(counts) for count in counts]
-        self._weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
+        self.weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
 
     def _errors(self, model: Corrects | None) -> list[torch.Tensor]:
         """(R, T, M, 3) simulated less observed markers of each group [m], of the simulator if the model is None.
@@ -82,7 +85,7 @@ class MotionLoss:
 
     def __call__(self, model: Corrects | None) -> torch.Tensor:
         """Returns the loss, differentiable in the model's weights."""
-        pairs = zip(self._errors(model), self._weights, strict=True)
+        pairs = zip(self._errors(model), self.weights, strict=True)
         return torch.stack([(errors.square().sum((1, 2, 3)) * weight).sum() for errors, weight in pairs]).sum()
 
     def error_mm(self, model: Corrects | None) -> float:
@@ -119,20 +122,30 @@ class InTheLoop(EpochTrainer[Corrected]):
         judge: loss whose error selects the weights, those of the start among them.
         settings: epochs and the penalty on the weights.
         epochs: in place of the configured number; 0 keeps the start.
+        factor: (P, P) lower Cholesky factor C of an approximate Hessian of the loss over its first value, by the P
+            weights w: L-BFGS varies C^T w, in which that Hessian is the identity. It varies w itself if None.
     """
 
     settings: LoopSettings
 
     def __init__(
-        self, model: Corrected, train: MotionLoss, judge: MotionLoss, settings: LoopSettings, epochs: int | None = None
+        self,
+        model: Corrected,
+        train: MotionLoss,
+        judge: MotionLoss,
+        settings: LoopSettings,
+        epochs: int | None = None,
+        factor: torch.Tensor | None = None,
     ) -> None:
         if isinstance(model, ResidualForce):
             with torch.no_grad():
                 _remove_force(model)
         self._train = train
         self._weights = [w for w in model.network.parameters() if w.requires_grad]
+        self._factor, weights = factor, parameters_to_vector(self._weights).detach()
+        self._variables = weights.clone() if factor is None else factor.T @ weights
         self._lbfgs = torch.optim.LBFGS(
-            self._weights,
+            [self._variables],
             max_iter=1,
             max_eval=_EVALUATIONS,
             history_size=settings.memory,
@@ -142,7 +155,7 @@ class InTheLoop(EpochTrainer[Corrected]):
         )
         last = settings.epochs if epochs is None else epochs
         super().__init__(model, self._lbfgs, judge.error_mm, settings.model_copy(update={"epochs": last}))
-        self._last: tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor] | None = None
+        self._last: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
 
     def begin(self) -> None:
         """Records the start as the first candidate, unless training has begun."""
@@ -156,6 +169,12 @@ class InTheLoop(EpochTrainer[Corrected]):
     def _run_epoch(self) -> dict[str, float]:
         """Makes one iteration."""
         self.begin()
+        (group,) = self._lbfgs.param_groups
+        group["lr"] = 1.0
+        if self._factor is not None and self.epoch == 0:
+            self._evaluate()  # L-BFGS divides its first step by the sum of the slopes, which is undone here.
+            assert self._last is not None
+            group["lr"] = max(float(self._last[1].abs().sum()), 1.0)
         self._lbfgs.step(self._evaluate)
         return {"train_loss": float(self._evaluate()) * self._unit}
 
@@ -170,33 +189,54 @@ class InTheLoop(EpochTrainer[Corrected]):
 
     def _evaluate(self) -> torch.Tensor:
         """Returns the loss and sets its gradient; cached, as L-BFGS evaluates the weights that it accepts twice."""
-        if self._last is None or not all(map(torch.equal, self._weights, self._last[0])):
-            self._lbfgs.zero_grad()
+        if self._last is None or not torch.equal(self._variables, self._last[0]):
+            values = self._solved(self._variables, transposed=True).split([w.numel() for w in self._weights])
+            for weight, value in zip(self._weights, values, strict=True):
+                weight.data.copy_(value.view_as(weight))
+            self.model.zero_grad()
             try:
                 loss = self._loss() / self._unit
                 loss.backward()
             except ConvergenceError:
-                self._lbfgs.zero_grad()
+                self.model.zero_grad()
                 loss = torch.tensor(_FAILURE, dtype=torch.float64)
             gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self._weights]
-            self._last = [w.detach().clone() for w in self._weights], gradients, loss.detach()
-        for weight, gradient in zip(self._weights, self._last[1], strict=True):
-            weight.grad = gradient.clone()
+            self._last = self._variables.clone(), self._solved(parameters_to_vector(gradients)), loss.detach()
+        self._variables.grad = self._last[1].clone()
         return self._last[2]
+
+    def _solved(self, vector: torch.Tensor, transposed: bool = False) -> torch.Tensor:
+        """C^-1 x, or C^-T x, of a vector x (P,)."""
+        if self._factor is None:
+            return vector.clone()
+        factor = self._factor.T if transposed else self._factor
+        return torch.linalg.solve_triangular(factor, vector[:, None], upper=transposed)[:, 0]
+
+    @override
+    def snapshot(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+        tensors, metadata = super().snapshot()
+        if self._factor is None:
+            return tensors, metadata
+        return {**tensors, "factor": self._factor, "varied": self._variables.clone()}, metadata
 
     @override
     def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
         super().resume(tensors, metadata)
-        self._last = None
+        factor, self._last = tensors.get("factor"), None
+        self._factor = None if factor is None else factor.to(self._variables)
+        self._variables.copy_(parameters_to_vector(self._weights).detach() if factor is None else tensors["varied"])
 
 
 def cross_validated_epochs(
-    parts: Sequence[tuple[Corrected, MotionLoss, MotionLoss]], settings: LoopSettings, advance: Callable[[], None]
+    parts: Sequence[tuple[Corrected, MotionLoss, MotionLoss, torch.Tensor | None]],
+    settings: LoopSettings,
+    advance: Callable[[], None],
 ) -> tuple[int, tuple[list[FloatArray], list[FloatArray]]]:
     """Returns the number of epochs with the smallest mean error on held-out motions, by cross-validation.
 
     Args:
-        parts: a model to train, and the losses on the motions to train on and on the held-out ones, for each fold.
+        parts: a model to train, the losses on the motions to train on and on the held-out ones, and the factor of
+            `InTheLoop`, for each fold.
         settings: of every training; epochs is the largest number tried, and patience the number of epochs without an
             improvement after which the search ends.
         advance: called after every epoch of every fold.
@@ -206,14 +246,14 @@ def cross_validated_epochs(
         held-out motions [mm], at the start and after that number.
     """
     settings = settings.changed(rollout_every=1)
-    trainers = [InTheLoop(model, train, held_out, settings) for model, train, held_out in parts]
+    trainers = [InTheLoop(model, train, held_out, settings, None, factor) for model, train, held_out, factor in parts]
     for trainer in trainers:
         trainer.begin()
     while True:
         means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
         if trainers[0].finished or len(means) - 1 - best >= settings.patience:
-            judged = [held_out.judged[-len(means) :] for *_, held_out in parts]
+            judged = [held_out.judged[-len(means) :] for _, _, held_out, _ in parts]
             before, after = ([row for of_part in judged for row in of_part[epoch]] for epoch in (0, best))
             return best, (before, after)
         for trainer in trainers:

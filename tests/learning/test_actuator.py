@@ -293,7 +293,7 @@ class Quadratic:
         return 0.5 * off @ self._hessian @ off
 
     def error_mm(self, model):
-        return float(self(model))
+        return float(self(model).detach())
 
 
 @pytest.mark.parametrize("resumed", [False, True])
@@ -303,7 +303,7 @@ def test_training_in_the_factor_of_the_hessian_ends_after_one_step(resumed):
     least = torch.randn(len(parameters_to_vector(model.parameters()))).double()
     root = torch.randn(len(least), len(least)).double() * torch.logspace(-3, 0, len(least)).double()
     loss = Quadratic(root @ root.T + 1e-6 * torch.eye(len(least)).double(), least)
-    unit = float(loss(model))
+    unit = loss.error_mm(model)
     factor = torch.linalg.cholesky(loss._hessian / unit)
     settings = ActuatorSettings(penalty=0.0)
     trainer = InTheLoop(model, loss, loss, settings, 1, factor)

@@ -273,7 +273,7 @@ def test_the_gauss_newton_matrix_is_the_hessian_where_the_motions_are_met(simula
     along = torch.randn(len(at), generator=torch.Generator().manual_seed(1)).double()
     for sign in (1.0, -1.0):
         vector_to_parameters(at + sign * 1e-5 * along, weights)
-        errors = one.errors(model)[0].square().sum((1, 2, 3))
+        errors = one.errors(model).square().sum((1, 2, 3))
         loss = (errors * weights_of_trials).sum() + penalty * sum(w.square().sum() for w in weights)
         gradients.append(parameters_to_vector(torch.autograd.grad(loss / unit, weights)))
     expected = (gradients[0] - gradients[1]) / 2e-5
@@ -315,16 +315,20 @@ def test_training_in_the_factor_of_the_hessian_ends_after_one_step(resumed):
     assert trainer.run_epoch()["train_loss"] < 1e-9 * unit
 
 
-def test_the_gauss_newton_matrix_makes_the_training_faster(simulator, motions):
-    fitting, losses = ActuatorFitting(simulator, motions, MANY), []
-    settings = QUICK.changed(epochs=3)
-    for preconditioned in (True, False):
-        model, factor = fitting._begun(MANY, settings, 0, "fit", 1)
-        trainer = InTheLoop(
-            model, fitting._loss(MANY), fitting._loss(MANY), settings, 3, factor if preconditioned else None
-        )
-        losses.append([trainer.run_epoch()["train_loss"] for _ in range(3)])
-    assert losses[0][-1] < 0.7 * losses[1][-1]
+def test_linearised_motions_follow_changes_of_the_inputs_in_time(simulator, motions):
+    fitting = ActuatorFitting(simulator, motions, MANY)
+    ((replay, start),) = fitting._replays(MANY)
+    felt = felt_inputs(replay, {}, QUICK.filters)
+    model = Actuator({"tendon_tension": InputNetwork(torch.zeros(4), torch.ones(4), QUICK.filters, 3)})
+    one = Linearised.of(replay, start, {}, model, felt)
+    before = one.errors(model)
+    with torch.no_grad():
+        model.inputs["tendon_tension"].linear.weight[:, :2] = 2e-3 * torch.eye(2)
+        exact = replay.errors(replay.changed(actuator=model.inputs)(start))[0] - before
+        at_once = replace(one, kernel=torch.ones(1).double()).errors(model) - before
+        followed = one.errors(model) - before
+    assert (at_once - exact).norm() > 1e-2 * exact.norm()
+    assert (followed - exact).norm() < 0.2 * (at_once - exact).norm()
 
 
 def test_trials_without_inputs_are_refused(simulator):

@@ -279,7 +279,7 @@ class ActuatorSettings(LoopSettings):
     width: Size = setting(24, "width of the hidden layer")
     rounds: Count = setting(4, "linearisations of the motions by the inputs, for the weights to begin with")
     epochs: Count = setting(10, "largest number of iterations of L-BFGS through the simulator, after the rounds")
-    penalty: NotNegative = setting(3.0e-5, "penalty on the squared weights")
+    penalty: NotNegative = setting(1.0e-4, "penalty on the squared weights")
     gate: bool = setting(
         True, "use it only if it is clearly closer to held-out trials than the simulator; false: always"
     )

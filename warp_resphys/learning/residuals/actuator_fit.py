@@ -6,12 +6,13 @@ identified response x to the commands and a network f of x and its exponential m
 
 The first weights come from linearised motions: the paper's equation 6, which changes a simulated motion as little as
 possible to bring it to the markers, with the force restricted to what the inputs can do. A roll-out also gives the
-derivatives J_k of the points p_k of each frame by lasting changes of the inputs; the weights w minimise
+derivatives J of its points p by lasting changes of the inputs, and a kernel k with which points follow changes in time
+(`linearised`). With the change d of the inputs by the networks, the weights w minimise
 
-    sum_k |p_k + J_k (f_w - f)_k - y_k|^2 + penalty |w|^2,
+    sum |p + J (k * d) - y|^2 + trust |d|^2 + penalty |w|^2,
 
-in a few rounds, each from a new roll-out. L-BFGS through the simulator (`InTheLoop`) then also sees what the inputs do
-in a step, as when they excite a vibration; it is preconditioned by the Gauss-Newton matrix of the sum above.
+in a few rounds, each from a new roll-out. L-BFGS through the simulator (`InTheLoop`) follows, preconditioned by the
+Gauss-Newton matrix of this sum without the trust.
 """
 
 import copy
@@ -43,7 +44,7 @@ from .training import Snapshot, run_epochs
 log = logging.getLogger(__name__)
 
 _OTHERS: Final = frozenset({*HUNG, *(quantity.name for quantity in MOTION)})  # inputs that drive no actuator
-_SHARES: Final = (1.0, 0.5, 0.25)  # of a round's change of the weights that are tried
+_NEAR: Final = (math.inf, 0.1, 0.03)  # changes of the inputs that are tried in a round, of the largest input
 
 
 @checks_types
@@ -194,8 +195,8 @@ class ActuatorFitting:
     ) -> tuple[Actuator, torch.Tensor | None]:
         """An actuator that is fitted to linearised motions of some trials, and the factor of `InTheLoop` from the last.
 
-        A round ends at the first share of its change of the weights that makes the motions closer. Without one, and
-        where a motion has no derivatives, the weights stay as they are.
+        A round fits the motions near their inputs, ever nearer until they are closer. Without success, and where a
+        motion has no derivatives, the weights stay as they are.
         """
         values = self.identified.values(self.simulator)
         replays = self._replays(names)
@@ -216,10 +217,9 @@ class ActuatorFitting:
                 except ConvergenceError as error:
                     log.info("%s: the first weights are those of %d rounds: %s", name, number, error)
                     break
-                fit_linearised(linearised, loss.weights, model, penalty)
-                after = copy.deepcopy(model.network.state_dict())
-                for share in _SHARES if all(bool(torch.isfinite(x).all()) for x in after.values()) else ():
-                    model.network.load_state_dict({k: torch.lerp(before[k], x, share) for k, x in after.items()})
+                for near in _NEAR:
+                    model.network.load_state_dict(before)
+                    fit_linearised(linearised, loss.weights, model, penalty, least / near**2)
                     found = _value(loss, model)
                     if found < least and found + penalty * float(squares_of(model).detach()) < best:
                         least = found
@@ -278,7 +278,9 @@ def _untrained(felt: Sequence[Mapping[str, torch.Tensor]], settings: ActuatorSet
 
 
 def _value(loss: MotionLoss, model: Actuator) -> float:
-    """Loss of an actuator; infinite where the simulation fails."""
+    """Loss of an actuator; infinite where the simulation or the weights fail."""
+    if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
+        return math.inf
     try:
         with torch.no_grad():
             return float(loss(model))

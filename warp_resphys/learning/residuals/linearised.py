@@ -1,13 +1,17 @@
 """Observed motions as a linear function of changes of their inputs, by which the networks of an actuator are fitted."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import torch
 from torch.func import functional_call
+from torch.nn.functional import pad
 
 from ...data.input_network import Actuator
+from ...data.input_response import InputResponse
 from ...stepping.inputs import Inputs
 from ...stepping.rollout import sample
 from ..replay import Replay, Start
@@ -17,18 +21,27 @@ _CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are comp
 _ITERATIONS: Final = 200  # of L-BFGS on linearised motions
 _LEAST_SHARE: Final = 1e-9  # of the mean diagonal of the Gauss-Newton matrix, added to be positive definite
 _LEAST_UNIT: Final = 1e-30
-_FRAMES_AT_ONCE: Final = 256  # whose derivatives by all weights are computed together
+_MEMORY: Final = 2.0  # s: length of the kernel with which points follow inputs
+_CORRELATED: Final = 0.2  # s: of the random changes to which it is fitted
+_RIDGE: Final = 1e-3  # of the mean diagonal, added in its fit
+_ALL: Final = slice(None)
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Simulated points (R, T, M, D) of trials as a linear function of changes of their inputs."""
+    """Simulated points (R, T, M, D) of trials as a linear function of changes of their inputs.
+
+    A change u of the inputs moves the points by J (k * u): J are the derivatives by lasting changes, and the kernel k
+    has the vibrations with which the body follows. It is fitted to derivatives along random changes.
+    """
 
     replay: Replay
+    times: torch.Tensor  # (R, T) of the frames since the start [s]
     points: torch.Tensor  # (R, T, M, D), under the inputs with the actuator
     slopes: dict[str, torch.Tensor]  # (R, T, M, D, C) by the inputs
-    felt: dict[str, torch.Tensor]  # what the networks take, (R, T, C (1 + F))
-    added: dict[str, torch.Tensor]  # by the actuator, (R, T, C)
+    kernel: torch.Tensor  # (L,) of the changes in the steps before a state, the last one first
+    felt: dict[str, torch.Tensor]  # what the networks take, (R, K + 1, C (1 + F)), the first before the start
+    acting: dict[str, torch.Tensor]  # inputs with the actuator, (R, K + 1, C)
 
     @classmethod
     @torch.no_grad()
@@ -40,61 +53,123 @@ class Linearised:
         model: Actuator,
         felt: Mapping[str, torch.Tensor],
     ) -> "Linearised":
-        """Simulates trials, with the derivatives by lasting changes of the inputs."""
+        """Simulates trials, with the derivatives by lasting changes of the inputs and along random ones."""
         replay = replay.changed(actuator=model.inputs)
         states, prepared = replay.states(start, parameters), replay.prepare(parameters)
         sizes = {name: _CHANGE * network.unit for name, network in model.inputs.items()}
         columns = [name for name in sizes for _ in range(model.inputs[name].parts)]
-        repeated = {name: x.repeat(len(columns)) for name, x in parameters.items()}
-        constants, *fields = replay.prepare(
-            repeated or {f"{columns[0]}_factor": replay.trials.times.new_ones(len(columns))}
-        )
-        during, before = (_changed(inputs, sizes, columns) for inputs in fields)
-        series = replay.varied_points(start, prepared, (constants, during, before), len(columns), states)
-        first, *rest = replay.at_frames(series, start).unflatten(0, (1 + len(columns), -1))
+        settles = start.at_rest and not replay.is_static  # The derivatives by lasting changes have no transients then.
+        random = _random_changes(prepared[1], sizes, replay.simulator.time_step) if settles else {}
+        sets = len(columns) + bool(random)
+        repeated = {name: x.repeat(sets) for name, x in parameters.items()}
+        unit = {f"{columns[0]}_factor": replay.trials.times.new_ones(sets)}
+        constants, *fields = replay.prepare(repeated or unit)
+        during, before = (_changed(inputs, sizes, columns, sets) for inputs in fields)
+        for name, changes in random.items():
+            during.actuation[name][:, -changes.shape[1] :] += changes
+        series = replay.varied_points(start, prepared, (constants, during, before), sets, states)
+        first, *rest = replay.at_frames(series, start).unflatten(0, (1 + sets, -1))
         times = (replay.trials.times - start.delay[:, None]).clamp_min(0.0)
         slopes: dict[str, list[torch.Tensor]] = {name: [] for name in sizes}
-        for name, moved in zip(columns, rest, strict=True):
+        for name, moved in zip(columns, rest, strict=False):
             slopes[name].append((moved - first) / sizes[name])
-        step, count = replay.simulator.time_step, series.shape[1]
-        shown = {name: sample(felt[name][:count].swapaxes(0, 1), times, step) for name in sizes}
-        added = {name: model.inputs[name](x) for name, x in shown.items()}
-        return cls(replay, first, {name: torch.stack(x, -1) for name, x in slopes.items()}, shown, added)
+        shown = {name: felt[name][: series.shape[1]].swapaxes(0, 1) for name in sizes}
+        stacked = {name: torch.stack(x, -1) for name, x in slopes.items()}
+        made = cls(replay, times, first, stacked, first.new_ones(1), shown, {})
+        made = replace(
+            made, acting={name: made._acting(name, network, shown[name]) for name, network in model.inputs.items()}
+        )
+        return replace(made, kernel=made._fitted_kernel(random, rest[-1] - first)) if random else made
+
+    def _fitted_kernel(self, changes: Mapping[str, torch.Tensor], moved: torch.Tensor) -> torch.Tensor:
+        """Kernel (L,) with which changes (K, R, C) in the steps move the points by (R, T, M, D)."""
+        steps, seen = next(iter(self.felt.values())).shape[1], self.replay.trials.seen
+        length = min(steps, math.ceil(_MEMORY / self.replay.simulator.time_step))
+        series = {name: pad(x, (0, 0, 0, 0, 1, 0))[:steps].swapaxes(0, 1) for name, x in changes.items()}
+        delayed = [replace(self, kernel=one)._moved(series)[seen].flatten() for one in torch.eye(length).to(moved)]
+        columns = torch.stack(delayed, 1)
+        normal = columns.T @ columns
+        normal.diagonal().add_(_RIDGE * normal.diagonal().mean())
+        kernel = torch.linalg.solve(normal, columns.T @ moved[seen].flatten())
+        return kernel / kernel.sum()
+
+    def followed(self, changes: torch.Tensor, trials: slice = _ALL) -> torch.Tensor:
+        """Changes (R, K + 1, ...), the first before the start, as trials follow them at their frames, (R, T, ...)."""
+        length, count = len(self.kernel), changes.shape[1]
+        padded = torch.cat([changes[:, :1].expand(-1, length - 1, *changes.shape[2:]), changes], 1)
+        series = self.kernel[0] * padded[:, length - 1 :]
+        for lag in range(1, length):
+            series = series + self.kernel[lag] * padded[:, length - 1 - lag : length - 1 - lag + count]
+        return sample(series, self.times[trials], self.replay.simulator.time_step)
+
+    def _acting(self, name: str, network: Callable[[torch.Tensor], torch.Tensor], felt: torch.Tensor) -> torch.Tensor:
+        """Inputs (..., C) with what a network adds for (..., C (1 + F)), within their range."""
+        known = felt[..., : self.slopes[name].shape[-1]]
+        return (known + network(felt)).clamp_min(self.replay.simulator.inputs[name].lower)
+
+    def _moved(self, changes: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """(R, T, M, D) by which changes (R, K + 1, C) of the inputs move the points."""
+        moved = [self.slopes[name] @ self.followed(x)[:, :, None, :, None] for name, x in changes.items()]
+        return torch.stack(moved).sum(0)[..., 0]
+
+    def changes(self, model: Actuator) -> dict[str, torch.Tensor]:
+        """Changes (R, K + 1, C) of the inputs by an actuator."""
+        acting = {name: self._acting(name, network, self.felt[name]) for name, network in model.inputs.items()}
+        return {name: x - self.acting[name] for name, x in acting.items()}
 
     def errors(self, model: Actuator) -> torch.Tensor:
-        """Points with an actuator less the observed ones (1, R, T, M, D)."""
-        moved = self.points
-        for name, slope in self.slopes.items():
-            change = model.inputs[name](self.felt[name]) - self.added[name]
-            moved = moved + (slope @ change[:, :, None, :, None])[..., 0]
-        return self.replay.errors(moved[None])
+        """Points with an actuator less the observed ones (R, T, M, D)."""
+        return self.replay.errors((self.points + self._moved(self.changes(model)))[None])[0]
 
 
-def _changed(inputs: Inputs, sizes: Mapping[str, float], columns: Sequence[str]) -> Inputs:
-    """Inputs of C R environments, in which each of C parts is changed in turn; its input is named in the columns."""
+def _random_changes(inputs: Inputs, sizes: Mapping[str, float], time_step: float) -> dict[str, torch.Tensor]:
+    """Changes (K, R, C) of inputs that change over time: lagged noise, not negative."""
+    generator, changes = torch.Generator().manual_seed(0), dict[str, torch.Tensor]()
+    response = InputResponse(time_step, rise=_CORRELATED)
+    for name, size in sizes.items():
+        values = inputs.actuation[name]
+        if values.ndim == 3:
+            noise = size * torch.rand(values.shape, generator=generator, dtype=torch.float64).to(values)
+            changes[name] = response(response.steady(noise[0]), noise)[0]
+    return changes
+
+
+def _changed(inputs: Inputs, sizes: Mapping[str, float], columns: Sequence[str], sets: int) -> Inputs:
+    """Inputs of E R environments, in whose first C sets of R each of C parts is changed in turn."""
     for name in sizes.keys() & inputs.actuation.keys():
         values = inputs.actuation[name]
         rows = [row for row, column in enumerate(columns) if column == name]
-        change = values.new_zeros(len(columns), len(rows))
+        change = values.new_zeros(sets, len(rows))
         change[rows] = sizes[name] * torch.eye(len(rows)).to(values)
-        inputs = inputs.replace(**{name: values + change.repeat_interleave(values.shape[-2] // len(columns), 0)})
+        inputs = inputs.replace(**{name: values + change.repeat_interleave(values.shape[-2] // sets, 0)})
     return inputs
 
 
 def fit_linearised(
-    linearised: Sequence[Linearised], loss_weights: Sequence[torch.Tensor], model: Actuator, penalty: float
+    linearised: Sequence[Linearised],
+    loss_weights: Sequence[torch.Tensor],
+    model: Actuator,
+    penalty: float,
+    trust: float,
 ) -> None:
-    """Minimises the squared errors of linearised motions, with weights (R,) of their trials, and the penalty."""
+    """Minimises the squared errors of linearised motions, with weights (R,) of their trials, and two penalties.
+
+    One is on the squared weights; trust is on the mean square change of the inputs, as shares of the largest one,
+    because motions are linear near their inputs alone.
+    """
     weights = [*model.parameters()]
     lbfgs = torch.optim.LBFGS(weights, max_iter=_ITERATIONS, history_size=20, line_search_fn="strong_wolfe")
 
     def evaluate() -> float:
         lbfgs.zero_grad()
-        pairs = zip(linearised, loss_weights, strict=True)
-        squares = [(one.errors(model)[0].square().sum((1, 2, 3)) * weight).sum() for one, weight in pairs]
-        loss = torch.stack(squares).sum() + penalty * squares_of(model)
-        loss.backward()
-        return float(loss.detach())
+        squares = [penalty * squares_of(model)]
+        for one, weight in zip(linearised, loss_weights, strict=True):
+            errors = one.errors(model).square().sum((1, 2, 3))
+            shares = [x / model.inputs[name].unit for name, x in one.changes(model).items()]
+            squares += [(errors * weight).sum(), trust / len(linearised) * torch.cat(shares, -1).square().mean()]
+        total = torch.stack(squares).sum()
+        total.backward()
+        return float(total.detach())
 
     lbfgs.step(evaluate)
 
@@ -104,27 +179,29 @@ def gauss_newton_factor(
 ) -> torch.Tensor | None:
     """Returns the Cholesky factor C (P, P) of the Gauss-Newton matrix of the loss of linearised motions by P weights w.
 
-    C C^T = 2 (sum_k N_k^T J_k^T J_k N_k + penalty) / unit, with the derivatives N_k of the networks by w in a frame and
-    J_k of its points by the inputs, the latter weighted as in the loss. None where the matrix is not positive definite,
-    as with derivatives that are not finite.
+    C C^T = 2 (sum_k N_k^T J_k^T J_k N_k + penalty) / unit, with the derivatives N_k of the networks by w, as the points
+    of a frame follow them, and J_k of these by the inputs, the latter weighted as in the loss. None where the matrix is
+    not positive definite, as with derivatives that are not finite.
     """
     weights = {name: weight.detach() for name, weight in model.named_parameters()}
 
-    def added(weights: dict[str, torch.Tensor], felt: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(C,) what the networks add to their inputs in a frame."""
-        networks = [(model.inputs[name], with_prefix(weights, f"network.{name}."), x) for name, x in felt.items()]
-        return torch.cat([functional_call(*call) for call in networks])
+    def acting(weights: dict[str, torch.Tensor], felt: dict[str, torch.Tensor]) -> torch.Tensor:
+        """(C,) inputs in a step."""
+        prefixed = {name: with_prefix(weights, f"network.{name}.") for name in felt}
+        networks = {name: partial(functional_call, model.inputs[name], prefixed[name]) for name in felt}
+        return torch.cat([linearised[0]._acting(name, networks[name], x) for name, x in felt.items()])
 
-    by_weights = torch.func.vmap(torch.func.jacrev(added), (None, 0))
+    by_weights = torch.func.vmap(torch.func.jacrev(acting), (None, 0))
     matrix = torch.zeros(2 * [sum(weight.numel() for weight in weights.values())]).to(next(iter(weights.values())))
-    for one, weight in zip(linearised, loss_weights, strict=True):
+    for one, loss_weight in zip(linearised, loss_weights, strict=True):
+        counted = (loss_weight[:, None, None] * one.replay.trials.seen)[..., None, None]
         slopes = torch.cat([one.slopes[name] for name in one.felt], -1)  # (R, T, M, D, C)
-        counted = (weight[:, None, None] * one.replay.trials.seen)[..., None, None]
-        by_inputs = (slopes.flatten(2, 3).mT @ (counted * slopes).flatten(2, 3)).flatten(0, 1).to(matrix)  # (R T, C, C)
-        for frames in torch.arange(len(by_inputs), device=matrix.device).split(_FRAMES_AT_ONCE):
-            some = {name: x.flatten(0, 1)[frames] for name, x in one.felt.items()}
-            rows = torch.cat([x.flatten(2) for x in by_weights(weights, some).values()], -1)  # (K, C, P)
-            matrix += rows.flatten(0, 1).T @ (by_inputs[frames] @ rows).flatten(0, 1)
+        by_inputs = (slopes.flatten(2, 3).mT @ (counted * slopes).flatten(2, 3)).to(matrix)  # (R, T, C, C)
+        for trial, squares in enumerate(by_inputs):
+            felt = {name: x[trial] for name, x in one.felt.items()}
+            of_steps = torch.cat([x.flatten(2) for x in by_weights(weights, felt).values()], -1)  # (K + 1, C, P)
+            rows = one.followed(of_steps[None], slice(trial, trial + 1))[0]  # (T, C, P)
+            matrix += rows.flatten(0, 1).T @ (squares @ rows).flatten(0, 1)
     matrix.diagonal().add_(penalty + _LEAST_SHARE * float(matrix.diagonal().mean()))
     factor, failed = torch.linalg.cholesky_ex(2.0 / max(unit, _LEAST_UNIT) * matrix)
     return None if bool(failed) else factor

@@ -35,7 +35,7 @@ def actuator(gain, creep, coupling=0.0):
 
 @pytest.fixture(scope="module")
 def robot():
-    """It has 0.7 of each commanded tension at once, and more of it in time."""
+    """A rod with 0.7 of each commanded tension at once, and more of it in time."""
     seen = {"tendon_tension": ((0.0,) * 3, (LIMIT,) * 3)}
     return Robot(replace(laboratory_robot(settings(*RUN)).description, seen=seen, actuator=actuator(-0.3, 0.15)))
 

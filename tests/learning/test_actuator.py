@@ -242,27 +242,22 @@ def test_the_scale_of_the_loss_changes_nothing(simulator, motions):
     torch.testing.assert_close(*weights)
 
 
-def linearised_motions(simulator, motions, network):
-    """Motions under a network, the observed ones of two trials marked as not seen in part."""
+def linearised_motions(simulator, motions, deviation):
+    """Linearised motions of MANY, and a network with random weights."""
     fitting = ActuatorFitting(simulator, motions, MANY)
     ((replay, start),) = fitting._replays(MANY)
-    felt = felt_inputs(replay, {}, QUICK.filters)
-    model = Actuator({"tendon_tension": network(felt["tendon_tension"])})
-    one = Linearised.of(replay, start, {}, model, felt)
-    seen = one.points.clone()
-    seen[0, 3:9, 1], seen[2, -5:] = torch.nan, torch.nan
-    return replace(one, replay=replay.changed(trials=replace(replay.trials, observed=seen))), model
+    model = Actuator({"tendon_tension": InputNetwork(torch.zeros(4), torch.ones(4), QUICK.filters, 3)})
+    torch.manual_seed(0)
+    for weight in model.parameters():
+        torch.nn.init.normal_(weight, std=deviation)
+    return Linearised.of(replay, start, {}, model, felt_inputs(replay, {}, QUICK.filters)), model
 
 
 def test_the_gauss_newton_matrix_is_the_hessian_where_the_motions_are_met(simulator, motions):
-    def network(felt):
-        made = InputNetwork(felt.amin((0, 1)), felt.amax((0, 1)), QUICK.filters, 3)
-        torch.manual_seed(0)
-        for weight in made.parameters():
-            torch.nn.init.normal_(weight, std=0.3)
-        return made
-
-    one, model = linearised_motions(simulator, motions, network)
+    one, model = linearised_motions(simulator, motions, 0.3)
+    seen = one.points.clone()
+    seen[0, 3:9, 1], seen[2, -5:] = torch.nan, torch.nan  # not seen
+    one = replace(one, replay=one.replay.changed(trials=replace(one.replay.trials, observed=seen)))
     penalty, unit, weights = 1e-3, 0.1, [*model.parameters()]
     weights_of_trials = one.replay.trials.loss_weight
     factor = gauss_newton_factor([one], [weights_of_trials], model, penalty, unit)
@@ -273,7 +268,7 @@ def test_the_gauss_newton_matrix_is_the_hessian_where_the_motions_are_met(simula
     along = torch.randn(len(at), generator=torch.Generator().manual_seed(1)).double()
     for sign in (1.0, -1.0):
         vector_to_parameters(at + sign * 1e-5 * along, weights)
-        errors = one.errors(model).square().sum((1, 2, 3))
+        errors = one.errors(one.changes(model)).square().sum((1, 2, 3))
         loss = (errors * weights_of_trials).sum() + penalty * sum(w.square().sum() for w in weights)
         gradients.append(parameters_to_vector(torch.autograd.grad(loss / unit, weights)))
     expected = (gradients[0] - gradients[1]) / 2e-5
@@ -316,17 +311,16 @@ def test_training_in_the_factor_of_the_hessian_ends_after_one_step(resumed):
 
 
 def test_linearised_motions_follow_changes_of_the_inputs_in_time(simulator, motions):
+    one, model = linearised_motions(simulator, motions, 0.0)
     fitting = ActuatorFitting(simulator, motions, MANY)
     ((replay, start),) = fitting._replays(MANY)
-    felt = felt_inputs(replay, {}, QUICK.filters)
-    model = Actuator({"tendon_tension": InputNetwork(torch.zeros(4), torch.ones(4), QUICK.filters, 3)})
-    one = Linearised.of(replay, start, {}, model, felt)
-    before = one.errors(model)
+    before = one.errors(one.changes(model))
     with torch.no_grad():
         model.inputs["tendon_tension"].linear.weight[:, :2] = 2e-3 * torch.eye(2)
         exact = replay.errors(replay.changed(actuator=model.inputs)(start))[0] - before
-        at_once = replace(one, kernel=torch.ones(1).double()).errors(model) - before
-        followed = one.errors(model) - before
+        changes = one.changes(model)
+        at_once = replace(one, kernel=torch.ones(1).double()).errors(changes) - before
+        followed = one.errors(changes) - before
     assert (at_once - exact).norm() > 1e-2 * exact.norm()
     assert (followed - exact).norm() < 0.2 * (at_once - exact).norm()
 

@@ -117,9 +117,9 @@ class Linearised:
         acting = {name: self._acting(name, network, self.felt[name]) for name, network in model.inputs.items()}
         return {name: x - self.acting[name] for name, x in acting.items()}
 
-    def errors(self, model: Actuator) -> torch.Tensor:
-        """Points with an actuator less the observed ones (R, T, M, D)."""
-        return self.replay.errors((self.points + self._moved(self.changes(model)))[None])[0]
+    def errors(self, changes: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Points under changes (R, K + 1, C) of the inputs less the observed ones, (R, T, M, D) [m]."""
+        return self.replay.errors((self.points + self._moved(changes))[None])[0]
 
 
 def _random_changes(inputs: Inputs, sizes: Mapping[str, float], time_step: float) -> dict[str, torch.Tensor]:
@@ -164,8 +164,9 @@ def fit_linearised(
         lbfgs.zero_grad()
         squares = [penalty * squares_of(model)]
         for one, weight in zip(linearised, loss_weights, strict=True):
-            errors = one.errors(model).square().sum((1, 2, 3))
-            shares = [x / model.inputs[name].unit for name, x in one.changes(model).items()]
+            changes = one.changes(model)
+            errors = one.errors(changes).square().sum((1, 2, 3))
+            shares = [x / model.inputs[name].unit for name, x in changes.items()]
             squares += [(errors * weight).sum(), trust / len(linearised) * torch.cat(shares, -1).square().mean()]
         total = torch.stack(squares).sum()
         total.backward()

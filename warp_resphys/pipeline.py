@@ -188,7 +188,7 @@ class _SplitStages:
             keys = ("target", "shapes", "data.steps")
             self.add("shapes", try_shapes, (files.SHAPES,), keys, run=run, files=digests | files_read(run, *bodies))
         if self.run.actuator is not None:
-            self.add("train_actuator", train_actuator, (files.ACTUATOR_FILE,), ("seed",))
+            self.add("train_actuator", train_actuator, (files.ACTUATOR_FILE,))
             self._identified += ("train_actuator",)
 
     def learning(self) -> None:

@@ -28,7 +28,7 @@ from warp_resphys.learning.residuals import fitting
 from warp_resphys.learning.residuals.correction import force_frames
 from warp_resphys.settings.stage_keys import StageSettings
 
-COMMAND = ("experiment=tiny", TRACKED, "actuator={rounds: 1, epochs: 1, gate: false, width: 3, filters: [0.05]}")
+COMMAND = ("experiment=tiny", TRACKED, "actuator={epochs: 1, gate: false, centres: 10, filters: [0.05]}")
 STAGES = {"laboratory", "import", "identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate"}
 STAGES |= {"mesh_check", "report", "laboratory_scaled", "import_scaled", "train_actuator"}
 

@@ -172,9 +172,8 @@ class TestInTheLoop:
         exact = simulated(Replay(simulator(), MARKERS, motions), release)
         other = MotionLoss([TrialGroup(exact, release, LOADS)], {})
         config, seen = CONFIG.changed(epochs=3), []
-        epochs, (before, after) = cross_validated_epochs(
-            [(network(), loss, loss, None)], config, lambda: seen.append(1)
-        )
+        trainer = InTheLoop(network(), loss, loss, config)
+        epochs, (before, after) = cross_validated_epochs([trainer], lambda: seen.append(1))
         assert epochs == 3
         assert len(before) == len(after) == len(motions.names)
         assert np.mean([row.mean() for row in before]) == pytest.approx(loss.error_mm(None), rel=1e-9)
@@ -183,15 +182,16 @@ class TestInTheLoop:
         for patience, spent in ((2, 2), (9, 3)):
             seen.clear()
             patient = config.changed(patience=patience)
-            chosen, _ = cross_validated_epochs([(network(), loss, other, None)], patient, lambda: seen.append(1))
+            trainer = InTheLoop(network(), loss, other, patient)
+            chosen, _ = cross_validated_epochs([trainer], lambda: seen.append(1))
             assert (chosen, len(seen)) == (0, spent)
         histories = []
         for held_out in (loss, other):
             alone = finish(InTheLoop(network(), loss, held_out, config))
             histories.append([record["rollout_error_mm"] for record in alone.history])
-        parts = [(network(), loss, held_out, None) for held_out in (loss, loss, other)]  # The mean over them decides.
+        parts = [InTheLoop(network(), loss, held_out, config) for held_out in (loss, loss, other)]
         mean = np.average(histories, axis=0, weights=[2, 1])
-        assert 0 < np.argmin(mean) == cross_validated_epochs(parts, config, lambda: None)[0]
+        assert 0 < np.argmin(mean) == cross_validated_epochs(parts, lambda: None)[0]  # The mean decides.
         trainer = InTheLoop(network(), loss, loss, config, epochs=0)
         trainer.begin()
         assert trainer.finished

@@ -87,9 +87,8 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage == "train_actuator":
         actuator, folds = settings.actuator, 0 if settings.split.validation else FOLDS
         trained, rolled = (steps_of(experiment, "actuator", names) for names in (train, judged))
-        first = actuator.rounds * (2.0 + _VARIED * _PARTS) * trained
-        looped = (actuator.epochs + 1) * (_ITERATION * trained + rolled)
-        return (1 + folds) * (first + looped), 0.0, 0.0
+        epoch = (2.0 + _VARIED * _PARTS) * trained + rolled
+        return (1 + folds) * actuator.epochs * epoch, 0.0, 0.0
     if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))

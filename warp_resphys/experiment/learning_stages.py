@@ -131,7 +131,7 @@ def train_actuator(context: StageContext) -> None:
     below = LAW if experiment.has_law else "sysid"
     made_of = experiment.model_simulator(below), experiment.motions, split.train, split.validation
     fitting = ActuatorFitting(*made_of, experiment.identified(below))
-    found, training = fitting.fit(settings.actuator, settings.seed, name, resumed, save)
+    found, training = fitting.fit(settings.actuator, name, resumed, save)
     networks = {key: network.plain() for key, network in found.actuator.items()}
     write_json(context.run_dir / ACTUATOR_FILE, {**training, "inputs": networks})
     checkpoint.unlink(missing_ok=True)

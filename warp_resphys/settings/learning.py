@@ -257,18 +257,18 @@ class TrainerSettings(EpochSettings):
 
 
 class LoopSettings(EpochSettings):
-    """Training through the simulator, by L-BFGS."""
+    """Training through the simulator."""
 
-    epochs: Natural = setting(5, "largest number of iterations of L-BFGS")
+    epochs: Natural = setting(5, "largest number of iterations")
     rollout_every: Natural = setting(1, "epochs between roll-outs that choose the weights")
     patience: Natural = setting(3, "epochs without improvement after which training ends")
-    penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
-    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
 
 
 class InTheLoopSettings(LoopSettings):
     """Training of the residual force on whole trials, through the simulator, by L-BFGS."""
 
+    penalty: NotNegative = setting(1.0e-2, "penalty on the squared weights")
+    memory: Natural = setting(10, "number of pairs that L-BFGS keeps")
     hold_out: bool = setting(True, "without validation trials, hold out each training trial to choose the epochs")
 
 
@@ -276,10 +276,8 @@ class ActuatorSettings(LoopSettings):
     """Learned changes of the inputs, trained through the simulator."""
 
     filters: Many[Positive] = setting((0.4, 2.0), "time constants of exponential means of the inputs", "s")
-    width: Size = setting(24, "width of the hidden layer")
-    rounds: Count = setting(4, "linearisations of the motions by the inputs, for the weights to begin with")
-    epochs: Count = setting(10, "largest number of iterations of L-BFGS through the simulator, after the rounds")
-    penalty: NotNegative = setting(1.0e-4, "penalty on the squared weights")
+    centres: Natural = setting(100, "largest number of inputs about which it is a sum of kernels")
+    epochs: Count = setting(4, "largest number of linearisations of the motions by the inputs")
     gate: bool = setting(
         True, "use it only if it is clearly closer to held-out trials than the simulator; false: always"
     )

@@ -9,10 +9,11 @@ possible to bring it to the markers, with the force restricted to what the input
 derivatives J of its points p by lasting changes of the inputs, and a kernel k with which points follow changes in time
 (`linearised`). With the change d of the inputs by the networks, the weights w minimise
 
-    sum |p + J (k * d) - y|^2 + trust |d|^2 + penalty |w|^2,
+    sum |p + J (k * d) - y|^2 + trust |d|^2 + penalty |w|^2.
 
-in a few rounds, each from a new roll-out. L-BFGS through the simulator (`InTheLoop`) follows, preconditioned by the
-Gauss-Newton matrix of this sum without the trust.
+An epoch is a roll-out with these derivatives and this minimum, with the least trust for which the motions come closer
+(Levenberg and Marquardt). The first one chooses the penalty, by the errors of linearised motions that are left out in
+turn.
 """
 
 import copy
@@ -23,6 +24,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import torch
+from typing_extensions import override
 
 from ...data.input_network import Actuator, InputNetwork
 from ...data.input_response import InputResponse, with_means
@@ -37,8 +39,8 @@ from ..observed_motions import Identified, ObservedMotions
 from ..parameters import HUNG
 from ..replay import Replay, Start
 from ..scores import HeldOutTest, held_out_test, text_of
-from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
-from .linearised import Linearised, fit_linearised, gauss_newton_factor, squares_of
+from .in_the_loop import JudgedTrainer, MotionLoss, TrialGroup, cross_validated_epochs
+from .linearised import Linearised, chosen_penalty, fit_linearised
 from .training import Snapshot, run_epochs
 
 log = logging.getLogger(__name__)
@@ -56,7 +58,6 @@ def fit_actuator(
     validation: Sequence[str] = (),
     parameters: Identified | Mapping[str, float] | None = None,
     settings: ActuatorSettings | None = None,
-    seed: int = 0,
 ) -> Identified:
     """Trains networks that change the inputs of a simulator towards those that act in the robot.
 
@@ -68,7 +69,6 @@ def fit_actuator(
             turn if empty.
         parameters: as for `reconstruct`.
         settings: size and training; the defaults of the class if None.
-        seed: of the weights; torch's global generator is restored.
 
     Returns:
         The parameters with the actuator, to pass on as ``parameters`` of `reconstruct`, `fit_force` and `evaluate`, and
@@ -81,7 +81,7 @@ def fit_actuator(
     others = [name for name in motions.trials.names if name not in validation]
     train = motions.trials.chosen(others if train is None else train)
     fitting = ActuatorFitting(simulator, motions, train, tuple(validation), Identified.of(parameters))
-    return fitting.fit(settings or ActuatorSettings(), seed)[0]
+    return fitting.fit(settings or ActuatorSettings())[0]
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,6 @@ class ActuatorFitting:
     def fit(
         self,
         settings: ActuatorSettings,
-        seed: int = 0,
         name: str = "fit_actuator",
         resumed: Snapshot | None = None,
         save: Callable[[Snapshot], None] = lambda kept: None,
@@ -114,7 +113,6 @@ class ActuatorFitting:
 
         Args:
             settings: of the network and the training.
-            seed: of the weights.
             name: displayed beside the progress bar.
             resumed: a snapshot from which an interrupted training goes on.
             save: is called with a snapshot every ten seconds, and when the training ends or is interrupted.
@@ -125,11 +123,8 @@ class ActuatorFitting:
         epochs, test = None, None
         folds = [] if self.validation else left_out_in_turn(self.motions.trials, self.train)
         if folds:
-            epochs, test = self._held_out(folds, settings, seed, name)
-        model, factor = self._begun(self.train, settings, seed, name, settings.rounds if resumed is None else 0)
-        train = self._loss(self.train)
-        judge = self._loss(self.validation) if self.validation else train
-        trainer = InTheLoop(model, train, judge, settings, epochs, factor)
+            epochs, test = self._held_out(folds, settings, name)
+        trainer = self._trainer(self.train, self.validation or self.train, settings, epochs)
         if resumed is not None:
             trainer.resume(*resumed)
         trainer.begin()
@@ -147,21 +142,34 @@ class ActuatorFitting:
         return replace(found, test=test), {"kept": {**kept, "test": test}, "epochs": trainer.history}
 
     def _held_out(
-        self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, seed: int, name: str
+        self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, name: str
     ) -> tuple[int, HeldOutTest]:
         """Number of epochs with the smallest error on trials that are left out in turn, and the test on these."""
-        parts, names, below = [], list[str](), list[FloatArray]()
-        for number, left_out in enumerate(folds):
-            rest = [one for one in self.train if one not in left_out]
-            label = f"{name}: without {number + 1} of {len(folds)}"
-            model, factor = self._begun(rest, settings, seed, label, settings.rounds)
-            held_out = self._loss(left_out)
-            held_out.error_mm(None)
-            names, below = names + self._in_batches(left_out), below + held_out.judged[-1]
-            parts.append((model, self._loss(rest), held_out, factor))
+        trainers = [
+            self._trainer([one for one in self.train if one not in fold], fold, settings.changed(rollout_every=1))
+            for fold in folds
+        ]
         with Progress(f"{name}: held out", len(folds) * settings.epochs, "epochs at most") as progress:
-            epochs, (_, errors) = cross_validated_epochs(parts, settings, progress.advance)
+            epochs, (below, errors) = cross_validated_epochs(trainers, progress.advance)
+        names = [one for fold in folds for one in self._in_batches(fold)]
         return epochs, self._tested(names, HELD_OUT, errors, below)
+
+    def _trainer(
+        self, names: Sequence[str], judged: Sequence[str], settings: ActuatorSettings, epochs: int | None = None
+    ) -> "LinearisedTrainer":
+        """Training of a new actuator on some trials, judged on others."""
+        replays, values = self._replays(names), self.identified.values(self.simulator)
+        felt = [felt_inputs(replay, values, settings.filters) for replay, _ in replays]
+        return LinearisedTrainer(
+            _untrained(felt, settings),
+            replays,
+            felt,
+            values,
+            self._loss_of(replays),
+            self._loss(judged),
+            settings,
+            epochs,
+        )
 
     def _in_batches(self, names: Sequence[str]) -> list[str]:
         """Names of trials in the order of their batches, which is that of their errors."""
@@ -190,46 +198,80 @@ class ActuatorFitting:
         replays = self.motions.replays(self.simulator, names, self.identified)
         return [(self.motions.learned(replay), start) for replay, start in replays]
 
-    def _begun(
-        self, names: Sequence[str], settings: ActuatorSettings, seed: int, name: str, rounds: int
-    ) -> tuple[Actuator, torch.Tensor | None]:
-        """An actuator that is fitted to linearised motions of some trials, and the factor of `InTheLoop` from the last.
 
-        A round fits the motions near their inputs, ever nearer until they are closer. Without success, and where a
-        motion has no derivatives, the weights stay as they are.
-        """
-        values = self.identified.values(self.simulator)
-        replays = self._replays(names)
-        felt = [felt_inputs(replay, values, settings.filters) for replay, _ in replays]
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            model = _untrained(felt, settings)
-        loss, penalty, linearised = self._loss_of(replays), settings.penalty, list[Linearised]()
-        with torch.no_grad():
-            least = float(loss(model))
-        with Progress(f"{name}: first weights", rounds, "rounds") as progress:
-            for number in range(rounds):
-                before = copy.deepcopy(model.network.state_dict())
-                best = least + penalty * float(squares_of(model).detach())
-                of_batches = zip(replays, felt, strict=True)
-                try:
-                    linearised = [Linearised.of(*pair, values, model, inputs) for pair, inputs in of_batches]
-                except ConvergenceError as error:
-                    log.info("%s: the first weights are those of %d rounds: %s", name, number, error)
-                    break
-                for near in _NEAR:
-                    model.network.load_state_dict(before)
-                    fit_linearised(linearised, loss.weights, model, penalty, least / near**2)
-                    found = _value(loss, model)
-                    if found < least and found + penalty * float(squares_of(model).detach()) < best:
-                        least = found
-                        break
-                else:
-                    model.network.load_state_dict(before)
-                    break
-                progress.advance()
-        total = least + penalty * float(squares_of(model).detach())
-        return model, gauss_newton_factor(linearised, loss.weights, model, penalty, total) if linearised else None
+class LinearisedTrainer(JudgedTrainer[Actuator]):
+    """Fits an actuator to linearised motions, which an epoch linearises again.
+
+    Without success, and where a motion has no derivatives, the weights stay as they are.
+
+    Args:
+        model: to train.
+        replays: of the trials to learn from, each with its start.
+        felt: what the networks take in each, see `felt_inputs`.
+        values: (1,) identified parameters.
+        train: loss of these trials.
+        judge: loss whose error selects the weights.
+        settings: epochs and patience.
+        epochs: in place of the configured number.
+    """
+
+    def __init__(
+        self,
+        model: Actuator,
+        replays: Sequence[tuple[Replay, Start]],
+        felt: Sequence[Mapping[str, torch.Tensor]],
+        values: Mapping[str, torch.Tensor],
+        train: MotionLoss,
+        judge: MotionLoss,
+        settings: ActuatorSettings,
+        epochs: int | None = None,
+    ) -> None:
+        super().__init__(model, None, train, judge, settings, epochs)
+        self._replays, self._felt, self._values, self._near = replays, felt, values, list(_NEAR)
+
+    @override
+    def _run_epoch(self) -> dict[str, float]:
+        self.begin()
+        least, before = self.history[-1]["train_loss"], copy.deepcopy(self.model.network.state_dict())
+        if not self._near:
+            return {"train_loss": least}
+        pairs = zip(self._replays, self._felt, strict=True)
+        try:
+            linearised = [Linearised.of(*pair, self._values, self.model, felt) for pair, felt in pairs]
+        except ConvergenceError as error:
+            log.info("the actuator stays as it is: %s", error)
+            self._near.clear()
+        if self.epoch == 0 and self._near:
+            self.penalty = chosen_penalty(linearised, self.train.weights, self.model)
+        while self._near:  # A bound that was too far once is so again.
+            trust = least / self._near[0] ** 2
+            fit_linearised(linearised, self.train.weights, self.model, self.penalty, trust)
+            found = self._value()
+            if found < least:
+                return {"train_loss": found}
+            self.model.network.load_state_dict(before)
+            self._near.pop(0)
+        return {"train_loss": least}
+
+    @override
+    def snapshot(self) -> Snapshot:
+        tensors, metadata = super().snapshot()
+        return tensors, {**metadata, "bounds": len(self._near), "penalty": self.penalty}
+
+    @override
+    def resume(self, tensors: Mapping[str, torch.Tensor], metadata: Mapping[str, Any]) -> None:
+        super().resume(tensors, metadata)
+        self._near, self.penalty = list(_NEAR[len(_NEAR) - metadata["bounds"] :]), metadata["penalty"]
+
+    def _value(self) -> float:
+        """Loss and penalty; infinite where the simulation or the weights fail."""
+        if not all(bool(torch.isfinite(weight).all()) for weight in self.model.parameters()):
+            return math.inf
+        try:
+            with torch.no_grad():
+                return float(self.loss())
+        except ConvergenceError:
+            return math.inf
 
 
 def felt_inputs(
@@ -271,18 +313,7 @@ def _untrained(felt: Sequence[Mapping[str, torch.Tensor]], settings: ActuatorSet
     for name in felt[0]:
         values = torch.cat([batch[name].flatten(0, 1) for batch in felt])
         if bool(values.any()):
-            networks[name] = InputNetwork(values.amin(0), values.amax(0), settings.filters, settings.width)
+            networks[name] = InputNetwork.of_training(values, settings.filters, settings.centres)
     if not networks:
         raise InputError("all inputs of the training trials are zero: name trials in which the robot is driven.")
     return Actuator(networks).to(next(iter(felt[0].values())).device)
-
-
-def _value(loss: MotionLoss, model: Actuator) -> float:
-    """Loss of an actuator; infinite where the simulation or the weights fail."""
-    if not all(bool(torch.isfinite(weight).all()) for weight in model.parameters()):
-        return math.inf
-    try:
-        with torch.no_grad():
-            return float(loss(model))
-    except ConvergenceError:
-        return float("inf")

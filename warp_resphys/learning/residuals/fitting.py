@@ -268,10 +268,11 @@ class Fitting:
 
         epochs, test = None, None
         if loop.hold_out and not validation and len(train) > 1:
-            parts = [(make_network(), loss([one for one in train if one != out]), loss([out]), None) for out in train]
+            each, rest = loop.changed(rollout_every=1), {out: [one for one in train if one != out] for out in train}
+            parts = [InTheLoop(make_network(), loss(rest[out]), loss([out]), each) for out in train]
             with Progress(f"{name}: held out", len(train) * loop.epochs, "epochs at most") as progress:
-                epochs, (below, errors) = cross_validated_epochs(parts, loop, progress.advance)
-            sizes = [size for _, _, held_out, _ in parts for size in held_out.amplitudes_mm()]
+                epochs, (below, errors) = cross_validated_epochs(parts, progress.advance)
+            sizes = [size for part in parts for size in part.judge.amplitudes_mm()]
             test = held_out_test(train, HELD_OUT, errors, below, sizes) if settings.trainer.gate else None
             epochs = epochs if test is None or test["used"] else 0
             log.debug("%s: %d epochs are best for held-out trials", name, epochs)

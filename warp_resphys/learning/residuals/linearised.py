@@ -1,13 +1,12 @@
 """Observed motions as a linear function of changes of their inputs, by which the networks of an actuator are fitted."""
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Final
 
 import torch
-from torch.func import functional_call
 from torch.nn.functional import pad
 
 from ...data.input_network import Actuator
@@ -15,12 +14,11 @@ from ...data.input_response import InputResponse
 from ...stepping.inputs import Inputs
 from ...stepping.rollout import sample
 from ..replay import Replay, Start
-from .training import with_prefix
 
 _CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are computed
 _ITERATIONS: Final = 200  # of L-BFGS on linearised motions
-_LEAST_SHARE: Final = 1e-9  # of the mean diagonal of the Gauss-Newton matrix, added to be positive definite
-_LEAST_UNIT: Final = 1e-30
+_PENALTIES: Final = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+_FOLDS: Final = 3
 _MEMORY: Final = 2.0  # s: length of the kernel with which points follow inputs
 _CORRELATED: Final = 0.2  # s: of the random changes to which it is fitted
 _RIDGE: Final = 1e-3  # of the mean diagonal, added in its fit
@@ -145,6 +143,40 @@ def _changed(inputs: Inputs, sizes: Mapping[str, float], columns: Sequence[str],
     return inputs
 
 
+def chosen_penalty(linearised: Sequence[Linearised], loss_weights: Sequence[torch.Tensor], model: Actuator) -> float:
+    """Returns the penalty with the smallest loss of trials that are left out in turn, a third of them at a time.
+
+    Penalties are tried from the largest on, until the loss grows. The model is left as it is. A single trial has the
+    largest.
+
+    Args:
+        linearised: groups of trials.
+        loss_weights: (R,) of the squared errors of each group's trials.
+        model: to fit.
+    """
+    begin, best, least = copy.deepcopy(model.state_dict()), _PENALTIES[0], math.inf
+    trials = torch.cat([torch.full_like(weights, 1.0) for weights in loss_weights]).cumsum(0) - 1.0
+    folds = [trials % _FOLDS == number for number in range(min(_FOLDS, len(trials)))]
+    fitted = [begin for _ in folds]
+    for penalty in _PENALTIES if len(folds) > 1 else ():
+        loss = 0.0
+        for number, fold in enumerate(folds):
+            left_out = fold.split([len(weights) for weights in loss_weights])
+            rest = [weights * ~out for weights, out in zip(loss_weights, left_out, strict=True)]
+            model.load_state_dict(fitted[number])
+            fit_linearised(linearised, rest, model, penalty, 0.0)
+            fitted[number] = copy.deepcopy(model.state_dict())
+            with torch.no_grad():
+                for one, weights, out in zip(linearised, loss_weights, left_out, strict=True):
+                    squares = one.errors(one.changes(model)).square().sum((1, 2, 3))
+                    loss += float((squares * weights * out).sum())
+        if not loss < least:
+            break
+        best, least = penalty, loss
+    model.load_state_dict(begin)
+    return best
+
+
 def fit_linearised(
     linearised: Sequence[Linearised],
     loss_weights: Sequence[torch.Tensor],
@@ -162,7 +194,7 @@ def fit_linearised(
 
     def evaluate() -> float:
         lbfgs.zero_grad()
-        squares = [penalty * squares_of(model)]
+        squares = [penalty * torch.stack([weight.square().sum() for weight in weights]).sum()]
         for one, weight in zip(linearised, loss_weights, strict=True):
             changes = one.changes(model)
             errors = one.errors(changes).square().sum((1, 2, 3))
@@ -173,41 +205,3 @@ def fit_linearised(
         return float(total.detach())
 
     lbfgs.step(evaluate)
-
-
-def gauss_newton_factor(
-    linearised: Sequence[Linearised], loss_weights: Sequence[torch.Tensor], model: Actuator, penalty: float, unit: float
-) -> torch.Tensor | None:
-    """Returns the Cholesky factor C (P, P) of the Gauss-Newton matrix of the loss of linearised motions by P weights w.
-
-    C C^T = 2 (sum_k N_k^T J_k^T J_k N_k + penalty) / unit, with the derivatives N_k of the networks by w, as the points
-    of a frame follow them, and J_k of these by the inputs, the latter weighted as in the loss. None where the matrix is
-    not positive definite, as with derivatives that are not finite.
-    """
-    weights = {name: weight.detach() for name, weight in model.named_parameters()}
-
-    def acting(weights: dict[str, torch.Tensor], felt: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(C,) inputs in a step."""
-        prefixed = {name: with_prefix(weights, f"network.{name}.") for name in felt}
-        networks = {name: partial(functional_call, model.inputs[name], prefixed[name]) for name in felt}
-        return torch.cat([linearised[0]._acting(name, networks[name], x) for name, x in felt.items()])
-
-    by_weights = torch.func.vmap(torch.func.jacrev(acting), (None, 0))
-    matrix = torch.zeros(2 * [sum(weight.numel() for weight in weights.values())]).to(next(iter(weights.values())))
-    for one, loss_weight in zip(linearised, loss_weights, strict=True):
-        counted = (loss_weight[:, None, None] * one.replay.trials.seen)[..., None, None]
-        slopes = torch.cat([one.slopes[name] for name in one.felt], -1)  # (R, T, M, D, C)
-        by_inputs = (slopes.flatten(2, 3).mT @ (counted * slopes).flatten(2, 3)).to(matrix)  # (R, T, C, C)
-        for trial, squares in enumerate(by_inputs):
-            felt = {name: x[trial] for name, x in one.felt.items()}
-            of_steps = torch.cat([x.flatten(2) for x in by_weights(weights, felt).values()], -1)  # (K + 1, C, P)
-            rows = one.followed(of_steps[None], slice(trial, trial + 1))[0]  # (T, C, P)
-            matrix += rows.flatten(0, 1).T @ (squares @ rows).flatten(0, 1)
-    matrix.diagonal().add_(penalty + _LEAST_SHARE * float(matrix.diagonal().mean()))
-    factor, failed = torch.linalg.cholesky_ex(2.0 / max(unit, _LEAST_UNIT) * matrix)
-    return None if bool(failed) else factor
-
-
-def squares_of(model: Actuator) -> torch.Tensor:
-    """Sum of the squared weights."""
-    return torch.stack([weight.square().sum() for weight in model.parameters()]).sum()

@@ -49,7 +49,7 @@ class EpochTrainer(ABC, Generic[Trained]):
 
     Args:
         model: to train.
-        optimiser: of the network's weights.
+        optimiser: of the network's weights; None: the training needs no memory of earlier epochs.
         rollout_error: mean roll-out error on the validation split [mm]; infinite where a roll-out diverged.
         settings: number of epochs, and how often the roll-out error is measured.
 
@@ -67,7 +67,7 @@ class EpochTrainer(ABC, Generic[Trained]):
     def __init__(
         self,
         model: Trained,
-        optimiser: torch.optim.Optimizer,
+        optimiser: torch.optim.Optimizer | None,
         rollout_error: Callable[[Trained], float],
         settings: EpochSettings,
     ) -> None:
@@ -125,7 +125,8 @@ class EpochTrainer(ABC, Generic[Trained]):
         tensors = {f"model.{k}": t for k, t in self.model.state_dict().items()}
         tensors |= {f"best.{k}": t for k, t in self.best.items()}
         numbers: dict[str, Any] = {}
-        for i, slot in self._optimiser.state_dict()["state"].items():
+        slots = {} if self._optimiser is None else self._optimiser.state_dict()["state"]
+        for i, slot in slots.items():
             for key, value in slot.items():
                 name = f"{i}.{key}"
                 if isinstance(value, torch.Tensor):
@@ -157,7 +158,8 @@ class EpochTrainer(ABC, Generic[Trained]):
             index, key, *position = name.split(".")
             slot = slots.setdefault(int(index), {})
             slot[key] = [*slot[key], tensor] if position else tensor
-        self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
+        if self._optimiser is not None:
+            self._optimiser.load_state_dict({**self._optimiser.state_dict(), "state": slots})
 
 
 class Trainer(EpochTrainer[Model]):

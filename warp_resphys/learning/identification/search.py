@@ -32,7 +32,8 @@ from .uncertainty import Uncertainty
 Report = Callable[[int, float, Mapping[str, float]], None]
 IsLast = Callable[[float], bool]
 
-_SIMILAR = 0.7  # ratio of old and new weights of the priors above which a second descent is not worth its time
+_BETWEEN = 3  # steps between two estimations of the weight of the priors
+_SIMILAR = 0.7  # ratio of its old and new values above which a further descent is not worth its time
 _MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
 _AT_A_BOUND = 1e-4  # of the range
 
@@ -237,27 +238,37 @@ def _descend(
 
     def evaluated(unit: FloatArray, loss: float) -> None:
         values = misfit.from_unit(unit)
+        for record in history:
+            if {**record, "loss": loss} == {"loss": loss, **values}:
+                record["loss"] = loss  # with another weight of the priors
+                return
         if math.isfinite(loss):
             history.append({"loss": loss, **values})
         if report is not None:
             report(number, loss, values)
 
-    def minimum(x: torch.Tensor, most: int) -> Point:
+    def minimum(x: torch.Tensor, most: int) -> tuple[Point, int]:
+        """The point after at most that many steps, and their number."""
         problem = UnitBox(misfit.objective, tolerance, evaluated)
         begin = problem.evaluate(x)
         if not math.isfinite(float(begin.value)):
-            return begin
-        end = minimise(problem, begin, tolerance, most - 1).point
-        return replace(end, value=torch.full_like(end.value, torch.inf)) if problem.differentiates is False else end
+            return begin, most
+        found = minimise(problem, begin, tolerance, most)
+        point = found.point
+        failed = problem.differentiates is False
+        return replace(point, value=torch.full_like(point.value, torch.inf)) if failed else point, found.iterations
 
     misfit.prior_weight = 0.0
     misfit.forget()
     misfit.update_prior_weight(first)
-    point = minimum(torch.as_tensor(first)[None], max_evaluations)
-    left, weight = max_evaluations - len(history), misfit.prior_weight
-    if misfit.has_priors and left > 1 and math.isfinite(float(point.value)):
+    (point, _), left, similar = minimum(torch.as_tensor(first)[None], 0), max_evaluations - 1, False
+    while left > 0 and not similar and math.isfinite(float(point.value)):
+        most = min(left, _BETWEEN) if misfit.has_priors else left
+        refined, steps = minimum(point.x, most)
+        if not math.isfinite(float(refined.value)):
+            point = refined if left == max_evaluations - 1 else point
+            break
+        point, left, weight = refined, left - steps, misfit.prior_weight
         misfit.update_prior_weight(point.x[0].numpy())
-        if not _SIMILAR * weight < misfit.prior_weight < weight / _SIMILAR:
-            refined = minimum(point.x, left)
-            point = refined if math.isfinite(float(refined.value)) else point
+        similar = steps < most and _SIMILAR * weight <= misfit.prior_weight <= weight / _SIMILAR
     return _Attempt(point.x[0].numpy(), float(point.value), history, misfit.prior_weight)

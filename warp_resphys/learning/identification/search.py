@@ -2,7 +2,8 @@
 
 The misfit (`misfit.BoundedMisfit`) is a sum of squares, which is minimised within bounds by
 `linalg.least_squares.UnitBox` with derivatives along the motions (`Replay.varied`). Its parameters are fractions of
-their ranges, "units" from 0 to 1.
+their ranges, "units" from 0 to 1. Priors have the weight of one independent residual, which is estimated again after
+every few steps.
 
 After a release, the start of a motion depends on the parameters: it is estimated again with the result, from which the
 search continues, until the loss changes by less than 2 %.
@@ -24,7 +25,7 @@ from ...io.errors import ConvergenceError, DataFileError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress
 from ...io.safe_files import read_json
-from ...linalg.least_squares import Point, UnitBox, minimise
+from ...linalg.least_squares import Solution, UnitBox, minimise
 from ..observed_motions import Identified
 from .misfit import BoundedMisfit
 from .uncertainty import Uncertainty
@@ -247,28 +248,27 @@ def _descend(
         if report is not None:
             report(number, loss, values)
 
-    def minimum(x: torch.Tensor, most: int) -> tuple[Point, int]:
-        """The point after at most that many steps, and their number."""
+    def minimum(x: torch.Tensor, most: int, damping: torch.Tensor | None = None) -> Solution:
+        """The point after at most that many steps, of infinite loss where the motions have no derivatives."""
         problem = UnitBox(misfit.objective, tolerance, evaluated)
         begin = problem.evaluate(x)
-        if not math.isfinite(float(begin.value)):
-            return begin, most
-        found = minimise(problem, begin, tolerance, most)
-        point = found.point
-        failed = problem.differentiates is False
-        return replace(point, value=torch.full_like(point.value, torch.inf)) if failed else point, found.iterations
+        found = minimise(problem, begin, tolerance, most if math.isfinite(float(begin.value)) else 0, damping)
+        if problem.differentiates is False:
+            return replace(found, point=replace(begin, value=torch.full_like(begin.value, torch.inf)))
+        return found
 
     misfit.prior_weight = 0.0
     misfit.forget()
     misfit.update_prior_weight(first)
-    (point, _), left, similar = minimum(torch.as_tensor(first)[None], 0), max_evaluations - 1, False
+    found, left = minimum(torch.as_tensor(first)[None], 0), max_evaluations - 1
+    point, damping, similar = found.point, found.damping, False
     while left > 0 and not similar and math.isfinite(float(point.value)):
-        most = min(left, _BETWEEN) if misfit.has_priors else left
-        refined, steps = minimum(point.x, most)
-        if not math.isfinite(float(refined.value)):
-            point = refined if left == max_evaluations - 1 else point
+        most, weight = min(left, _BETWEEN) if misfit.has_priors else left, misfit.prior_weight
+        found = minimum(point.x, most, damping)
+        if not math.isfinite(float(found.point.value)):
+            point = found.point if left == max_evaluations - 1 else point
             break
-        point, left, weight = refined, left - steps, misfit.prior_weight
+        point, damping, left = found.point, found.damping, left - found.iterations
         misfit.update_prior_weight(point.x[0].numpy())
-        similar = steps < most and _SIMILAR * weight <= misfit.prior_weight <= weight / _SIMILAR
+        similar = found.converged and _SIMILAR * weight <= misfit.prior_weight <= weight / _SIMILAR
     return _Attempt(point.x[0].numpy(), float(point.value), history, misfit.prior_weight)

@@ -1,5 +1,7 @@
 """Actuators that change inputs by given functions."""
 
+from copy import deepcopy
+
 import torch
 
 from warp_resphys.data.input_network import InputNetwork
@@ -14,14 +16,14 @@ def network_of(change, highest, parts, filters=()):
     values[::2] = values[::2].round()  # corners of the range
     values *= highest
     network = InputNetwork.of_training(values, filters, CENTRES).requires_grad_(False)
-    columns = torch.stack([unit_response(network, values, one) for one in range(len(network.weights))], 1)
+    columns = functions_of(network, values)
     normal = columns.T @ columns + 1e-6 * torch.eye(columns.shape[1])
     network.weights.copy_(torch.linalg.solve(normal, columns.T @ change(values)))
     return network
 
 
-def unit_response(network, values, one):
-    """(S,) what a weight of one of a basis function adds to a part."""
-    network.weights.zero_()
-    network.weights[one, 0] = 1.0
-    return network(values)[:, 0]
+def functions_of(network, values):
+    """(S, N) what weights of one of the basis functions add."""
+    network = deepcopy(network)
+    network.weights = torch.nn.Parameter(torch.eye(len(network.weights)).double(), requires_grad=False)
+    return network(values)

@@ -276,7 +276,7 @@ class ActuatorSettings(LoopSettings):
     """Learned changes of the inputs, trained through the simulator."""
 
     filters: Many[Positive] = setting((0.4, 2.0), "time constants of exponential means of the inputs", "s")
-    centres: Natural = setting(100, "largest number of inputs about which it is a sum of kernels")
+    centres: Natural = setting(100, "largest number of centres of the Gaussian process")
     epochs: Count = setting(4, "largest number of linearisations of the motions by the inputs")
     gate: bool = setting(
         True, "use it only if it is clearly closer to held-out trials than the simulator; false: always"

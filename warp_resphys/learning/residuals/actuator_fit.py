@@ -229,6 +229,12 @@ class LinearisedTrainer(JudgedTrainer[Actuator]):
         super().__init__(model, None, train, judge, settings, epochs)
         self._replays, self._felt, self._values, self._near = replays, felt, values, list(_NEAR)
 
+    @property
+    @override
+    def finished(self) -> bool:
+        """Whether all epochs are done, or the last one found no weights with which the motions come closer."""
+        return super().finished or not self._near
+
     @override
     def _run_epoch(self) -> dict[str, float]:
         self.begin()

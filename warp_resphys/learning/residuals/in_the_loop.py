@@ -225,7 +225,7 @@ def cross_validated_epochs(
 
     Args:
         trainers: one for each fold, whose `judge` is the loss on the held-out motions, with an error after each epoch.
-            They end after `patience` epochs without an improvement.
+            They end after `patience` epochs without an improvement, together.
         advance: called after every epoch of every fold.
 
     Returns:
@@ -237,7 +237,7 @@ def cross_validated_epochs(
     while True:
         means = np.mean([[record["rollout_error_mm"] for record in t.history] for t in trainers], axis=0)
         best = int(np.argmin(means))
-        if trainers[0].finished or len(means) - 1 - best >= trainers[0].settings.patience:
+        if all(trainer.finished for trainer in trainers) or len(means) - 1 - best >= trainers[0].settings.patience:
             judged = [trainer.judge.judged[-len(means) :] for trainer in trainers]
             before, after = ([row for of_part in judged for row in of_part[epoch]] for epoch in (0, best))
             return best, (before, after)

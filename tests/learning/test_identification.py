@@ -11,7 +11,7 @@ from support.slopes import differences
 from support.swinging_beam import MARKERS, MESH, TIP, blank, double, simulated
 from warp_resphys import Body, ConvergenceError, InputError, Inputs, Simulator, SolverSettings, select_vertices
 from warp_resphys.io.errors import DataFileError
-from warp_resphys.learning.identification.misfit import BoundedMisfit, Misfit
+from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.search import Identification, first_points, search_parameters
 from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, uncertainty_of
 from warp_resphys.learning.metrics import redundancy
@@ -276,24 +276,3 @@ def test_what_the_data_do_not_change_is_uncertain_by_its_range():
     assert result.poorest == {"stiffness": 0.0, "damping": 1.0}
     assert result.poorest_deviation == pytest.approx(12.0**-0.5)
     assert result.deviation["damping"] == pytest.approx(12.0**-0.5 * 0.1 * 100**0.25 * np.log(100.0))
-
-
-class Line(BoundedMisfit):
-    """Residuals that depend on a parameter linearly, with noise."""
-
-    def linearise(self, unit, derivatives=True):
-        rows = 10.0 * (unit - 0.8) + 0.1 * np.random.default_rng(0).standard_normal((50, 1))
-        trial = LinearTrial(rows, np.full((50, 1), 10.0 * derivatives), 50.0)
-        return LinearMisfit([trial], *self.prior_rows(unit))
-
-    def forget(self):
-        pass
-
-
-def test_a_prior_weighs_as_much_as_the_residuals_that_are_left():
-    """Those of the first guess, and of one descent from there, would hold the parameter at 0.7 or less."""
-    misfit = Line({"modulus": Bounds(lower=0.0, upper=1.0, prior=Prior(mean=0.2, deviation=0.4))})
-    result = search_parameters(misfit, [{"modulus": 0.2}], 15)
-    assert result.parameters["modulus"] == pytest.approx(0.8, abs=0.01)
-    (history,) = result.history
-    assert len({record["modulus"] for record in history}) == len(history) <= 15

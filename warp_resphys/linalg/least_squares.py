@@ -67,13 +67,10 @@ class Solution:
     iterations: int  # trial steps
     converged: bool  # whether every problem of the batch has converged
     last_step: float  # largest distance of the last step
-    damping: torch.Tensor  # (B,) of a next step
 
 
 @torch.no_grad()
-def minimise(
-    problem: Problem, start: Point, tolerance: float, max_iterations: int, damping: torch.Tensor | None = None
-) -> Solution:
+def minimise(problem: Problem, start: Point, tolerance: float, max_iterations: int) -> Solution:
     """Returns the local minimum reached from a start.
 
     A problem has converged, and is no longer updated, when a step is shorter than the tolerance and either its damping
@@ -84,10 +81,9 @@ def minimise(
         start: starting point, evaluated by the problem.
         tolerance: tolerance of `Problem.distance`.
         max_iterations: limit of trial steps, with one evaluation each.
-        damping: (B,) of the first step; None: zero.
     """
-    point, distance = start, torch.full_like(start.value, torch.inf)
-    damping = torch.zeros_like(point.value) if damping is None else damping
+    point = start
+    damping, distance = torch.zeros_like(point.value), torch.full_like(point.value, torch.inf)
     done = torch.zeros_like(point.value, dtype=torch.bool)
     accepted = ~done
     iteration = 0
@@ -113,8 +109,8 @@ def minimise(
         damping = torch.where(better, _DECREASE * damping, (_INCREASE * damping).clamp(1.0, _MAX_DAMPING))
         done |= converged
         if bool(done.all()):
-            return Solution(point, iteration, True, float(distance.max()), damping)
-    return Solution(point, iteration, False, float(distance.max()), damping)
+            return Solution(point, iteration, True, float(distance.max()))
+    return Solution(point, iteration, False, float(distance.max()))
 
 
 def _where(mask: torch.Tensor, new: torch.Tensor, old: torch.Tensor) -> torch.Tensor:

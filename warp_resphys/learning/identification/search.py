@@ -2,8 +2,7 @@
 
 The misfit (`misfit.BoundedMisfit`) is a sum of squares, which is minimised within bounds by
 `linalg.least_squares.UnitBox` with derivatives along the motions (`Replay.varied`). Its parameters are fractions of
-their ranges, "units" from 0 to 1. Priors have the weight of one independent residual, which is estimated again after
-every few steps.
+their ranges, "units" from 0 to 1.
 
 After a release, the start of a motion depends on the parameters: it is estimated again with the result, from which the
 search continues, until the loss changes by less than 2 %.
@@ -25,7 +24,7 @@ from ...io.errors import ConvergenceError, DataFileError
 from ...io.parts import Checkpoint
 from ...io.progress import Progress
 from ...io.safe_files import read_json
-from ...linalg.least_squares import Solution, UnitBox, minimise
+from ...linalg.least_squares import Point, UnitBox, minimise
 from ..observed_motions import Identified
 from .misfit import BoundedMisfit
 from .uncertainty import Uncertainty
@@ -33,8 +32,7 @@ from .uncertainty import Uncertainty
 Report = Callable[[int, float, Mapping[str, float]], None]
 IsLast = Callable[[float], bool]
 
-_BETWEEN = 3  # steps between two estimations of the weight of the priors
-_SIMILAR = 0.7  # ratio of its old and new values above which a further descent is not worth its time
+_SIMILAR = 0.7  # ratio of old and new weights of the priors above which a second descent is not worth its time
 _MOST_AGAIN, _UNCHANGED = 3, 0.98  # estimations of a release after the first; ratio of losses at which they end
 _AT_A_BOUND = 1e-4  # of the range
 
@@ -239,36 +237,27 @@ def _descend(
 
     def evaluated(unit: FloatArray, loss: float) -> None:
         values = misfit.from_unit(unit)
-        for record in history:
-            if {**record, "loss": loss} == {"loss": loss, **values}:
-                record["loss"] = loss  # with another weight of the priors
-                return
         if math.isfinite(loss):
             history.append({"loss": loss, **values})
         if report is not None:
             report(number, loss, values)
 
-    def minimum(x: torch.Tensor, most: int, damping: torch.Tensor | None = None) -> Solution:
-        """The point after at most that many steps, of infinite loss where the motions have no derivatives."""
+    def minimum(x: torch.Tensor, most: int) -> Point:
         problem = UnitBox(misfit.objective, tolerance, evaluated)
         begin = problem.evaluate(x)
-        found = minimise(problem, begin, tolerance, most if math.isfinite(float(begin.value)) else 0, damping)
-        if problem.differentiates is False:
-            return replace(found, point=replace(begin, value=torch.full_like(begin.value, torch.inf)))
-        return found
+        if not math.isfinite(float(begin.value)):
+            return begin
+        end = minimise(problem, begin, tolerance, most - 1).point
+        return replace(end, value=torch.full_like(end.value, torch.inf)) if problem.differentiates is False else end
 
     misfit.prior_weight = 0.0
     misfit.forget()
     misfit.update_prior_weight(first)
-    found, left = minimum(torch.as_tensor(first)[None], 0), max_evaluations - 1
-    point, damping, similar = found.point, found.damping, False
-    while left > 0 and not similar and math.isfinite(float(point.value)):
-        most, weight = min(left, _BETWEEN) if misfit.has_priors else left, misfit.prior_weight
-        found = minimum(point.x, most, damping)
-        if not math.isfinite(float(found.point.value)):
-            point = found.point if left == max_evaluations - 1 else point
-            break
-        point, damping, left = found.point, found.damping, left - found.iterations
+    point = minimum(torch.as_tensor(first)[None], max_evaluations)
+    left, weight = max_evaluations - len(history), misfit.prior_weight
+    if misfit.has_priors and left > 1 and math.isfinite(float(point.value)):
         misfit.update_prior_weight(point.x[0].numpy())
-        similar = found.converged and _SIMILAR * weight <= misfit.prior_weight <= weight / _SIMILAR
+        if not _SIMILAR * weight < misfit.prior_weight < weight / _SIMILAR:
+            refined = minimum(point.x, left)
+            point = refined if math.isfinite(float(refined.value)) else point
     return _Attempt(point.x[0].numpy(), float(point.value), history, misfit.prior_weight)

@@ -200,7 +200,6 @@ CASES = {
     ("experiment=marker_ablation", "mesh.divisions=[4,2,2]", "ablation.counts=[1,4]"): [
         ("ablation.counts", "ablation.counts=[1,43]"),
         ("data.weights_g.observed", "data.weights_g.observed=[50,70]"),
-        ("reconstruction.method", "reconstruction=lbfgsb", "ablation.modes=4"),
     ],
     ("experiment=tiny", TRACKED): [
         ("chambers.count", "chambers.count=3"),
@@ -215,7 +214,6 @@ CASES = {
         ("the first must be a multiple of the second", "laboratory.time_step=0.003"),
         ("correlation is ", "laboratory.sequences.correlation=[[1.0],[0.0]]"),
         ("identify.first_guess", "+identify.first_guess.pressure=0.04"),
-        ("reconstruction.method=lbfgsb has none", "reconstruction=lbfgsb", "+reconstruction.modes=4"),
         ("recordings have their own", "data.input_scales=[1.5]", "data.folder=.", "data.test=[a]"),
         (r"pressure_slope_3\.lower is -0\.1: .* not negative", f"{SLOPE}={{lower: -0.1, upper: 0.1}}"),
     ],

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-import scipy.optimize
 import torch
 
 from warp_resphys import Body, Corotated, Inputs, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import KINDS, WHOLE_STATE, MarkerMap, bind_markers
 from warp_resphys.dynamics.linearisation import Linearisation
-from warp_resphys.dynamics.modes import vibration_modes
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.learning.residuals.reconstruction import follow, make_reconstructor
 from warp_resphys.settings.learning import ReconstructionSettings
@@ -23,9 +21,9 @@ PUBLISHED = {"tolerance": 1e-15, "max_iterations": 3000}
 STEMS = [[0.06, 0.012, 0.045], [0.03, -0.015, 0.013], [0.075, 0.02, 0.01]]
 
 
-def reconstructor(sim, method, regularisation, tolerance, max_iterations, modes=None, observation=WHOLE_STATE):
+def reconstructor(sim, method, regularisation, tolerance, max_iterations, observation=WHOLE_STATE):
     """The method with these settings."""
-    settings = {"method": method, "regularisation": regularisation, "tolerance": tolerance, "modes": modes}
+    settings = {"method": method, "regularisation": regularisation, "tolerance": tolerance}
     return make_reconstructor(sim, ReconstructionSettings(**settings, max_iterations=max_iterations), observation)
 
 
@@ -127,25 +125,6 @@ class TestGaussNewton:
         missed = (q[0] - observed)[0, FREE].flatten()
         np.testing.assert_allclose(missed, -regularisation * slope, rtol=0, atol=1e-5 * float(missed.abs().max()))
 
-    @pytest.mark.parametrize("modes", [2, 12])
-    def test_minimum_in_a_basis_against_brute_force(self, modes):
-        """With 2 columns against 6 coordinates, and with 12: both ways to the same Jacobian."""
-        observed, start = observation()
-        sim, markers, regularisation = simulator(), markers_at([6, 11]), 1e-6
-        basis = vibration_modes(sim, modes)
-
-        def residuals(coefficients):
-            force = basis @ torch.as_tensor(coefficients)
-            new = sim.step(start, Inputs(force.view(1, 12, 3)))
-            misfit = (markers(new.q) - markers(observed[1])).ravel()
-            return np.concatenate([misfit, np.sqrt(regularisation) * force])
-
-        best = scipy.optimize.least_squares(residuals, np.zeros(modes), "3-point", xtol=1e-14, ftol=1e-14, gtol=1e-14)
-        solver = reconstructor(sim, "gauss_newton", regularisation, **TIGHT, modes=modes, observation=markers)
-        expected = (basis @ torch.as_tensor(best.x)).view(1, 12, 3)
-        result = solver.step(start, markers(observed[1]))
-        np.testing.assert_allclose(result.force, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
-
     @pytest.mark.parametrize(("name", "remedy"), [("whole", "max_iterations"), ("vertices", "regularisation")])
     def test_too_few_iterations(self, name, remedy):
         observed, start = observation()
@@ -196,17 +175,17 @@ def test_the_published_method_finds_the_same_minimum(name, integrator, regularis
 
 
 @pytest.mark.parametrize(
-    ("method", "integrator", "name", "modes"),
+    ("method", "integrator", "name"),
     [
-        *(("gauss_newton", "bdf2", "whole", None), ("lbfgsb", "midpoint", "whole", None)),
-        *(("gauss_newton", "bdf2", "pairs", 6), ("gauss_newton", "midpoint", "pairs", None)),
+        *(("gauss_newton", "bdf2", "whole"), ("lbfgsb", "midpoint", "whole")),
+        *(("gauss_newton", "bdf2", "pairs"), ("gauss_newton", "midpoint", "pairs")),
     ],
 )
-def test_forces_reproduce_the_motion_in_open_loop(method, integrator, name, modes):
+def test_forces_reproduce_the_motion_in_open_loop(method, integrator, name):
     observed, start = observation(6, (0.05, 0.2), integrator=integrator)
     sim, markers = simulator(integrator=integrator), OBSERVED[name]
     regularisation, share = (1e-5, 0.2) if name == "whole" else (1e-7, 0.3)
-    settings = {"tolerance": 1e-12, "max_iterations": 500, "modes": modes, "observation": markers}
+    settings = {"tolerance": 1e-12, "max_iterations": 500, "observation": markers}
     q, force = reconstruct(reconstructor(sim, method, regularisation, **settings), start, observed)
     assert not force[:, :, BODY.fixed_vertices].any()
     replayed = sim.rollout(start, 6, Inputs(force)).q[1:]
@@ -216,8 +195,8 @@ def test_forces_reproduce_the_motion_in_open_loop(method, integrator, name, mode
 
 
 class TestLevenbergMarquardt:
-    @pytest.mark.parametrize(("integrator", "modes"), [("bdf2", None), ("midpoint", 4)])
-    def test_gauss_newton_finds_the_same_minimum(self, integrator, modes):
+    @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
+    def test_gauss_newton_finds_the_same_minimum(self, integrator):
         """With stems that turn, and with a marker that one of the environments did not see."""
         observed, start = observation(3, (0.1, 0.5), integrator=integrator)
         sim = simulator(integrator=integrator)
@@ -227,9 +206,7 @@ class TestLevenbergMarquardt:
             seen = markers(target)
             seen[1, 0] = torch.nan
             damped, plain = (
-                reconstructor(sim, method, 1e-6, **TIGHT, modes=modes, observation=markers).step(
-                    state, seen, first_guess=first
-                )
+                reconstructor(sim, method, 1e-6, **TIGHT, observation=markers).step(state, seen, first_guess=first)
                 for method, state in zip(("levenberg_marquardt", "gauss_newton"), states, strict=True)
             )
             scale = float(plain.force.abs().max())
@@ -257,12 +234,10 @@ class TestLevenbergMarquardt:
     ("settings", "sentence"),
     [
         ({"method": "adam"}, "ReconstructionSettings.method is 'adam'"),
-        ({"method": "lbfgsb", "modes": 3}, "reconstruction.method"),
         ({"regularisation": -1e-9, "observation": WHOLE_STATE}, "ReconstructionSettings.regularisation"),
         ({"regularisation": 0.0}, "reconstruction.regularisation"),
         ({"tolerance": 0.0}, "ReconstructionSettings.tolerance"),
         ({"max_iterations": 0}, "ReconstructionSettings.max_iterations"),
-        ({"modes": 25}, "25 vibration modes were asked for, but the body has 1 to 24."),
         ({"observation": markers_at([-1])}, "a marker is on a vertex that the body does not have"),
     ],
 )

@@ -49,7 +49,7 @@ def ablation_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
     workers = workers_for(run.parallel, run.ablation.processes, run.device).at_most(len(run.ablation.counts))
     keys = (*SIMULATOR, "simulation")
     generated = StageSettings.reading(run, *keys, "target", "data", files=files)
-    drawn = (f"ablation.{name}" for name in ("counts", "draws", "modes"))
+    drawn = (f"ablation.{name}" for name in ("counts", "draws"))
     ablated = StageSettings.reading(run, *keys, *drawn, "reconstruction", "seed", files=files)
     return [
         Stage("generate", generate_motion, (MOTION,), generated),
@@ -72,7 +72,7 @@ def check_ablation(run: RunSettings, simulator: Simulator) -> None:
             "refine the mesh."
         )
     probe = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_reconstructor(simulator, run.reconstruction.changed(modes=run.ablation.modes), probe)
+    make_reconstructor(simulator, run.reconstruction, probe)
 
 
 def print_ablation(run: RunSettings, folder: Path) -> None:
@@ -146,7 +146,7 @@ def _from_markers(context: StageContext, count: int, report: Report) -> Arrays:
     motion, like = simulator.tensor(read_motion(context.run_dir)[0]), simulator.rest_positions
     vertices = draw_markers(simulator, count, draws, settings.seed)
     markers = MarkerMap.at_vertices(torch.as_tensor(vertices, device=like.device), like.dtype)
-    method = make_reconstructor(simulator, settings.reconstruction.changed(modes=settings.ablation.modes), markers)
+    method = make_reconstructor(simulator, settings.reconstruction, markers)
     q = motion[0].expand(draws, *like.shape)
     error, misfit = list[torch.Tensor](), list[torch.Tensor]()
     targets = (markers(one.expand_as(q)) for one in motion[1:])

@@ -114,10 +114,14 @@ class Comparison:
             return None if used is None else model
         corrected = bool(used.identified.actuator) if used.learned is None else not used.learned.replaces_simulator
         for other in self._growing if corrected else ():
-            simulator, identified = self.models[other].simulator, self.models[other].identified
-            if simulator is used.simulator and identified.parameters == used.identified.parameters:
+            if self._same_simulator(other, model):
                 return other
         return None
+
+    def _same_simulator(self, model: str, other: str) -> bool:
+        """Whether two models have the same simulator with the same parameters, whatever was learned on top of it."""
+        one, two = self.models[model], self.models[other]
+        return one.simulator is two.simulator and one.identified.parameters == two.identified.parameters
 
     def _calibrating(self, model: str) -> list[str]:
         """Names of the trials of the calibration, and of the largest training trial if the model grows by it."""
@@ -203,6 +207,8 @@ class Comparison:
     def _linearised(self, names: Sequence[str], uncertain: bool = False) -> Linear:
         """Derivatives of trials by the parameters of each model's simulator; empty without markers.
 
+        Models that differ in what was learned share the derivatives of the first of them.
+
         Args:
             names: names of the trials.
             uncertain: whether models are left out whose parameters have no uncertainty.
@@ -212,8 +218,7 @@ class Comparison:
             replaced = model.learned is not None and model.learned.replaces_simulator
             if replaced or not model.has_intervals or (uncertain and model.identified.uncertainty is None):
                 continue
-            alike = (other for other in found if self.models[other].simulator is model.simulator)
-            same = next((other for other in alike if self.models[other].identified == model.identified), None)
+            same = next((other for other in found if self._same_simulator(other, name)), None)
             found[name] = (
                 sensitivities(model.simulator, self.motions, names, model.identified, self.parts.batch)
                 if same is None

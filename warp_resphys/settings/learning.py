@@ -198,7 +198,6 @@ class ReconstructionSettings(Settings):
     )
     tolerance: Positive = setting(1.0e-10, "last change of any position [m]; for lbfgsb, relative change of the loss")
     max_iterations: Natural = setting(20, "iterations after which a step fails")
-    modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")
 
 
 class NetworkSettings(Settings):
@@ -329,4 +328,3 @@ class AblationSettings(Settings):
     counts: Annotated[Some[Natural], AfterValidator(different)] = setting(description="numbers of markers")
     draws: Natural = setting(10, "random sets of each number")
     processes: Natural | None = setting(None, "processes; null: one per core, one on a GPU")
-    modes: Natural | None = setting(None, "vibration modes whose inertial forces span the force; null: any force")

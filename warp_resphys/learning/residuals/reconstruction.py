@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ...data.markers import WHOLE_STATE, Markers, Observation, WholeState
-from ...dynamics.modes import vibration_modes
 from ...dynamics.simulator import Constants, Simulator
 from ...io.arrays import Brief
 from ...io.errors import ConvergenceError, InputError, checks_types
@@ -112,13 +111,12 @@ class LeastSquares(Reconstructor):
 
     Args:
         problems: formulations of the same minimum, the fastest first.
-        arguments: see `Reconstructor`; ``modes`` is the number of columns of B.
+        arguments: see `Reconstructor`.
     """
 
     def __init__(self, problems: Sequence[type[StepProblem]], *arguments: Any) -> None:
         super().__init__(*arguments)
-        self._problems, modes = tuple(problems), self.settings.modes
-        self._basis = None if modes is None else vibration_modes(self.simulator, modes)
+        self._problems = tuple(problems)
 
     @override
     def step(
@@ -132,7 +130,7 @@ class LeastSquares(Reconstructor):
         step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
-                problem = kind(*step, self._basis, self.settings.tolerance)
+                problem = kind(*step, self.settings.tolerance)
                 result = minimise(
                     problem, problem.start(first_guess), self.settings.tolerance, self.settings.max_iterations
                 )
@@ -245,25 +243,19 @@ def make_reconstructor(
 
     Args:
         simulator: to correct.
-        settings: method, tolerances and modes; ``levenberg_marquardt`` and ``modes`` are for markers, which need a
-            positive regularisation.
+        settings: method and tolerances; ``levenberg_marquardt`` is for markers, which need a positive regularisation.
         observation: C, for as many environments as the states have.
 
     Raises:
-        InputError: a method or modes that do not fit the observation, or a marker on a vertex that the body does not
-            have.
+        InputError: a method that does not fit the observation, or a marker on a vertex that the body does not have.
     """
     problems: dict[str, tuple[type[StepProblem], ...]] = {"gauss_newton": (FullStateProblem,)}
-    method, modes = settings.method, settings.modes
+    method = settings.method
     if not isinstance(observation, WholeState):
         damped = (MarkerForceProblem,)
         problems = {"gauss_newton": (MarkerPositionProblem, *damped), "levenberg_marquardt": damped}
     if method not in (*problems, "lbfgsb"):
         raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
-    if modes is not None and isinstance(observation, WholeState):
-        raise InputError("reconstruction.modes is for bodies that are seen through markers: leave it out.")
-    if modes is not None and method == "lbfgsb":
-        raise InputError(f"{modes} modes are asked for, but reconstruction.method=lbfgsb has none: take gauss_newton.")
     arguments = (simulator, settings, observation)
     return LBFGSB(*arguments) if method == "lbfgsb" else LeastSquares(problems[method], *arguments)
 

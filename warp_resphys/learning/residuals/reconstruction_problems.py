@@ -34,7 +34,6 @@ class StepProblem(Problem):
     observed: torch.Tensor  # (B, M, D) measured points at its end, NaN where a point was not seen [unit]
     weight: float  # lambda [unit^2/N^2]
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
-    basis: torch.Tensor | None = None  # (3 N, modes) basis of the forces; None for any force on the free vertices
     tolerance: float = 0.0  # of the distance of two iterates at the minimum [m]
 
     def __post_init__(self) -> None:
@@ -146,8 +145,7 @@ class MarkerPositionProblem(StepProblem):
 
     so that f solves a ridge regression with J = C' H^-1 and r = y - C(x) + C' H^-1 g, C' being the derivative of C:
     f = J^T (J J^T + lambda I)^-1 r. One factorisation and 3 m + 2 back-substitutions an iteration, no inner solve, and
-    at convergence f = g(x) holds as it does for a step of the simulator. Restricted to forces B a with orthonormal
-    columns B (see `vibration_modes`), J is C' H^-1 B, which takes a back-substitution a column where these are fewer.
+    at convergence f = g(x) holds as it does for a step of the simulator.
 
     Where x stands at a fraction e of the time step, q+ moves 1/e times as far as x, so that e (y - C(q+)) replaces
     y - C(x), and lambda e^2 replaces lambda. The objective is set to zero, so that every step is accepted.
@@ -169,21 +167,14 @@ class MarkerPositionProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        x, step, basis = point.x[:, 0], self._step, self.basis
+        x, step = point.x[:, 0], self._step
         end = step.finish(x).q
         residual = step.residual(x).reshape(len(x), -1, 1).to(x.dtype)
         step.factorise(x)
         transposed = self.transposed_jacobian(end)
-        columns = transposed
-        if basis is not None and basis.shape[1] < transposed.shape[2]:
-            columns = basis.expand(len(x), -1, -1)
-        response, settling = step.solve(torch.cat([columns, residual], dim=2)).tensor_split([-1], dim=2)
-        jacobian = response.mT if columns is transposed else transposed.mT @ response
-        if basis is not None and columns is transposed:
-            jacobian = jacobian @ basis
+        response, settling = step.solve(torch.cat([transposed, residual], dim=2)).tensor_split([-1], dim=2)
         right = step.stage.end * self.missing(end) + transposed.mT @ settling
-        force = ridge(jacobian, right, self.weight * step.stage.end**2)
-        force = force if basis is None else basis @ force
+        force = ridge(response.mT, right, self.weight * step.stage.end**2)
         new = x + (step.solve(force) - settling).view_as(x)
         return lambda _: torch.stack([new, force.view_as(x)], 1)
 
@@ -193,7 +184,7 @@ class MarkerForceProblem(StepProblem):
 
     Each trial force is applied in a whole step of the simulator, with its line search, so that every iterate is a state
     of the simulator. With J = C' H^-1 there, the next force minimises
-    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2, over forces B a where a basis B is given.
+    |r - J (f - f0)|^2 + lambda |f|^2 + d lambda |f - f0|^2.
     """
 
     method = "sparse Levenberg-Marquardt"
@@ -205,9 +196,6 @@ class MarkerForceProblem(StepProblem):
     @override
     def start(self, first_guess: torch.Tensor | None) -> Point:
         """Starts at zero force where the step fails with the first guess."""
-        if first_guess is not None and self.basis is not None:
-            basis = self.basis
-            first_guess = (basis @ (basis.mT @ first_guess.flatten(1)[..., None])).view_as(first_guess)
         if first_guess is not None and bool(torch.isfinite((point := self.evaluate(first_guess)).value).all()):
             return point
         return self.evaluate(torch.zeros_like(self.state.q))
@@ -227,19 +215,16 @@ class MarkerForceProblem(StepProblem):
 
     @override
     def linearise(self, point: Point) -> Move:
-        force, (end,), basis = point.x.flatten(1)[..., None], point.kept, self.basis
+        force, (end,) = point.x.flatten(1)[..., None], point.kept
         step = self.without_force()
         step.factorise(self.solution(point)[0])
         # q+ moves 1 / stage.end times as far as x.
         jacobian = step.solve(self.transposed_jacobian(end)).mT / step.stage.end
         missing = self.missing(end)
-        if basis is not None:
-            force, jacobian = basis.mT @ force, jacobian @ basis
 
         def damped_step(damping: torch.Tensor) -> torch.Tensor:
             factor = (1.0 + damping)[:, None, None]
             change = ridge(jacobian, missing + jacobian @ (force / factor), self.weight * factor)
-            new = force - force / factor + change
-            return (new if basis is None else basis @ new).view_as(point.x)
+            return (force - force / factor + change).view_as(point.x)
 
         return damped_step

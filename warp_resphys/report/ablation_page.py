@@ -80,7 +80,7 @@ def write_ablation_report(
         )
     medians = "; ".join(f"{row.markers}: {number_text(row.median_mm)} mm" for row in rows)
     alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
-    how = _how_reconstructed(ablation.modes, settings.reconstruction.regularisation)
+    how = _how_reconstructed(settings.reconstruction.regularisation)
 
     def sections(canvas: Canvas) -> Iterator[Part]:
         boxes = marker_boxes({row.markers: np.array(row.errors_mm) for row in rows}, uncorrected)
@@ -122,13 +122,12 @@ def ablation_table(rows: Sequence[MarkerErrors], note: str = "") -> PageTable:
     return PageTable("Markers", [*_COLUMNS.values()], body, note)
 
 
-def _how_reconstructed(modes: int | None, regularisation: float) -> str:
-    free = f"among the inertial forces of the {modes} slowest vibrations" if modes else "free at every vertex"
+def _how_reconstructed(regularisation: float) -> str:
     return Markup(
         "Step by step from the known first state, with the force of least |markers&nbsp;–&nbsp;observed|<sup>2</sup> + "  # noqa: RUF001
-        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², {}. The published study uses "
+        "λ&nbsp;|force|<sup>2</sup>, where λ is {}&nbsp;m²/N², free at every vertex. The published study uses "
         "1.0&nbsp;×&nbsp;10⁻⁴&nbsp;m²/N² for λ."  # noqa: RUF001
-    ).format(number_text(regularisation), free)
+    ).format(number_text(regularisation))
 
 
 def verdict(rows: Sequence[MarkerErrors], uncorrected: float) -> str:

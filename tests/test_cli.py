@@ -9,6 +9,7 @@ import subprocess
 import sys
 import textwrap
 import types
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,11 @@ from pydantic import ConfigDict
 from support.command_line import ended, outcome
 from warp_resphys import InputError, __version__, cli, commands
 from warp_resphys.commands import NOBODY_READS, run_label
+from warp_resphys.io.errors import ResphysWarning
 from warp_resphys.io.resuming import StageInterrupted
 from warp_resphys.io.setting_errors import keys
 from warp_resphys.io.settings import Settings
+from warp_resphys.launch import _one_sentence_each
 from warp_resphys.overrides import readable
 from warp_resphys.settings.run import RunSettings
 
@@ -429,3 +432,10 @@ class TestProcess:
     def test_another_pipe_that_breaks_is_a_fault_of_the_program(self, config_dir):
         _, err = self.start(config_dir, self.job('raise BrokenPipeError(32, "Broken pipe")')).communicate(timeout=60)
         assert err.endswith("BrokenPipeError: [Errno 32] Broken pipe\n")
+
+
+def test_warnings_that_differ_in_numbers_alone_are_shown_once():
+    told = ("24 % more of 'pull_1'", "25.5 % more of 'pull_1'", "25.5 % more of 'pull_2'")
+    with _one_sentence_each():
+        shown = [warnings.formatwarning(text, ResphysWarning, "", 0) for text in told]
+    assert shown == ["warning: 24 % more of 'pull_1'\n", "", "warning: 25.5 % more of 'pull_2'\n"]

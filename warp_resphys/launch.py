@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module, resources
 from pathlib import Path
 from typing import Any, Final, get_type_hints
@@ -38,6 +39,7 @@ INTERRUPTED: Final = 130
 TYPED: Final = ("run", "tune")
 # Overrides of Hydra for a job that only prints.
 _SILENT: Final = ("hydra.run.dir=.", "hydra.output_subdir=null", "hydra/job_logging=disabled")
+_NUMBER: Final = re.compile(r"(?<![\w'.])[\d.,]*\d(?![\w'])")  # on its own, not in a name
 
 
 def launch(command: str, function: str, arguments: Sequence[str]) -> None:
@@ -129,10 +131,14 @@ class _Job:
 
 @contextmanager
 def _one_sentence_each() -> Iterator[None]:
-    """Lets errors and warnings have one sentence each, without lines of code; restores the process at the end."""
+    """Lets errors and warnings have one sentence each, without lines of code; restores the process at the end.
+
+    Of warnings that differ in numbers alone, as of one body in several stages, the first is shown.
+    """
+    shown = set[str]()
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # It tells of its list of fonts.
     before = warnings.formatwarning, logging.raiseExceptions, os.environ.get("HYDRA_FULL_ERROR")
-    warnings.formatwarning = _sentence_of_warning
+    warnings.formatwarning = partial(_sentence_of_warning, shown)
     logging.raiseExceptions = False  # no traceback for each log line if the disk is full
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them and exiting
     try:
@@ -152,11 +158,18 @@ def _function(name: str) -> tuple[Callable[..., Any], type[Settings]]:
 
 
 def _sentence_of_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+    shown: set[str],
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
 ) -> str:
-    """A warning as `warnings.formatwarning` returns it; those of this package without a line of code."""
+    """A warning as `warnings.formatwarning` returns it; those of this package without a line of code, each once."""
     if issubclass(category, ResphysWarning):
-        return f"warning: {message}\n"
+        before = len(shown)
+        shown.add(_NUMBER.sub("", str(message)))
+        return f"warning: {message}\n" if len(shown) > before else ""
     return f"{filename}:{lineno}: {category.__name__}: {message}\n"
 
 

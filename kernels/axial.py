@@ -1,11 +1,11 @@
-"""Laws that are functions of a length: fibres, strings, muscles, and inertia.
+"""Laws that are functions of a length: fibres, muscles, and inertia.
 
 The vector x at a point less an origin o has the length l and the unit vector u. With the values v, a tension gives
 
     e(l, v),   t = de/dl,   slope dt/dl,   and dt/dv,
 
 so that the stress is t u and the tangent slope u u^T + t / l (1 - u u^T), which has a negative eigenvalue only for a
-negative tension. The origin is zero, or for strings and inertia the first three values. The last value of fibres, the
+negative tension. The origin is zero, or for inertia the first three values. The last value of fibres, the
 elongation over which they become taut, is a constant.
 """
 
@@ -19,8 +19,6 @@ from .modules import named_module
 ZERO, HALF, ONE, TWO, THREE = wp.float64(0.0), wp.float64(0.5), wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)
 SIXTH, TWENTY_FOURTH = wp.float64(1.0 / 6.0), wp.float64(1.0 / 24.0)
 QUARTER, TENTH, FORTIETH = wp.float64(0.25), wp.float64(0.1), wp.float64(0.025)
-
-string_values = wp.types.vector(6, wp.float64)  # position of the point that it is tied to [m], k [N/m], L [m], toe
 
 
 @wp.func
@@ -67,14 +65,6 @@ def thread_tension(length: wp.float64, v: wp.vec2d):
     """Describes a thread, ``k s(l - 1)``, with s(e) = max(e, 0)^2 / 2 smoothed over a toe; v = (k, toe)."""
     energy, force, slope = thread_pull(length - ONE, v[1])
     return v[0] * energy, v[0] * force, v[0] * slope, wp.vec2d(force, ZERO)
-
-
-@wp.func
-def string_tension(length: wp.float64, v: string_values):
-    """Describes a tension-only spring from a point, ``k s(l - L)``."""
-    energy, force, slope = thread_pull(length - v[4], v[5])
-    by_values = string_values(ZERO, ZERO, ZERO, force, -v[3] * slope, ZERO)
-    return v[3] * energy, v[3] * force, v[3] * slope, by_values
 
 
 @wp.func
@@ -149,7 +139,4 @@ def _axial_law(name: str, tension: Any, tied: bool = False) -> Law:
 
 
 THREAD, MUSCLE = _axial_law("axial.thread", thread_tension), _axial_law("axial.muscle", muscle_tension)
-STRING, INERTIA = (
-    _axial_law(f"axial.{name}", tension, tied=True)
-    for name, tension in (("string", string_tension), ("inertia", inertia_tension))
-)
+INERTIA = _axial_law("axial.inertia", inertia_tension, tied=True)

@@ -8,12 +8,11 @@ from scipy.spatial.transform import Rotation
 from support.chambered import hollow_box
 from support.clamped import clamped
 from warp_resphys import Body, Fibres, Inputs, Mesh, Muscles, Pressure, Rigid, Scene, Simulator, SymmetryPlane, Tendons
-from warp_resphys.energies import Muscle, Strings
+from warp_resphys.energies import Muscle
 from warp_resphys.energies.materials import Corotated, StableNeoHookean
 from warp_resphys.io.errors import InputError, MeshError
 from warp_resphys.mesh import find_chambers
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
-from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.mesh.volume_mesh import join
 from warp_resphys.settings.body import Route
 
@@ -22,7 +21,8 @@ SOFT = Corotated(2e5, 0.45)
 
 def finger():
     mesh = box_hexahedra((0.1, 0.03, 0.03), (4, 1, 1))
-    return clamped(mesh, energies=[Strings([select_vertices(mesh, x=0.1)], 0.1)])
+    route = Route(guides=[[0.0, 0.015, 0.025], [0.05, 0.015, 0.028], [0.1, 0.015, 0.025]])
+    return clamped(mesh, energies=[Tendons([route], friction=0.2)])
 
 
 def ball():
@@ -32,11 +32,11 @@ def ball():
 
 def test_bodies_of_a_scene_move_as_each_alone():
     scene = Scene({"finger": finger(), "ball": ball()})
-    weight = Inputs(payload=np.array([[0.05]]))
+    pulled = Inputs(tendon_tension=np.array([[0.5]]))
     together = Simulator(scene, SOFT)
-    assert {"finger_youngs_modulus", "finger_string_length", "ball_body_density"} <= together.parameters.keys()
-    motion = together.rollout(together.rest_state(), 6, scene.inputs({"finger": weight}))
-    for name, body, material, inputs in (("finger", finger(), SOFT, weight), ("ball", ball(), {}, Inputs())):
+    assert {"finger_youngs_modulus", "finger_tendon_friction", "ball_body_density"} <= together.parameters.keys()
+    motion = together.rollout(together.rest_state(), 6, scene.inputs({"finger": pulled}))
+    for name, body, material, inputs in (("finger", finger(), SOFT, pulled), ("ball", ball(), {}, Inputs())):
         alone = Simulator(body, material)
         own = alone.rollout(alone.rest_state(), 6, inputs)
         torch.testing.assert_close(motion.q[:, :, scene.vertex_slice(name)], own.q, rtol=0.0, atol=1e-9)

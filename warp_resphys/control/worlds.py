@@ -179,7 +179,7 @@ def laboratory_robot(settings: StageSettings, upright: bool = False, on_failure:
         model=_LABORATORY,
         settings=target.model_copy(update={"gravity": gravity}),
         material=settings.laboratory.material,
-        mesh=build_body(target, settings.payload_at).mesh,
+        mesh=build_body(target).mesh,
         payload_at=settings.payload_at,
         markers=MarkerSettings.of(BindingSettings.of(settings.binding)),
         labels=settings.binding.observed,

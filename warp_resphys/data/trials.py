@@ -9,7 +9,6 @@ import h5py
 import numpy as np
 import torch
 
-from ..energies.strings import PAYLOAD, Strings
 from ..fem.bodies import Body
 from ..io.arrays import BoolArray, Brief, FloatArray
 from ..io.errors import InputError
@@ -17,9 +16,13 @@ from ..io.safe_files import atomic_hdf5, create, read_array, read_attribute, rea
 from ..mesh.selection import vertices_at
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
+from ..stepping.quantity import Quantity
 from ..stepping.rotations import rotations
 from .base_motion import at_times, contact_inputs
 
+PAYLOAD: Final = Quantity(
+    "payload", "kg", 0.0, closed=True, typical=0.05, words="weight", shown_unit="g", shown_factor=1e3
+)
 GIVEN: Final = "given"  # beginning of trials whose initial state is known
 RELEASED: Final = "released"
 STATIC: Final = "static"
@@ -303,8 +306,7 @@ def _of_trials(file: h5py.Group, name: str, count: int) -> FloatArray:
 def payload_inputs(body: Body, payload_at: Place | None, loads: FloatArray) -> dict[str, FloatArray]:
     """Converts payloads to arguments of `Inputs` [kg].
 
-    On a body with strings the result is (R, 1) `energies.strings.PAYLOAD`; otherwise it is an (R, N) ``attached_mass``,
-    in equal shares on the vertices that carry the payload.
+    The result is an (R, N) ``attached_mass``, in equal shares on the vertices that carry the payload.
 
     Args:
         body: body that carries the payloads.
@@ -315,8 +317,6 @@ def payload_inputs(body: Body, payload_at: Place | None, loads: FloatArray) -> d
         InputError: a payload without a place, or a place with fixed vertices only.
         MeshError: no vertex lies at the place.
     """
-    if any(isinstance(energy, Strings) for energy in body.energies):
-        return {PAYLOAD.name: loads[:, None].copy()}
     masses = np.zeros((len(loads), body.n_vertices))
     if not np.any(loads):
         return {"attached_mass": masses}

@@ -21,4 +21,3 @@ from .materials import MooneyRivlin as MooneyRivlin
 from .medium import Medium as Medium
 from .muscles import Muscle as Muscle
 from .pointwise import PointwiseEnergy as PointwiseEnergy
-from .strings import Strings as Strings

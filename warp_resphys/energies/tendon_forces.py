@@ -40,7 +40,6 @@ from ..kernels import tendon_segments as kernels
 from ..stepping.quantity import Quantity
 from .base import BoundEnergy, Energy, EnergySite, EnergyStep, Memory
 from .launcher import Launcher, launch, warp_view
-from .strings import thread_pull
 from .term import Adjoint, Kernel, PartPoints, PartTerm, PointSet, Values, value_of
 
 TENSION = Quantity("tendon_tension", "N", 0.0, closed=True, per="tendon", words="tension", shown_unit="N")
@@ -58,6 +57,12 @@ ROUTE = "tendon_route"  # (B, T, 3) c of `kernels.tendon_segments`: one, and the
 STEP_VALUES = ("tendon_hold", "tendon_drop", "tendon_rise", "tendon_beyond")
 _TINY = 1e-300  # keeps a division by a length defined
 _STRAIGHT = 1e-4  # rad: angles are rounded off below it, so that they have a derivative at zero
+
+
+def thread_pull(elongation: torch.Tensor, toe: float) -> torch.Tensor:
+    """Returns the force of a thread of stiffness one [m], as the kernels have it (`kernels.axial.thread_pull`)."""
+    tightening = elongation.clamp(0.0, toe)
+    return tightening * (elongation - 0.5 * tightening) / toe
 
 
 @dataclass(frozen=True)

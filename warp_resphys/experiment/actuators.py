@@ -12,16 +12,14 @@ from ..energies.medium import Medium
 from ..energies.muscles import CONTRACTION as MUSCLE_CONTRACTION
 from ..energies.muscles import STRESS, Muscle, Muscles
 from ..energies.pressure import PRESSURE, Pressure
-from ..energies.strings import Strings
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..mesh.chambers import Chamber, find_chambers, outer_surface
-from ..mesh.selection import select_cells, vertices_at
+from ..mesh.selection import select_cells
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import BodySettings, ChamberSettings, MuscleSettings
-from ..settings.mesh import Place
 from ..stepping.quantity import Quantity
 
 # Driving input by group and the value of its key ``commanded``.
@@ -34,16 +32,15 @@ DRIVING_QUANTITIES: Final[Mapping[str, Quantity]] = {
 }
 
 
-def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None) -> list[Energy]:
+def build_actuators(settings: BodySettings, mesh: Mesh) -> list[Energy]:
     """Builds the energies of a body besides its material.
 
-    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``payload_string``, ``obstacles`` and
-    ``self_contact``, and ``energies`` of other packages.
+    Those of ``chambers``, ``fibres``, ``tendons``, ``muscles``, ``medium``, ``obstacles`` and ``self_contact``, and
+    ``energies`` of other packages.
 
     Args:
         settings: of the body.
         mesh: of the body.
-        payload_at: vertices that the string is tied to.
 
     Raises:
         InputError: the number of chambers differs from the mesh, or tendons or muscles do not fit.
@@ -62,10 +59,6 @@ def build_actuators(settings: BodySettings, mesh: Mesh, payload_at: Place | None
         energies.append(build_muscles(settings.muscles, mesh))
     if settings.medium is not None:
         energies.append(Medium(**dict(settings.medium)))
-    if settings.payload_string is not None:
-        if payload_at is None:
-            raise InputError("payload_string is set, but data.payload_at is not: name the vertices that carry it.")
-        energies.append(Strings([vertices_at(mesh, payload_at)], **dict(settings.payload_string)))
     if settings.obstacles:
         energies.append(Contact(settings.obstacles, **dict(settings.contact)))
     if settings.self_contact is not None:

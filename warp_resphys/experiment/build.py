@@ -43,7 +43,6 @@ from ..settings.mesh import (
     FileMesh,
     HexahedralBox,
     MeshSettings,
-    Place,
     RodMesh,
     ShippedArm,
     SurfaceMesh,
@@ -177,12 +176,11 @@ def build_material(settings: MaterialSettings, key: str) -> Material | dict[str,
     return materials.get("", materials)
 
 
-def build_body(settings: BodySettings, payload_at: Place | None = None, mesh: Mesh | None = None) -> Body:
+def build_body(settings: BodySettings, mesh: Mesh | None = None) -> Body:
     """Builds the body of a configuration.
 
     Args:
         settings: mesh, masses, fixed vertices and actuators of the body.
-        payload_at: vertices that carry the payload of a string.
         mesh: mesh to use instead of the configured one.
 
     Raises:
@@ -190,20 +188,20 @@ def build_body(settings: BodySettings, payload_at: Place | None = None, mesh: Me
         MeshError: the mesh cannot be read or simulated, or has no vertex where the body is fixed.
     """
     if mesh is not None:
-        return _body(settings, payload_at, mesh)
+        return _body(settings, mesh)
     files = tuple(_file_of(mesh) for mesh in (settings.mesh, *(part.mesh for part in settings.parts.values())))
-    return _built_body(BodySettings.of(settings), payload_at, files)
+    return _built_body(BodySettings.of(settings), files)
 
 
 @lru_cache(maxsize=8)
-def _built_body(settings: BodySettings, payload_at: Place | None, files: tuple[str | None, ...]) -> Body:
+def _built_body(settings: BodySettings, files: tuple[str | None, ...]) -> Body:
     """Builds a body; ``files`` are the digests of the files of its meshes."""
-    return _body(settings, payload_at, whole_mesh(settings))
+    return _body(settings, whole_mesh(settings))
 
 
-def _body(settings: BodySettings, payload_at: Place | None, mesh: Mesh) -> Body:
+def _body(settings: BodySettings, mesh: Mesh) -> Body:
     mesh = _with_regions(mesh, settings)
-    energies = build_actuators(settings, mesh, payload_at)
+    energies = build_actuators(settings, mesh)
     fixed = () if settings.fixed is None else vertices_at(mesh, settings.fixed)
     glued = [_glue(mesh, settings, number) for number in range(len(settings.glued))]
     planes = _symmetry_planes(settings.symmetry)
@@ -341,11 +339,7 @@ def marker_view_of(
 
 
 def build_simulator(
-    settings: SimulatorSettings,
-    material: MaterialSettings,
-    body: Body | None = None,
-    payload_at: Place | None = None,
-    on_failure: str | None = None,
+    settings: SimulatorSettings, material: MaterialSettings, body: Body | None = None, on_failure: str | None = None
 ) -> Simulator:
     """Builds the simulator of a configuration.
 
@@ -353,7 +347,6 @@ def build_simulator(
         settings: settings of the simulator and its body.
         material: material of the body.
         body: body to use instead of the configured one.
-        payload_at: vertices that carry the payload of a string.
         on_failure: behaviour after a failed step, instead of the configured one.
 
     Raises:
@@ -361,7 +354,7 @@ def build_simulator(
     """
     solver = settings.solver if on_failure is None else settings.solver.changed(on_failure=on_failure)
     simulator = Simulator(
-        build_body(settings, payload_at) if body is None else body,
+        build_body(settings) if body is None else body,
         build_material(material, "simulation"),
         time_step=settings.time_step,
         gravity=settings.gravity,

@@ -48,7 +48,7 @@ def check_run(run: RunSettings) -> None:
     for network in (run.network, run.simfree.network):
         if network.core is not None:
             core_factory(network.core)
-    body = build_body(run, run.payload_at)
+    body = build_body(run)
     drive = drive_of(run, body)
     assert run.tip is not None
     vertices_at(body.mesh, run.tip)
@@ -80,7 +80,7 @@ def _check_target(run: RunSettings, body: Body, drive: Drive | None) -> None:
     for key, target in run.targets.items():
         build_material(target.material, f"{key}.material")
         with naming(f"{key}: "):
-            simulator = build_simulator(target_settings(run, target), target.material, payload_at=run.payload_at)
+            simulator = build_simulator(target_settings(run, target), target.material)
             played = drive_of(target, simulator.body)
         if run.recorded is not None:
             _check_drive(drive, played)

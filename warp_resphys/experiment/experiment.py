@@ -103,7 +103,7 @@ class Experiment:
     @cached_property
     def body(self) -> Body:
         """The simulated body."""
-        return build_body(self.settings, self.settings.payload_at)
+        return build_body(self.settings)
 
     @cached_property
     def _simulators(self) -> dict[str, Simulator]:
@@ -130,7 +130,7 @@ class Experiment:
         if kind == "published":
             published = settings.published
             assert published is not None
-            changes |= {"physics": published.physics, "integrator": published.integrator, "payload_string": None}
+            changes |= {"physics": published.physics, "integrator": published.integrator}
         elif kind in ("identified", LAW) and identified is not None and identified.integrator is not None:
             changes |= {"integrator": identified.integrator, "time_step": settings.time_step / identified.substeps}
         chosen = target_settings(settings, settings.target) if kind == "target" else SimulatorSettings.of(settings)

@@ -212,7 +212,7 @@ def make_setup(settings: StageSettings) -> Setup:
         upright, _ = Rotation.align_vectors(up[None], -gravity[None] / strength)
         rotation = Rotation.from_rotvec(turn * up) * upright
     translation = draw.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, 3)
-    body = build_body(target_settings(settings, laboratory), settings.payload_at)
+    body = build_body(target_settings(settings, laboratory))
     count, observed = len(binding.tracked), nominal_places(binding, body.mesh)
     nominal = np.array([*observed[:count], *binding.reference.values()], dtype=np.float64)
     places = nominal + laboratory.placement_noise * draw.standard_normal(nominal.shape)
@@ -227,7 +227,7 @@ def make_setup(settings: StageSettings) -> Setup:
 def laboratory_simulator(settings: StageSettings, gravity: FloatArray) -> Simulator:
     """Simulator that takes the place of the real body, for gravity in the frame of the body [m/s^2]."""
     simulated = target_settings(settings, settings.laboratory).model_copy(update={"gravity": tuple(gravity.tolist())})
-    return build_simulator(simulated, settings.laboratory.material, payload_at=settings.payload_at)
+    return build_simulator(simulated, settings.laboratory.material)
 
 
 def check_laboratory(run: RunSettings, trials: Sequence[Trial]) -> None:

@@ -181,7 +181,7 @@ class RunReader:
     @cached_property
     def body(self) -> Body:
         """The undeformed body."""
-        return build_body(self.run, self.run.payload_at)
+        return build_body(self.run)
 
     @cached_property
     def dataset(self) -> Trials:
@@ -223,7 +223,7 @@ class RunReader:
             identification=identification,
             actuator=read_actuator(self.folder) if run.with_actuator else {},
             **(self._stretches(metrics["law"]) if "law" in metrics else {}),
-            start=configured_parameters(build_simulator(run, run.simulation, payload_at=run.payload_at), sorted(names)),
+            start=configured_parameters(build_simulator(run, run.simulation), sorted(names)),
             truth={name: value for name, value in material.items() if name != "model"} | true_contact(run),
             true_material=material.get("model", "corotated"),
             training={model: epochs for model, epochs in histories.items() if epochs},

@@ -18,7 +18,6 @@ from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
 from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
 from ..dynamics.frames import BaseFrame, base_movement
 from ..dynamics.simulator import Simulator
-from ..energies.strings import PAYLOAD
 from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError, in_short
 from ..settings.learning import ActuationSettings, ReleaseSettings
@@ -294,7 +293,7 @@ class ObservedMotions(Brief):
             constant.append(replay.trials.times.new_tensor(self.trials.payload[rows])[:, None])
         filters = self.actuation.filter_time_constants
         acting = resting if replay.is_static else inputs
-        driven = {name: values for name, values in acting.actuation.items() if name != PAYLOAD.name}
+        driven = acting.actuation
         moving = self._base_movement(replay.trials.names, replay.simulator)
         if replay.is_static:
             constant += [values.repeat(1, 1 + len(filters)) for values in driven.values()]

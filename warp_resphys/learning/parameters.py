@@ -12,7 +12,6 @@ import torch
 
 from ..data.input_response import RESPONSES, SLOPES
 from ..dynamics.simulator import Simulator
-from ..energies.strings import PAYLOAD
 from ..energies.tendons import OFFSETS, Tendons
 from ..io.errors import InputError, naming
 from ..settings.learning import Bounds
@@ -21,7 +20,7 @@ MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
 T = TypeVar("T")
 _OWN: Final = "@"
-HUNG: Final = ("attached_mass", PAYLOAD.name)
+HUNG: Final = ("attached_mass",)
 _NOT_NEGATIVE: Final = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
 
 

@@ -13,12 +13,11 @@ from numpy.typing import ArrayLike
 from ..data.base_motion import LARGEST_STEP
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of, with_means
-from ..data.trials import payload_inputs
+from ..data.trials import PAYLOAD, payload_inputs
 from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.contact.contact_points import MOTION
-from ..energies.strings import PAYLOAD, Strings
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR, command_of
 from ..stepping.inputs import Inputs
@@ -69,7 +68,7 @@ def inputs_of(simulator: Simulator, description: Description) -> dict[str, Robot
     """Returns the inputs of a robot by name, except the external force."""
     inputs = {}
     for energy in [energy for energy in simulator.body.energies if isinstance(energy, Energy)]:
-        for quantity in [quantity for quantity in energy.inputs if quantity != PAYLOAD]:
+        for quantity in energy.inputs:
             low, high = description.seen.get(quantity.name, (None, None))
             inputs[quantity.name] = RobotInput(quantity.name, quantity.unit, energy.names, low, high, quantity)
     if description.payload_at is not None:
@@ -281,8 +280,6 @@ class Commands:
     def _hung(self, payload: torch.Tensor) -> dict[str, torch.Tensor]:
         """Inputs of the simulator for a payload (B, 1) [kg]."""
         mass = payload if self._mass_factor is None else payload * self._mass_factor[:, None]
-        if any(isinstance(energy, Strings) for energy in self._simulator.body.energies):
-            return {PAYLOAD.name: mass}
         return {"attached_mass": mass * self._payload_share}
 
     def _check_base(self, base: torch.Tensor) -> None:

@@ -100,7 +100,7 @@ class Description:
     def simulator(self, device: torch.device, on_failure: str) -> Simulator:
         """Builds the simulator."""
         settings = self.settings.model_copy(update={"device": str(device)})
-        body = build_body(settings, self.payload_at, self.mesh)
+        body = build_body(settings, self.mesh)
         return build_simulator(settings, self.material, body, on_failure=on_failure)
 
     def to(self, device: torch.device) -> "Description":

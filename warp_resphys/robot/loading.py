@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from ..data.input_response import response_of
 from ..data.rigid_bodies import as_markers
-from ..data.trials import STATIC
+from ..data.trials import PAYLOAD, STATIC
 from ..dynamics.trajectory import Motion
-from ..energies.strings import PAYLOAD
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
 from ..io.errors import DataFileError, InputError, listed

@@ -231,14 +231,6 @@ class MediumSettings(Settings):
     buoyancy: bool = setting(True, "whether the fluid carries the body")
 
 
-class StringSettings(Settings):
-    """A string on which payloads hang."""
-
-    length: Positive = setting(description="without a payload", unit="m")
-    compliance: NotNegative = setting(0.0, "elongation by force", "m/N")
-    toe: Positive = setting(1.0e-5, "elongation over which it becomes taut", "m")
-
-
 class SolverSettings(Settings):
     """Settings of the solver of a step, `dynamics.nonlinear_solver`."""
 
@@ -270,9 +262,6 @@ class BodySettings(Settings):
     tendons: TendonSettings | None = setting(None, "tendons that pull")
     muscles: MuscleSettings | None = setting(None, "contractile fibres")
     medium: MediumSettings | None = setting(None, "fluid around the body")
-    payload_string: StringSettings | None = setting(
-        None, "string on which payloads hang; null: they are attached to the body"
-    )
     obstacles: dict[str, ObstacleSettings] = setting({}, "rigid obstacles that the body touches, by name")
     contact: ContactSettings = setting(ContactSettings(), "contact with the obstacles")
     energies: OwnEnergies = setting(

@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from typing_extensions import override
 
+from ..data.trials import PAYLOAD
 from ..energies.contact.obstacle_contact import Contact
 from ..energies.contact.surface_contact import SurfaceContact
-from ..energies.strings import PAYLOAD
 from ..io.arrays import FloatArray
 from ..io.errors import ConvergenceError, InputError, listed
 from ..learning.parameters import check_names, identifiable_parameters

@@ -64,7 +64,7 @@ class Reader:
         assert isinstance(settings.data, ReadingSettings)
         self.data: ReadingSettings = settings.data
         self.settings, self.markers, self.trials = settings, settings.markers, trials
-        self.body = build_body(settings, settings.payload_at)
+        self.body = build_body(settings)
         self.drive = drive_of(settings, self.body)
         self.tracked = list(self.markers.observed)
         self._check_binding()

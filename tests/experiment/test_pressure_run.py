@@ -301,8 +301,7 @@ def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(fini
     with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
         stored = read_array(file, "sysid_spread")[0]
         corrected = [read_array(file, f"{model}_spread")[0] for model in ("actuator", "resphys")]
-    np.testing.assert_array_equal(*corrected)
-    assert np.abs(corrected[0] - stored).max() > 1e-3 * stored.max()  # about the motion with the actuator
+    np.testing.assert_array_equal(corrected, [stored, stored])  # of the simulator that they correct
     expected = 1e6 * points.var(0).mean(-1)
     assert stored.shape == expected.shape
     np.testing.assert_allclose(stored[-4:], expected[-4:], rtol=0.25)

@@ -104,7 +104,7 @@ def test_a_trial_is_predicted_without_itself():
 
 
 ROUNDING = 1e-9  # mm
-DRIVEN = trials(session=lambda name: name[0], pressure=np.ones((1, 3, 1)), payload=np.ones((1, 1)))
+DRIVEN = trials(session=lambda name: name[0], pressure=np.ones((1, 3, 1)), attached_mass=np.ones((1, 1)))
 
 
 def driven(frames=40):

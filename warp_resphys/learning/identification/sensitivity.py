@@ -24,6 +24,7 @@ from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, listed
 from ...io.parts import cut
 from ...io.progress import Progress
+from ...linalg.threads import in_threads, thread_count
 from ..metrics import mean_distance
 from ..observed_motions import ObservedMotions
 from ..parameters import HUNG, configured_parameters, parameters_of_parts, split_name, value_name
@@ -80,12 +81,19 @@ def sensitivities(
         moved = {name: 1.0 if word == "factor" else float(np.abs(inputs).max())} | moved
     moved |= identified.deviation
     moved = {name: _DIFFERENCE * size for name, size in moved.items()}
+
+    def differentiated(some: Sequence[str]) -> dict[str, Sensitivity]:
+        try:
+            return _of_batch(simulator, motions, some, identified, moved)
+        except ConvergenceError as error:
+            log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(some), error)
+            return {}
+
+    threads = thread_count() if simulator.rest_positions.device.type == "cpu" else 1
     with Progress("Differentiating the test trials", len(names), "trials") as progress, torch.no_grad():
         for _, some in (part for whole in motions.trials.batches(names) for part in cut(whole, batch)):
-            try:
-                found |= _of_batch(simulator, motions, some, identified, moved)
-            except ConvergenceError as error:
-                log.warning("evaluate: the posterior does not widen the intervals of %s: %s", listed(some), error)
+            for shared in in_threads(differentiated, [part for k in range(threads) if (part := some[k::threads])]):
+                found |= shared
             progress.advance(len(some))
     return found
 

@@ -118,7 +118,7 @@ def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[st
 
 
 def _robots_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """Sentences on the robots that need a corrected simulator, and on those for which the learned force helps."""
+    """Sentences on the robots that need a corrected simulator, and on those for which learning helps."""
     if not results:
         return "No run has succeeded."
     gains = {name: (row["beside"] and row["beside"]["gain"], row["gains"]["resphys"]) for name, row in results.items()}
@@ -129,8 +129,8 @@ def _robots_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
     few = [name for name, row in results.items() if len(row["tested"]) < LEAST_TRIALS]
     return (
         "By its 90 % interval over the held-out trials, a corrected simulator has less error than all other models "
-        f"(uncorrected, a network alone, without physics) on {words[0]} for which all of these were measured, and the "
-        f"learned force reduces the error of identification on {words[1]}."
+        f"(uncorrected, a network alone, without physics) on {words[0]} for which all of these were measured, and "
+        f"what is learned on top reduces the error of identification on {words[1]}."
     ) + (f" {in_a_row([*map(_title, few)])}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")
 
 

@@ -51,7 +51,7 @@ def _curves(data: RunReport, driven: Driven, canvas: Canvas) -> list[Drawn]:
         axes.plot(x[:_STEPS], x[:_STEPS], color=muted, linewidth=1.0, linestyle=(0, (1, 2)), label="as commanded")
         axes.plot(x[:_STEPS], y[:_STEPS], color=colour, linewidth=1.7, label="rising")
         axes.plot(x[_STEPS:], y[_STEPS:], color=colour, linewidth=1.7, linestyle=(0, (4, 1.5)), label="falling")
-        axes.set_title(part, loc="left", fontsize="medium")
+        axes.set_title(part.replace("_", " "), loc="left", fontsize="medium")
     for axes in grid.flat[len(parts) :]:
         axes.set_axis_off()
     for axes in grid[-1]:

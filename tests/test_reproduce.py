@@ -83,7 +83,7 @@ def test_gains_and_the_best_models_are_those_of_the_trials():
     kept = json.loads((DOCS / "robots.json").read_text())
     kept["sopra"]["gains"]["resphys"]["lower"] = -0.1
     page = reproduce.robots_page(kept, {"tentacle": "data.steps is -1"}, DOCS / "robots")
-    assert f"reduces the error of identification on 0 of {len(kept)} robots." in page
+    assert f"reduces the error of identification on 1 of {len(kept)} robots (Real SoPrA)." in page
     assert "| 48 % (\N{MINUS SIGN}10 to 50) |" in page
     assert "| Tentacle (failed since 2026-11-27) |" in page
     assert "- Tentacle failed: data.steps is -1" in page

@@ -435,7 +435,7 @@ class TestProcess:
 
 
 def test_warnings_that_differ_in_numbers_alone_are_shown_once():
-    told = ("24 % more of 'pull_1'", "25.5 % more of 'pull_1'", "25.5 % more of 'pull_2'")
+    messages = ("24 % more of 'pull_1'", "25.5 % more of 'pull_1'", "25.5 % more of 'pull_2'")
     with _one_sentence_each():
-        shown = [warnings.formatwarning(text, ResphysWarning, "", 0) for text in told]
+        shown = [warnings.formatwarning(text, ResphysWarning, "", 0) for text in messages]
     assert shown == ["warning: 24 % more of 'pull_1'\n", "", "warning: 25.5 % more of 'pull_2'\n"]

@@ -41,7 +41,7 @@ class Memory:
     name: str
     unit: str
     shape: tuple[int, ...]  # without the batch axis
-    per: str  # meaning of the first axis, such as ``string``
+    per: str  # meaning of the first axis, such as ``tendon``
 
     def check(self, values: Any, batch: int, like: torch.Tensor) -> None:
         """Raises InputError for a wrong shape, dtype or device, or values that are not finite."""

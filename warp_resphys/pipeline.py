@@ -194,6 +194,8 @@ class _SplitStages:
     def learning(self) -> None:
         """Adds the reconstruction of residual forces, and the training of the networks."""
         run, split = self.run, self.split
+        if run.reconstruction is None:
+            return
         # For the published comparison, where all vertices are observed, test trials are reconstructed, too.
         compared = split.test if run.markers is None and run.law is None else ()
         reconstructed = split.train + split.validation + compared
@@ -217,16 +219,17 @@ class _SplitStages:
         """Adds the roll-outs of all models on the test trials, their times, and the error of the mesh."""
         run, split, groups = self.run, self.split, test_groups(self.run, self.split)
         calibration = (split.validation or split.train) if run.markers is not None and folds_of(run) is None else ()
-        learned = [stage.name for stage in self.stages if stage.name.startswith("train_")]
+        made = [stage.name for stage in self.stages if stage.name.startswith(("train_", "reconstruct_resphys"))]
         self.add(
             *("evaluate", evaluate, (files.ROLLOUTS, files.ERRORS)),
-            (*NETWORKS, "published", "correct_uncorrected", "data.horizons"),
-            (*learned, "reconstruct_resphys"),
+            (*NETWORKS, "reconstruction", "published", "correct_uncorrected", "data.horizons"),
+            made,
             groups=groups,
             calibration=calibration,
         )
         if run.timing:
-            self.add("time", time_models, (files.TIMES,), (*NETWORKS, "target"), learned, groups=groups)
+            keys = (*NETWORKS, "reconstruction", "target")
+            self.add("time", time_models, (files.TIMES,), keys, made, groups=groups)
         played = run.laboratory if run.is_laboratory else None
         same = played is not None and (played.mesh, played.parts) == (run.mesh, run.parts)
         if run.mesh_check is not None and not same:

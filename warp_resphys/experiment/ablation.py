@@ -65,6 +65,7 @@ def check_ablation(run: RunSettings, simulator: Simulator) -> None:
         InputError: it has fewer, or a method that does not fit.
     """
     assert run.ablation is not None
+    assert run.reconstruction is not None
     most, surface = max(run.ablation.counts), len(surface_vertices(simulator.body.mesh))
     if most > surface:
         raise InputError(

@@ -123,7 +123,8 @@ def _check_learning(run: RunSettings, simulator: Simulator, trials: Sequence[Tri
         with naming(f"shapes.{name}: "):
             check_shape(shape)
     marker = MarkerMap.at_vertices(torch.zeros(1, 1, dtype=torch.int64))
-    make_reconstructor(simulator, run.reconstruction, WHOLE_STATE if run.markers is None else marker)
+    if run.reconstruction is not None:
+        make_reconstructor(simulator, run.reconstruction, WHOLE_STATE if run.markers is None else marker)
     if run.identify is not None:
         with naming("identify."):
             _check_identification(run, run.identify, simulator, {trial.name: trial.session for trial in trials})

@@ -74,7 +74,8 @@ def read_actuator(folder: Path) -> dict[str, InputNetwork]:
 def training_files(folder: Path, run: RunSettings) -> dict[str, Path]:
     """Files with the epochs of what a run learned and the weights that were kept, by model; some may be missing."""
     files = {ACTUATOR: folder / ACTUATOR_FILE} if run.with_actuator else {}
-    return {**files, **{model: folder / training_file(model) for model in LEARNED}}
+    forces = () if run.reconstruction is None else LEARNED
+    return {**files, **{model: folder / training_file(model) for model in forces}}
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,8 @@ class Experiment:
     @property
     def models(self) -> list[str]:
         """Names of the models that are compared; law and actuator are among them if they help on held-out trials."""
-        settings, found = self.settings, (self.has_law, self.has_actuator)
+        settings = self.settings
+        found = self.has_law, self.has_actuator, settings.reconstruction is not None
         return models_of(settings.published, settings.identify, settings.correct_uncorrected, *found)
 
     @property
@@ -231,7 +233,7 @@ class Experiment:
         Raises:
             DataFileError: the file is missing or damaged.
         """
-        if model not in LEARNED:
+        if model not in LEARNED or self.settings.reconstruction is None:
             return None
         learned = Learned.read(self.folder / weights_file(model), network_of(model), self.like.device)
         refused = learned.test is not None and not learned.test["used"] and not learned.replaces_simulator

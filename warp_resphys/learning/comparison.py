@@ -1,7 +1,7 @@
 """Several models on the same tested trials: roll-outs, errors, prediction intervals, and what explains errors."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -123,6 +123,12 @@ class Comparison:
         one, two = self.models[model], self.models[other]
         return one.simulator is two.simulator and one.identified.parameters == two.identified.parameters
 
+    def _same_motions(self, model: str, other: str) -> bool:
+        """Whether two models have the same simulator, and neither a network nor another actuator."""
+        one, two = self.models[model], self.models[other]
+        networks, actuators = (one.learned, two.learned), (one.identified.actuator, two.identified.actuator)
+        return self._same_simulator(model, other) and networks == (None, None) and actuators[0] == actuators[1]
+
     def _calibrating(self, model: str) -> list[str]:
         """Names of the trials of the calibration, and of the largest training trial if the model grows by it."""
         return [*dict.fromkeys([*self.calibration, *(self._largest[:1] if model in self._growing else ())])]
@@ -157,17 +163,29 @@ class Comparison:
 
     @cached_property
     def _rolled_out(self) -> tuple[dict[str, list[TrialPart]], dict[str, list[TrialPart]]]:
-        """Parts of the tested trials, and of those of the calibration, by model, after they were rolled out."""
+        """Parts of the tested trials, and of those of the calibration, by model, after they were rolled out.
 
-        def cut(model: str, names: Sequence[str], label: str) -> list[TrialPart]:
-            used = self.models[model]
-            made = used.simulator, self.motions, names, used.learned, used.identified
-            return rollout_parts(*made, self.parts.batch, self.filmed, f"{label}{model}")
+        A model of which nothing that was learned is used has the parts of the one below it.
+        """
+        new = list[TrialPart]()
 
-        tested = {model: cut(model, self.names, "") for model in self.models}
+        def cut(models: Sequence[str], names: Callable[[str], Sequence[str]], label: str) -> dict[str, list[TrialPart]]:
+            parts = dict[str, list[TrialPart]]()
+            for model in models:
+                used = self.models[model]
+                made = used.simulator, self.motions, names(model), used.learned, used.identified
+                same = next((other for other in parts if self._same_motions(other, model)), None)
+                if same is None:
+                    parts[model] = rollout_parts(*made, self.parts.batch, self.filmed, f"{label}{model}")
+                    new.extend(parts[model])
+                else:
+                    parts[model] = parts[same]
+            return parts
+
+        tested = cut([*self.models], lambda _: self.names, "")
         with_intervals = [name for name, model in self.models.items() if model.has_intervals]
-        calibrating = {name: cut(name, self._calibrating(name), "calibration_") for name in with_intervals}
-        self.parts.run([*chain(*tested.values(), *calibrating.values())])
+        calibrating = cut(with_intervals, self._calibrating, "calibration_")
+        self.parts.run(new)
         return tested, calibrating
 
     def _in_order(self, model: str, name: str) -> Any:

@@ -80,6 +80,7 @@ def write_ablation_report(
         )
     medians = "; ".join(f"{row.markers}: {number_text(row.median_mm)} mm" for row in rows)
     alt = f"Box plot of the mean vertex error by number of markers, on a logarithmic axis. Medians: {medians}."
+    assert settings.reconstruction is not None
     how = _how_reconstructed(settings.reconstruction.regularisation)
 
     def sections(canvas: Canvas) -> Iterator[Part]:

@@ -89,7 +89,9 @@ class RunKeys(SimulatorSettings):
     shapes: dict[str, ShapeSettings] = setting(
         {}, "other bodies by name, on which the identified material is tested, where the real body is simulated"
     )
-    reconstruction: ReconstructionSettings = ReconstructionSettings()
+    reconstruction: ReconstructionSettings | None = setting(
+        ReconstructionSettings(), "forces that explain the trials; null: neither a force nor SimFree is learned"
+    )
     network: NetworkSettings = NetworkSettings()
     trainer: TrainerSettings = TrainerSettings()
     simfree: BaselineSettings = BaselineSettings()
@@ -209,7 +211,8 @@ class RunKeys(SimulatorSettings):
     @property
     def models(self) -> list[str]:
         """Names of the models that the run compares."""
-        return models_of(self.published, self.identify, self.correct_uncorrected, self.with_law, self.with_actuator)
+        learned = self.with_law, self.with_actuator, self.reconstruction is not None
+        return models_of(self.published, self.identify, self.correct_uncorrected, *learned)
 
     def training_of(self, model: str) -> TrainingSettings:
         """Settings of the training of a model; ``simfree`` has its own, and is trained on steps.
@@ -248,6 +251,7 @@ def models_of(
     correct_uncorrected: bool,
     law: bool = False,
     actuator: bool = False,
+    forces: bool = True,
 ) -> list[str]:
     """Returns the names of the models that an experiment compares.
 
@@ -257,6 +261,7 @@ def models_of(
         correct_uncorrected: whether a force is learned for the uncorrected simulator as well.
         law: whether the law of the material is identified.
         actuator: whether changes of the inputs are learned.
+        forces: whether forces are reconstructed, from which networks learn.
     """
     absent = {
         "published": published is None,
@@ -264,6 +269,7 @@ def models_of(
         "sysid_elastic": identified is None or not identified.elastic,
         "law": not law,
         "actuator": not actuator,
-        "resphys_uncorrected": identified is None or not correct_uncorrected,
+        "simfree": not forces,
+        "resphys_uncorrected": identified is None or not correct_uncorrected or not forces,
     }
     return [model for model in get_args(Model) if not absent.get(model)]

@@ -15,7 +15,14 @@ from ..io.settings import Many, Settings, setting
 from .body import SimulatorSettings, TargetSettings
 from .control import ControlSettings, FigureSettings
 from .data_kinds import ReadingSettings
-from .learning import AblationSettings, ActuatorSettings, IdentifySettings, LawSettings, TrainingSettings
+from .learning import (
+    AblationSettings,
+    ActuatorSettings,
+    IdentifySettings,
+    LawSettings,
+    ReconstructionSettings,
+    TrainingSettings,
+)
 from .mesh import Place
 from .observed import BindingSettings
 from .performed import Split, Trial
@@ -79,6 +86,7 @@ class StageSettings(RunSettings):
         identify: IdentifySettings
         law: LawSettings
         actuator: ActuatorSettings
+        reconstruction: ReconstructionSettings
         control: ControlSettings
         ablation: AblationSettings
         mesh_check: float

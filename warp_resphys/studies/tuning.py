@@ -112,7 +112,8 @@ def _checked(run: RunSettings, search: Tune) -> tuple[dict[str, Any], TrainingSe
     Raises:
         InputError: a value of the wrong kind or out of range.
     """
-    learned = [] if run.ablation is not None else [model for model in run.models if model in LEARNED]
+    trains = run.ablation is None and run.reconstruction is not None
+    learned = [model for model in run.models if model in LEARNED] if trains else []
     if search.model not in learned:
         raise InputError(f"tune.model is {search.model!r}: the experiment {run.name} trains {listed(learned)}.")
     if folds_of(run) is not None:

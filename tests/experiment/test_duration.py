@@ -7,6 +7,7 @@ import pytest
 from support.configured import settings
 from warp_resphys import Simulator
 from warp_resphys.experiment import duration
+from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.duration import announcement, work_of
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.splits import split_of
@@ -53,6 +54,26 @@ def test_the_work_is_trials_by_steps_by_epochs(data):
     twice = works_of(data, "simfree.trainer.epochs=80", "simfree.trainer.batch_size=1")
     assert twice["train_simfree"][2] == pytest.approx(2.0 * 30 * 1e-3 * 80 / 2.0)
     assert works_of(data, "simfree.trainer.epochs=80")["train_simfree"][2] == pytest.approx(2.0 * batches)
+
+
+def test_derivatives_of_each_part_count(monkeypatch, tmp_path):
+    """Of three tendons, where trials are differentiated: in the identification, and for intervals."""
+    monkeypatch.setattr(duration, "steps_of", lambda experiment, model, names, longest=None: float(len(names)))
+    monkeypatch.setattr(
+        Experiment, "simulator", lambda self, kind: build_simulator(self.settings, self.material_of(kind))
+    )
+    factor, works = "+identify.parameters.tendon_tension_factor={lower: 0.5, upper: 2.0", dict[str, list[float]]()
+    for more in ((), (f"{factor}}}",), (f"{factor}, per: part}}",)):
+        run = settings("experiment=tendon_rod", *more)
+        split = split_of(run)
+        for stage in learning_stages(run, split, ".", ""):
+            if stage.name in ("identify", "evaluate"):
+                amount, *_ = work_of(stage.name, Experiment(stage.settings, tmp_path, "count"))
+                works.setdefault(stage.name, []).append(amount)
+    for without, one, three in works.values():
+        assert one > without
+        assert three - without == pytest.approx(3.0 * (one - without))
+    assert works["evaluate"][1] - works["evaluate"][0] == pytest.approx(0.2 * len(split.validation + split.test))
 
 
 def test_a_sentence_says_how_long_and_what_helps(data, monkeypatch):

@@ -5,6 +5,7 @@ The report has tests of its own.
 
 import contextlib
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.error_tables import ComparedModels
 from warp_resphys.learning.residuals import fitting
 from warp_resphys.learning.residuals.correction import force_frames
+from warp_resphys.report.verdict import results_table
 from warp_resphys.settings.stage_keys import StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED, "actuator={epochs: 1, gate: false, centres: 10, filters: [0.05]}")
@@ -78,6 +80,23 @@ def test_every_stage_leaves_its_files_and_the_errors_are_those_of_the_roll_outs(
     assert (checked["trials"], checked["model"]) == (["t003"], "sysid")
     assert checked["cells"][0] < checked["cells"][1]
     assert checked["moved_mm"] > abs(np.subtract(*checked["errors_mm"]))
+
+
+def test_without_reconstruction_the_actuator_is_all_that_is_learned(finished, tmp_path):
+    """Also where networks of an earlier run lie in the folder."""
+    shutil.copytree(finished, tmp_path / "run")
+    place_segment(tmp_path)
+    with without_reports(), contextlib.chdir(tmp_path):
+        finish(*COMMAND, "data.input_scales=[1.5]", "reconstruction=none")
+    results, before = (read_json(folder / "metrics.json") for folder in (tmp_path / "run", finished))
+    assert before["errors_mm"].keys() - results["errors_mm"].keys() == {"simfree"}
+    assert results["errors_mm"]["resphys"] == results["errors_mm"]["actuator"] == before["errors_mm"]["actuator"]
+    assert results["networks"].keys() == {"actuator"}
+    assert "reconstruction" not in results
+    assert warp_resphys.load(tmp_path / "run").description.learned is None
+    path = f"hydra.searchpath=[file://{tmp_path / 'configs'}]"
+    heads = [row.head for row in results_table(results, settings(path, *COMMAND, "reconstruction=none")).rows]
+    assert [head for head in heads if head.startswith("+")] == ["+ identified parameters (SysID)", "+ learned actuator"]
 
 
 def test_recordings_are_seen_by_cameras_and_registered_back(finished):

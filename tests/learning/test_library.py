@@ -16,7 +16,9 @@ from warp_resphys.io.fan_out import Workers
 from warp_resphys.io.parts import Parts
 from warp_resphys.learning import comparison
 from warp_resphys.learning.comparison import Comparison, Model
+from warp_resphys.learning.evaluation import rollout_parts
 from warp_resphys.learning.identification.misfit import Misfit
+from warp_resphys.learning.identification.search import Identification
 from warp_resphys.learning.observed_motions import Identified
 from warp_resphys.learning.placement import Accuracy
 from warp_resphys.learning.residuals.fitting import Fitting, fit_force
@@ -263,6 +265,20 @@ def test_models_of_one_simulator_have_the_derivatives_of_their_parameters(robot)
     calibrated = Comparison(models, motions, names[:1], {"1": names[1:]}, names[:1])
     assert [*calibrated.errors()["per_marker"]["close"]] == ["a", "b", "c"]
     assert calibrated.errors()["intervals"]["models"].keys() == {"rest", *models}
+
+
+def test_a_model_of_which_nothing_learned_is_used_has_the_motions_of_the_one_below(robot, monkeypatch):
+    simulator, motions = beam(180e3), let_go(robot, 0.04, 0.12, markers=MARKERS)
+    names, found = motions.trials.names, {"sysid": 190e3, "soft": 120e3, "resphys": 190e3}
+    models = {name: Model(simulator, Identification({"youngs_modulus": value})) for name, value in found.items()}
+    rolled = list[str]()
+    monkeypatch.setattr(comparison, "rollout_parts", lambda *a: rolled.append(a[-1]) or rollout_parts(*a))
+    errors = Comparison(models, motions, names[:1], {"1": names[1:]}, names[:1]).errors()["errors_mm"]
+    assert rolled == ["sysid", "soft", "calibration_sysid", "calibration_soft"]
+    assert errors["resphys"] == errors["sysid"] != errors["soft"]
+    acting = replace(found := models["sysid"].identified, actuator={"tendon_tension": object()})
+    compared = Comparison({"a": Model(simulator, found), "b": Model(simulator, acting)}, motions, names, {"1": names})
+    assert not compared._same_motions("a", "b")
 
 
 def test_intervals_grow_for_simulators_identified_without_the_largest_trial(robot, monkeypatch):

@@ -7,7 +7,7 @@ control have no estimate.
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -19,8 +19,10 @@ from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
 from ..learning.evaluation import FOLDS
+from ..learning.parameters import by_part
 from ..learning.residuals.reconstruction import make_reconstructor
 from ..report.wording import duration_text
+from ..settings.learning import Bounds
 from ..settings.stage_keys import StageSettings
 from .experiment import MODELS, SIMFREE, Experiment
 from .mesh_check import CHECKED_SECONDS
@@ -100,7 +102,10 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
         return replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
     if stage == "evaluate":
         tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
-        return sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE), 0.0, 0.0
+        rolled = sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE)
+        if settings.identify is None or not settings.calibration:  # else motions are differentiated, for intervals
+            return rolled, 0.0, 0.0
+        return rolled + _differentiated(experiment, settings.identify.parameters, "sysid", tested), 0.0, 0.0
     if stage == "mesh_check":
         return (1.0 + settings.mesh_check**3) * CHECKED_SECONDS / settings.time_step, 0.0, 0.0
     if stage == "time":  # three rows, one trial at a time, which takes twice as long
@@ -110,9 +115,21 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
         names = train if wanted.trials is None else tuple(evenly(train, wanted.trials))
         evaluations = wanted.starts * min(wanted.max_evaluations, 3.0 + wanted.max_evaluations / 3.0)
         searches = {"sysid": wanted.parameters, "sysid_elastic": wanted.elastic or {}}
-        each = {model: evaluations * (1.0 + _VARIED * len(ranges)) for model, ranges in searches.items() if ranges}
-        return sum(number * steps_of(experiment, m, names, wanted.seconds) for m, number in each.items()), 0.0, 0.0
+        each = [
+            _differentiated(experiment, ranges, model, names, wanted.seconds)
+            for model, ranges in searches.items()
+            if ranges
+        ]
+        return evaluations * sum(each), 0.0, 0.0
     return None
+
+
+def _differentiated(
+    experiment: Experiment, ranges: Mapping[str, Bounds], model: str, names: Sequence[str], longest: float | None = None
+) -> float:
+    """Returns the number of steps that take as long as trials with their derivatives by all parameters."""
+    parameters = len(by_part(experiment.simulator("simulation"), ranges, ranges))
+    return (1.0 + _VARIED * parameters) * steps_of(experiment, model, names, longest)
 
 
 def steps_of(experiment: Experiment, model: str, names: Sequence[str], longest: float | None = None) -> float:

@@ -96,10 +96,10 @@ def _sections(schema: Schema, node: Schema, path: str, default: str, shown: dict
 
 
 def _omitted(node: Schema) -> str:
-    """Says that a group is null by default, and what null means."""
-    if node.get("default", {}) is not None:
-        return ""
+    """Says that a group is null by default, or may be, and what null means."""
     meaning = str(node.get("description", "")).partition("null: ")[2]
+    if node.get("default", {}) is not None:
+        return f"`null`: {meaning}. " if meaning and "default" in node else ""
     return f"Default `null`{f': {meaning}' if meaning else ''}. "
 
 

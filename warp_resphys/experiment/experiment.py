@@ -198,9 +198,13 @@ class Experiment:
     @property
     def models(self) -> list[str]:
         """Names of the models that are compared; law and actuator are among them if they help on held-out trials."""
-        settings = self.settings
-        found = self.has_law, self.has_actuator, settings.reconstruction is not None
+        settings, found = self.settings, (self.has_law, self.has_actuator, self.has_forces)
         return models_of(settings.published, settings.identify, settings.correct_uncorrected, *found)
+
+    @property
+    def has_forces(self) -> bool:
+        """Whether forces are reconstructed and learned, as in all runs of versions without the choice."""
+        return getattr(self.settings, "reconstruction", True) is not None
 
     @property
     def has_law(self) -> bool:
@@ -233,7 +237,7 @@ class Experiment:
         Raises:
             DataFileError: the file is missing or damaged.
         """
-        if model not in LEARNED or self.settings.reconstruction is None:
+        if model not in LEARNED or not self.has_forces:
             return None
         learned = Learned.read(self.folder / weights_file(model), network_of(model), self.like.device)
         refused = learned.test is not None and not learned.test["used"] and not learned.replaces_simulator

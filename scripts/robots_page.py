@@ -78,7 +78,8 @@ def _robots_table(results: Mapping[str, Mapping[str, Any]], failed: Mapping[str,
         "Mean distance of the markers on data that neither training nor identification used [mm], ± the standard "
         "deviation over trials. Without physics: the best of a body at rest, interpolation and regression "
         "between the training trials, and a linear model. Less error: the share of the uncorrected error that SysID "
-        "removes, and of SysID's error that ResPhys removes, with its 90 % interval over the trials (paired bootstrap) "
+        "removes, and of SysID's error that ResPhys removes, which is the simulator with all that is learned and used, "
+        "its actuators or a force, with its 90 % interval over the trials (paired bootstrap) "
         f"if there are {LEAST_TRIALS} or more. Coverage: the share of the "
         "measured coordinates within the 90 % prediction intervals of ResPhys, and their mean half-width. Time: the "
         "sum over all stages and folds, including those that ran in parallel, on a machine with other load."
@@ -129,7 +130,7 @@ def _robots_verdict(results: Mapping[str, Mapping[str, Any]]) -> str:
     few = [name for name, row in results.items() if len(row["tested"]) < LEAST_TRIALS]
     return (
         "By its 90 % interval over the held-out trials, a corrected simulator has less error than all other models "
-        f"(uncorrected, a network alone, without physics) on {words[0]} for which all of these were measured, and "
+        f"(uncorrected, without physics and, where it was trained, a network alone) on {words[0]}, and "
         f"what is learned on top reduces the error of identification on {words[1]}."
     ) + (f" {in_a_row([*map(_title, few)])}: fewer than {LEAST_TRIALS} trials, so no interval." if few else "")
 

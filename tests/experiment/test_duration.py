@@ -1,13 +1,14 @@
 """The announced duration of a run: counts of steps, and the sentence."""
 
 import logging
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from support.configured import settings
 from warp_resphys import Simulator
 from warp_resphys.experiment import duration
-from warp_resphys.experiment.build import build_simulator
 from warp_resphys.experiment.duration import announcement, work_of
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.splits import split_of
@@ -59,9 +60,7 @@ def test_the_work_is_trials_by_steps_by_epochs(data):
 def test_derivatives_of_each_part_count(monkeypatch, tmp_path):
     """Of three tendons, where trials are differentiated: in the identification, and for intervals."""
     monkeypatch.setattr(duration, "steps_of", lambda experiment, model, names, longest=None: float(len(names)))
-    monkeypatch.setattr(
-        Experiment, "simulator", lambda self, kind: build_simulator(self.settings, self.material_of(kind))
-    )
+    monkeypatch.setattr(Experiment, "trials", SimpleNamespace(inputs={"tendon_tension": np.zeros((1, 2, 3))}))
     factor, works = "+identify.parameters.tendon_tension_factor={lower: 0.5, upper: 2.0", dict[str, list[float]]()
     for more in ((), (f"{factor}}}",), (f"{factor}, per: part}}",)):
         run = settings("experiment=tendon_rod", *more)

@@ -181,6 +181,14 @@ def test_a_network_or_trainer_on_the_command_line_is_taken_whole(group, option):
     assert getattr(run, other) == getattr(settings("experiment=beam_synthetic"), other)
 
 
+@pytest.mark.parametrize("experiment", ["beam_oscillation", "tendon_rod", "finger", "sopra"])
+def test_an_experiment_with_its_own_reconstruction_may_do_without(experiment):
+    assert settings(f"experiment={experiment}").reconstruction is not None
+    run = settings(f"experiment={experiment}", "reconstruction=none")
+    assert run.reconstruction is None
+    assert {"simfree", "resphys_uncorrected"}.isdisjoint(run.models)
+
+
 def test_a_material_may_leave_out_its_model_and_its_parameters_and_is_believed_or_not():
     config = composed()
     for material in ({}, {"youngs_modulus": 2e5}, {"model": "stable_neo_hookean", "density": 1000.0}):

@@ -200,6 +200,7 @@ CASES = {
     ("experiment=marker_ablation", "mesh.divisions=[4,2,2]", "ablation.counts=[1,4]"): [
         ("ablation.counts", "ablation.counts=[1,43]"),
         ("data.weights_g.observed", "data.weights_g.observed=[50,70]"),
+        ("reconstruction is none, but ablation reconstructs", "reconstruction=none"),
     ],
     ("experiment=tiny", TRACKED): [
         ("chambers.count", "chambers.count=3"),

@@ -276,6 +276,11 @@ def test_a_model_of_which_nothing_learned_is_used_has_the_motions_of_the_one_bel
     errors = Comparison(models, motions, names[:1], {"1": names[1:]}, names[:1]).errors()["errors_mm"]
     assert rolled == ["sysid", "soft", "calibration_sysid", "calibration_soft"]
     assert errors["resphys"] == errors["sysid"] != errors["soft"]
+    seen_first = {
+        "a": models["soft"],
+        "b": Model(simulator, replace(models["soft"].identified, of_trials={"x@a": 1.0})),
+    }
+    assert not Comparison(seen_first, motions, names, {"1": names})._same_motions("a", "b")
     acting = replace(found := models["sysid"].identified, actuator={"tendon_tension": object()})
     compared = Comparison({"a": Model(simulator, found), "b": Model(simulator, acting)}, motions, names, {"1": names})
     assert not compared._same_motions("a", "b")

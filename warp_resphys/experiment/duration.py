@@ -19,7 +19,6 @@ from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
 from ..learning.evaluation import FOLDS
-from ..learning.parameters import by_part
 from ..learning.residuals.reconstruction import make_reconstructor
 from ..report.wording import duration_text
 from ..settings.learning import Bounds
@@ -103,9 +102,10 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage == "evaluate":
         tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
         rolled = sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE)
-        if settings.identify is None or not settings.calibration:  # else motions are differentiated, for intervals
+        if settings.identify is None or settings.markers is None:
             return rolled, 0.0, 0.0
-        return rolled + _differentiated(experiment, settings.identify.parameters, "sysid", tested), 0.0, 0.0
+        counted = [*settings.groups["1"], *settings.calibration]  # differentiated, for intervals and free fits
+        return rolled + _differentiated(experiment, settings.identify.parameters, "sysid", counted), 0.0, 0.0
     if stage == "mesh_check":
         return (1.0 + settings.mesh_check**3) * CHECKED_SECONDS / settings.time_step, 0.0, 0.0
     if stage == "time":  # three rows, one trial at a time, which takes twice as long
@@ -128,7 +128,8 @@ def _differentiated(
     experiment: Experiment, ranges: Mapping[str, Bounds], model: str, names: Sequence[str], longest: float | None = None
 ) -> float:
     """Returns the number of steps that take as long as trials with their derivatives by all parameters."""
-    parameters = len(by_part(experiment.simulator("simulation"), ranges, ranges))
+    parts = max((inputs.shape[-1] for inputs in experiment.trials.inputs.values()), default=1)
+    parameters = sum(parts if limits.by_part else 1 for limits in ranges.values())
     return (1.0 + _VARIED * parameters) * steps_of(experiment, model, names, longest)
 
 

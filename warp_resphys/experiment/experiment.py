@@ -203,8 +203,8 @@ class Experiment:
 
     @property
     def has_forces(self) -> bool:
-        """Whether forces are reconstructed and learned, as in all runs of versions without the choice."""
-        return getattr(self.settings, "reconstruction", True) is not None
+        """Whether forces are reconstructed and learned."""
+        return self.settings.reconstruction is not None
 
     @property
     def has_law(self) -> bool:

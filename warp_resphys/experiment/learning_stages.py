@@ -208,7 +208,8 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     """Writes rollouts.h5, the observed points of every model's roll-outs of the test trials, and errors.json."""
     settings: StageSettings = context.settings
     experiment, parts = Experiment(settings, context.run_dir, "count"), Parts.of(context, workers, settings.batch)
-    found = experiment.reconstructed("resphys") if experiment.trials.bound is None and not settings.with_law else None
+    with_points = experiment.has_forces and experiment.trials.bound is None and not settings.with_law
+    found = experiment.reconstructed("resphys") if with_points else None
     compared = Comparison(
         {name: experiment.model(name) for name in experiment.models},
         experiment.motions,

@@ -124,7 +124,9 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
     law: LawContent | None = None if run.law is None else read_if_there(folder / LAW_FILE) or None
     if law is not None:
         metrics["law"] = {**law, "against": "sysid" if "sysid" in identified else "simulation"}
-    if run.reconstruction is not None and (reconstruction := read_if_there(folder / RECONSTRUCTION)):
+    if run.reconstruction is None:
+        metrics["without_forces"] = True
+    elif reconstruction := read_if_there(folder / RECONSTRUCTION):
         metrics["reconstruction"] = reconstruction
     if run.control is not None and (control := read_if_there(folder / CONTROL)):
         metrics["control"] = control

@@ -124,10 +124,11 @@ class Comparison:
         return one.simulator is two.simulator and one.identified.parameters == two.identified.parameters
 
     def _same_motions(self, model: str, other: str) -> bool:
-        """Whether two models have the same simulator, and neither a network nor another actuator."""
+        """Whether two models have the same simulator with all that was identified, and no network."""
         one, two = self.models[model], self.models[other]
-        networks, actuators = (one.learned, two.learned), (one.identified.actuator, two.identified.actuator)
-        return self._same_simulator(model, other) and networks == (None, None) and actuators[0] == actuators[1]
+        known = [(m.identified.of_trials, m.identified.placement, m.identified.actuator) for m in (one, two)]
+        networks = one.learned, two.learned
+        return networks == (None, None) and self._same_simulator(model, other) and known[0] == known[1]
 
     def _calibrating(self, model: str) -> list[str]:
         """Names of the trials of the calibration, and of the largest training trial if the model grows by it."""
@@ -165,7 +166,7 @@ class Comparison:
     def _rolled_out(self) -> tuple[dict[str, list[TrialPart]], dict[str, list[TrialPart]]]:
         """Parts of the tested trials, and of those of the calibration, by model, after they were rolled out.
 
-        A model of which nothing that was learned is used has the parts of the one below it.
+        Models with equal motions, as where nothing that was learned is used, have the same parts.
         """
         new = list[TrialPart]()
 
@@ -174,7 +175,8 @@ class Comparison:
             for model in models:
                 used = self.models[model]
                 made = used.simulator, self.motions, names(model), used.learned, used.identified
-                same = next((other for other in parts if self._same_motions(other, model)), None)
+                alike = (o for o in parts if self._same_motions(o, model) and [*names(o)] == [*names(model)])
+                same = next(alike, None)
                 if same is None:
                     parts[model] = rollout_parts(*made, self.parts.batch, self.filmed, f"{label}{model}")
                     new.extend(parts[model])

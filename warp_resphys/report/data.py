@@ -105,6 +105,7 @@ class Metrics(ErrorTables, Usage, total=False):
     """Content of metrics.json, of a split or of all folds."""
 
     networks: dict[str, KeptWeights]  # by model
+    without_forces: bool  # whether no force is learned, as no forces are reconstructed
     parameters: dict[str, Mapping[str, float]]  # identified values, by model
     first_guesses: dict[str, Mapping[str, float]]
     law: UsedLaw
@@ -313,7 +314,8 @@ def unused(metrics: Metrics) -> dict[str, str]:
         for model, kept in fold.get("networks", {}).items():
             if (test := kept.get("test")) is not None:
                 tests.setdefault(model, []).append(test)
-    return {
+    idle = {"resphys": "no force is learned"} if any(fold.get("without_forces") for fold in folds_in(metrics)) else {}
+    return idle | {
         model: text_of(found[0]) if len(found) == 1 else f"it is clearly closer in none of the {len(found)} folds"
         for model, found in tests.items()
         if not any(test["used"] for test in found)

@@ -104,7 +104,6 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
         Row(text, [by_model.get(model, Cell("")) for by_model in columns.values()], mark * (model == best))
         for model, text in _ROWS.items()
         if any(model in by_model for by_model in columns.values())
-        and (model != "resphys" or settings.reconstruction is not None)
     ]
     of = "vertices" if settings.markers is None else "markers"
     lacking = [f"{model_words(model)} ({why})" for model, why in missing_baselines(metrics).items()]

@@ -242,8 +242,14 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
                     f"{folder} is unfinished: the settings of '{needed}' changed; run its command again."
                 )
             log.info("%s is not evaluated yet: errors and prediction intervals of %s are not known", folder, model)
-            return Experiment(parse(StageSettings, evaluated["settings"]), folder)
-    return Experiment(parse(StageSettings, finished_record(folder, _EVALUATE)["settings"]), folder)
+            return Experiment(_settings_of(evaluated), folder)
+    return Experiment(_settings_of(finished_record(folder, _EVALUATE)), folder)
+
+
+def _settings_of(record: Mapping[str, Any]) -> StageSettings:
+    """Settings of the record of a stage; without the choice of a reconstruction, earlier versions had one."""
+    settings = record["settings"]
+    return parse(StageSettings, {**settings, "reads": [*{**dict.fromkeys(settings["reads"]), "reconstruction": None}]})
 
 
 def describe(folder: Path, model: str) -> Description:

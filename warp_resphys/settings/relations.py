@@ -49,7 +49,7 @@ def _check_data(run: RunKeys) -> None:
     if run.mesh_check is not None and run.markers is None:
         raise ValueError("mesh_check compares markers, but markers is null: leave it null, too.")
     if run.ablation is not None and run.reconstruction is None:
-        raise ValueError("reconstruction is null, but ablation reconstructs forces: give a method, or leave it out.")
+        raise ValueError("reconstruction is none, but ablation reconstructs forces: choose one of its methods.")
     if run.ablation is not None:
         weights = run.data.weights_g.observed if isinstance(run.data, ReleaseFromLoad) else ()
         if len(weights) != 1:

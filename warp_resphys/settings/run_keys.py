@@ -90,7 +90,8 @@ class RunKeys(SimulatorSettings):
         {}, "other bodies by name, on which the identified material is tested, where the real body is simulated"
     )
     reconstruction: ReconstructionSettings | None = setting(
-        ReconstructionSettings(), "forces that explain the trials; null: neither a force nor SimFree is learned"
+        ReconstructionSettings(),
+        "forces that explain the trials; null: none, so that neither a force nor SimFree is learned",
     )
     network: NetworkSettings = NetworkSettings()
     trainer: TrainerSettings = TrainerSettings()

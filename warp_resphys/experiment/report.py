@@ -120,13 +120,12 @@ def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None
         **resources_used(folder, stages),
         "versions": package_versions(),
         "device": str(choose_device(run.device)),
+        **({"without_forces": True} if run.reconstruction is None else {}),
     }
     law: LawContent | None = None if run.law is None else read_if_there(folder / LAW_FILE) or None
     if law is not None:
         metrics["law"] = {**law, "against": "sysid" if "sysid" in identified else "simulation"}
-    if run.reconstruction is None:
-        metrics["without_forces"] = True
-    elif reconstruction := read_if_there(folder / RECONSTRUCTION):
+    if run.reconstruction is not None and (reconstruction := read_if_there(folder / RECONSTRUCTION)):
         metrics["reconstruction"] = reconstruction
     if run.control is not None and (control := read_if_there(folder / CONTROL)):
         metrics["control"] = control
@@ -205,9 +204,8 @@ class RunReader:
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
         assert run.tip is not None
         names = {name for result in identification.values() for name in result.parameters}
-        histories = {
-            model: read_if_there(path).get("epochs") for model, path in training_files(self.folder, run).items()
-        }
+        files = training_files(self.folder, run)
+        histories = {model: read_if_there(path).get("epochs") for model, path in files.items()}
         return RunReport(
             metrics=metrics,
             settings=run,

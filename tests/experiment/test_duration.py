@@ -58,7 +58,7 @@ def test_the_work_is_trials_by_steps_by_epochs(data):
 
 
 def test_derivatives_of_each_part_count(monkeypatch, tmp_path):
-    """Of three tendons, where trials are differentiated: in the identification, and for intervals."""
+    """A parameter of three tendons takes three derivatives, in the identification and for intervals."""
     monkeypatch.setattr(duration, "steps_of", lambda experiment, model, names, longest=None: float(len(names)))
     monkeypatch.setattr(Experiment, "trials", SimpleNamespace(inputs={"tendon_tension": np.zeros((1, 2, 3))}))
     factor, works = "+identify.parameters.tendon_tension_factor={lower: 0.5, upper: 2.0", dict[str, list[float]]()

@@ -22,12 +22,13 @@ from warp_resphys.experiment import learning_stages
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.recordings.importing import import_recordings
 from warp_resphys.io.resuming import StageContext, run_stages
-from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
+from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json, write_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.error_tables import ComparedModels
 from warp_resphys.learning.residuals import fitting
 from warp_resphys.learning.residuals.correction import force_frames
 from warp_resphys.report.data import unused
+from warp_resphys.robot.description import finished_experiment
 from warp_resphys.settings.stage_keys import StageSettings
 
 COMMAND = ("experiment=tiny", TRACKED, "actuator={epochs: 1, gate: false, centres: 10, filters: [0.05]}")
@@ -95,6 +96,17 @@ def test_without_reconstruction_the_actuator_is_all_that_is_learned(finished, tm
     assert "reconstruction" not in results
     assert warp_resphys.load(tmp_path / "run").description.learned is None
     assert unused(results) == {"resphys": "no force is learned"}
+
+
+def test_a_run_from_before_the_choice_of_a_reconstruction_has_its_force(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    record = tmp_path / "run" / "stages" / "evaluate.json"
+    content = read_json(record)
+    content["settings"]["reads"].remove("reconstruction")
+    del content["settings"]["reconstruction"]
+    write_json(record, content)
+    assert finished_experiment(tmp_path / "run").models == finished_experiment(finished).models
+    assert warp_resphys.load(tmp_path / "run", "simfree").description.learned is not None
 
 
 def test_recordings_are_seen_by_cameras_and_registered_back(finished):

@@ -247,9 +247,9 @@ def finished_experiment(folder: Path, model: str | None = None) -> Experiment:
 
 
 def _settings_of(record: Mapping[str, Any]) -> StageSettings:
-    """Settings of the record of a stage; without the choice of a reconstruction, earlier versions had one."""
+    """Settings in the record of a stage; those from before `reconstruction=none` lack the key: forces were learned."""
     settings = record["settings"]
-    return parse(StageSettings, {**settings, "reads": [*{**dict.fromkeys(settings["reads"]), "reconstruction": None}]})
+    return parse(StageSettings, {**settings, "reads": [*settings["reads"], "reconstruction"]})
 
 
 def describe(folder: Path, model: str) -> Description:

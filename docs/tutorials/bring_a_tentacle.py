@@ -129,7 +129,7 @@ markers:
   reference: {json.dumps(reference)}
   bind: patch
   largest_distance: 0.03
-reconstruction: {{regularisation: 1.0, modes: 6}}
+reconstruction: {{regularisation: 1.0}}
 identify:
   parameters:
     poissons_ratio: null

@@ -66,21 +66,19 @@ class Viscosity:
         both = (self.damping / stage.step).expand(batch, 2)
         offset = dilation = None
         if self.damped:
-            strains = [(w, strain(x)) for x, w in stage.strain_weights]
-            offset = reduce(torch.add, [_scale(w * both[:, 0], strained) for w, strained in strains])
-            traces = [w * strained.diagonal(dim1=-2, dim2=-1).sum(-1) for w, strained in strains]
-            dilation = both[:, 1:] * reduce(torch.add, traces)
+            reference = reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights])  # R
+            offset, dilation = both[:, :1, None, None] * reference, both[:, 1:] * _trace(reference)
         if self.ratio is None or self.time is None:
             return both, offset, dilation
         decay, gamma = relaxation(self.time, stage.end * time_step)
-        added = (self.ratio * gamma).expand(batch, -1).sum(1)
-        branches = _scale(added, strain(q))
-        offset = branches if offset is None else offset + branches
+        added, strained = (self.ratio * gamma).expand(batch, -1).sum(1), strain(q)
+        factors = added[:, None, None, None].to(strained)
+        offset = factors * strained if offset is None else torch.addcmul(offset, factors, strained)
         if carried is not None:
             shares = (self.ratio * decay).expand(batch, -1)[:, None].to(offset)  # (B, 1, K)
             flat = torch.baddbmm(offset.flatten(1)[:, None], shares, carried.flatten(2).to(offset), alpha=-1.0)
             offset = flat.view_as(offset)
-        dilation = branches.new_zeros(branches.shape[:2]) if dilation is None else dilation
+        dilation = offset.new_zeros(offset.shape[:2]) if dilation is None else dilation
         return torch.stack([both[:, 0] + added, both[:, 1]], 1), offset, dilation
 
     def relax(
@@ -107,9 +105,9 @@ def relaxation(time: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.
     return torch.exp(-ratio), -torch.expm1(-ratio) / ratio
 
 
-def _scale(values: torch.Tensor, tensors: torch.Tensor) -> torch.Tensor:
-    """Returns (B,) values times (B, P, 3, 3) tensors."""
-    return values[:, None, None, None] * tensors
+def _trace(tensors: torch.Tensor) -> torch.Tensor:
+    """Returns the traces (B, P) of (B, P, 3, 3) tensors."""
+    return tensors[..., 0, 0] + tensors[..., 1, 1] + tensors[..., 2, 2]
 
 
 class StrainTerm(Term):

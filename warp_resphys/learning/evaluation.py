@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from ..data.trials import GIVEN, Trials
+from ..data.trials import GIVEN, STATIC, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import ConvergenceError, InputError, checks_types
@@ -24,7 +24,7 @@ from .replay import Start
 from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
 
 HELD_OUT: Final = "left-out training"
-FOLDS: Final = 3  # of the training trials, without validation trials
+FOLDS: Final = 3  # of the training trials, where validation trials do not suffice
 POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
 
 
@@ -271,16 +271,21 @@ def used_frames(trials: Trials, names: Sequence[str], first_frames: Mapping[str,
     return np.asarray(trials.times[trials.rows(names)] <= last[:, None] + 1e-9)
 
 
-def left_out_in_turn(trials: Trials, names: Sequence[str]) -> list[tuple[str, ...]]:
-    """Divides the training trials that begin alike among the folds of a test without validation trials.
+def left_out_in_turn(trials: Trials, names: Sequence[str], validation: Sequence[str] = ()) -> list[tuple[str, ...]]:
+    """Divides the training trials that begin alike among the folds of a test where validation trials do not suffice.
+
+    A single static pose does not, as its error has no spread.
 
     Args:
         trials: of all names.
         names: of the training trials.
+        validation: names of the validation trials.
 
     Returns:
         Names that are left out of a fit together; nothing if each trial begins in its own way.
     """
+    if len(validation) > 1 or any(trials.begin_of(name) != STATIC for name in validation):
+        return []
     alike = [batch for batch in trials.batches(names) if len(batch) > 1]
     count = min(max(map(len, alike), default=0), FOLDS)
     return [tuple(name for batch in alike for name in batch[number::count]) for number in range(count)]

@@ -121,7 +121,7 @@ class ActuatorFitting:
             The parameters with the actuator and its test, and ``training`` as of `Learned`.
         """
         epochs, test = None, None
-        folds = [] if self.validation else left_out_in_turn(self.motions.trials, self.train)
+        folds = left_out_in_turn(self.motions.trials, self.train, self.validation)
         if folds:
             epochs, test = self._held_out(folds, settings, name)
         trainer = self._trainer(self.train, self.validation or self.train, settings, epochs)

@@ -283,10 +283,10 @@ class Fitting:
     def test(self, learned: Learned, settings: TrainingSettings, name: str) -> HeldOutTest:
         """Tests a network beside the simulator alone: on the validation trials, or on training trials in turn.
 
-        Without validation trials, a third of the training trials that begin alike is left out of a fit each time, with
-        the modes of all; a single one is tested on itself.
+        Where validation trials do not suffice (`left_out_in_turn`), a third of the training trials that begin alike is
+        left out of a fit each time, with the modes of all; a single one is tested on itself.
         """
-        folds = [] if self.validation else left_out_in_turn(self.motions.trials, self.train)
+        folds = left_out_in_turn(self.motions.trials, self.train, self.validation)
         parts = [] if folds else [(learned, self.validation or self.train)]
         for number, left_out in enumerate(folds, 1):
             rest = tuple(name for name in self.train if name not in left_out)
@@ -299,7 +299,7 @@ class Fitting:
             runs = HeldOutRollouts(counting, self.motions, trials, self.identified)
             names, sizes = names + runs.names, sizes + runs.amplitudes_mm()
             errors, below = errors + runs.errors(fitted), below + runs.errors(None)
-        split = "validation" if self.validation else HELD_OUT if folds else "training"
+        split = HELD_OUT if folds else "validation" if self.validation else "training"
         return held_out_test(names, split, errors, below, sizes)
 
     def _group(

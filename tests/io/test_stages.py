@@ -12,7 +12,7 @@ from support.refusals import refuses
 from warp_resphys.io import resuming
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.machine import peak_memory_gib
-from warp_resphys.io.progress import Progress, one_line
+from warp_resphys.io.progress import Progress, one_line, title_of
 from warp_resphys.io.safe_files import write_json
 
 REPOSITORY = Path(__file__).parents[2]
@@ -203,6 +203,18 @@ def test_one_process_at_a_time_in_a_folder_that_can_be_made(experiment, tmp_path
 
 
 class TestProgress:
+    @pytest.mark.parametrize(
+        ("stage", "title"),
+        [
+            ("train_resphys: without 1 of 3", "Training the force: without 1 of 3"),
+            ("train_actuator: held out", "Training the actuator: held out"),
+            ("reduce", "Fitting the reduced model"),
+            ("Differentiating", "Differentiating"),
+        ],
+    )
+    def test_parts_of_a_stage_have_its_title(self, stage, title):
+        assert title_of(stage) == title
+
     def test_a_log_gets_a_line_every_ten_seconds_and_one_at_the_end(self, clock):
         stream = io.StringIO()
         with Progress("train", 100, "epochs", start_at=40, console=Console(file=stream)) as bar:

@@ -18,7 +18,7 @@ from ..data.trials import UNDER_INPUTS, evenly
 from ..io.errors import number_of
 from ..io.fan_out import ALONE, Workers
 from ..io.resuming import Stage
-from ..learning.evaluation import FOLDS
+from ..learning.evaluation import left_out_in_turn
 from ..learning.residuals.reconstruction import make_reconstructor
 from ..report.wording import duration_text
 from ..settings.learning import Bounds
@@ -86,10 +86,10 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage.startswith("reconstruct_"):
         return 0.0, steps_of(experiment, settings.model, settings.reconstructed), 0.0
     if stage == "train_actuator":
-        actuator, folds = settings.actuator, 0 if settings.split.validation else FOLDS
+        actuator, folds = settings.actuator, left_out_in_turn(experiment.trials, train, settings.split.validation)
         trained, rolled = (steps_of(experiment, "actuator", names) for names in (train, judged))
         epoch = (2.0 + _VARIED * _PARTS) * trained + rolled
-        return (1 + folds) * actuator.epochs * epoch, 0.0, 0.0
+        return (1 + len(folds)) * actuator.epochs * epoch, 0.0, 0.0
     if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))

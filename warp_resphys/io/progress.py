@@ -52,8 +52,9 @@ _LOG_WIDTH: Final = 110  # of tables that go to a file, in characters
 
 
 def title_of(stage: str) -> str:
-    """Returns what a stage does, in words; a name that is no stage unchanged."""
-    return _TITLES.get(stage) or _TITLES.get(stage.partition("_")[0], stage)
+    """Returns what a stage, or a part of one after a colon, does, in words; a name that is no stage unchanged."""
+    name, colon, part = stage.partition(":")
+    return f"{_TITLES.get(name) or _TITLES.get(name.partition('_')[0], name)}{colon}{part}"
 
 
 @contextmanager

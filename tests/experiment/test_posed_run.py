@@ -82,6 +82,7 @@ def test_poses_of_unnamed_markers_identify_the_body(poses, folder):
     errors = {name: summary["mean"] for name, summary in metrics["errors_mm"].items()}
     assert 5.0 * errors["sysid"] < errors["simulation"]
     assert {"simfree", "resphys"} <= errors.keys()
+    assert metrics["networks"]["resphys"]["test"]["trials"] == ["weak", "strong", "second"]  # one pose is no test
     checked = metrics["mesh_check"]
     assert checked["cells"][1] == 1.5 * checked["cells"][0] == 30
     assert 0.1 < checked["moved_mm"] < 10.0

@@ -170,7 +170,8 @@ def test_trials_of_several_sessions_are_tested_under_their_own_names(simulator, 
     mixed = replace(motions, trials=trials)
     fitting = ActuatorFitting(simulator, mixed, trials.names)
     folds = left_out_in_turn(trials, trials.names)
-    assert folds and not left_out_in_turn(trials, trials.names[:-1], trials.names[-1:])
+    assert folds
+    assert not left_out_in_turn(trials, trials.names[:-1], trials.names[-1:])
     _, test = fitting._held_out(folds, QUICK.changed(epochs=1), "fit")
     assert sorted(test["trials"]) == sorted(trials.names)
     below = dict(zip(fitting._in_batches(trials.names), fitting._rolled_out(Identified(), trials.names), strict=True))
@@ -231,6 +232,13 @@ def test_poses_at_rest_teach_what_acts_in_the_end(simulator):
     # One pose has no spread, so that training poses are left out in turn.
     assert (found.test["split"], sorted(found.test["trials"])) == ("left-out training", sorted(poses[:6]))
     assert not left_out_in_turn(trials, poses[:6], poses[6:8])
+    # A fold that leaves no pose with inputs would have nothing to fit.
+    alone = {"tendon_tension": np.zeros_like(trials.inputs["tendon_tension"])}
+    alone["tendon_tension"][0] = 1.0
+    released = replace(motions, trials=replace(trials, inputs=alone))
+    folds = ActuatorFitting(simulator, released, poses[:6], poses[6:7])._folds()
+    assert len(folds) == 2
+    assert poses[0] not in {*folds[0], *folds[1]}
 
 
 def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, motions):

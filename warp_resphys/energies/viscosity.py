@@ -66,8 +66,10 @@ class Viscosity:
         both = (self.damping / stage.step).expand(batch, 2)
         offset = dilation = None
         if self.damped:
-            reference = reduce(torch.add, [w * strain(x) for x, w in stage.strain_weights])  # R
-            offset, dilation = both[:, :1, None, None] * reference, both[:, 1:] * _trace(reference)
+            parts = [strain(x) if w == 1.0 else w * strain(x) for x, w in stage.strain_weights]
+            reference = reduce(torch.add, parts)  # R
+            offset = both[:, :1, None, None] * reference
+            dilation = both[:, 1:] * reference.diagonal(dim1=-2, dim2=-1).sum(-1)
         if self.ratio is None or self.time is None:
             return both, offset, dilation
         decay, gamma = relaxation(self.time, stage.end * time_step)
@@ -103,11 +105,6 @@ def relaxation(time: torch.Tensor, seconds: float) -> tuple[torch.Tensor, torch.
     """Returns exp(-s / tau) and gamma, (1 or B, K) each, for relaxation times tau [s]."""
     ratio = seconds / time
     return torch.exp(-ratio), -torch.expm1(-ratio) / ratio
-
-
-def _trace(tensors: torch.Tensor) -> torch.Tensor:
-    """Returns the traces (B, P) of (B, P, 3, 3) tensors."""
-    return tensors[..., 0, 0] + tensors[..., 1, 1] + tensors[..., 2, 2]
 
 
 class StrainTerm(Term):

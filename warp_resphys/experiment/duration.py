@@ -93,12 +93,15 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
-        loop, trainer = training.in_the_loop, training.trainer
+        loop, trainer, times = training.in_the_loop, training.trainer, 1  # fits, of which those of a test are more
+        if model != SIMFREE and trainer.gate:
+            times += len(left_out_in_turn(experiment.trials, train, settings.split.validation))
         if loop is not None:
-            held_out = loop.hold_out and not settings.split.validation
-            return (loop.epochs + 1) * (_ITERATION * trained + rolled) * (len(train) if held_out else 1), 0.0, 0.0
+            if loop.hold_out and not settings.split.validation:
+                times = len(train)
+            return times * (loop.epochs + 1) * (_ITERATION * trained + rolled), 0.0, 0.0
         replayed = 0.0 if model == SIMFREE else trainer.epochs / trainer.rollout_every * rolled
-        return replayed, 0.0, trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
+        return times * replayed, 0.0, times * trainer.epochs * math.ceil(trained / trainer.batch_size) * _BATCH
     if stage == "evaluate":
         tested = [name for names in (*settings.groups.values(), settings.calibration) for name in names]
         rolled = sum(steps_of(experiment, model, tested) for model in experiment.models if model != SIMFREE)

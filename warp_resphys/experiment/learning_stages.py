@@ -123,7 +123,7 @@ def identify_law(context: StageContext) -> None:
 def train_actuator(context: StageContext) -> None:
     """Writes actuator.json: the networks that change inputs, their test on held-out trials, and the epochs.
 
-    An interrupted training resumes; without validation trials, the cross-validation before it is repeated.
+    An interrupted training resumes; a cross-validation before it (`left_out_in_turn`) is repeated.
     """
     settings: StageSettings = context.settings
     experiment, name, split = Experiment(settings, context.run_dir), context.name, settings.split

@@ -282,7 +282,8 @@ def left_out_in_turn(trials: Trials, names: Sequence[str], validation: Sequence[
         validation: names of the validation trials.
 
     Returns:
-        Names that are left out of a fit together; nothing if each trial begins in its own way.
+        Names that are left out of a fit together; nothing if the validation trials suffice, or if each training trial
+        begins in its own way.
     """
     if len(validation) > 1 or any(trials.begin_of(name) != STATIC for name in validation):
         return []

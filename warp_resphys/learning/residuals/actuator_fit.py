@@ -66,7 +66,7 @@ def fit_actuator(
         motions: observed states or markers, under inputs.
         train: names of the trials to learn from; by default all that are not in `validation`.
         validation: names of the trials that choose the weights and test the result; a third of the training trials in
-            turn if empty.
+            turn if there are none, or one static pose.
         parameters: as for `reconstruct`.
         settings: size and training; the defaults of the class if None.
 
@@ -121,10 +121,11 @@ class ActuatorFitting:
             The parameters with the actuator and its test, and ``training`` as of `Learned`.
         """
         epochs, test = None, None
-        folds = left_out_in_turn(self.motions.trials, self.train, self.validation)
+        folds = self._folds() if settings.gate or not self.validation else []
         if folds:
             epochs, test = self._held_out(folds, settings, name)
-        trainer = self._trainer(self.train, self.validation or self.train, settings, epochs)
+        judged = self.train if folds else self.validation or self.train
+        trainer = self._trainer(self.train, judged, settings, epochs)
         if resumed is not None:
             trainer.resume(*resumed)
         trainer.begin()
@@ -140,6 +141,13 @@ class ActuatorFitting:
         error = trainer.best_error if math.isfinite(trainer.best_error) else None
         kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
         return replace(found, test=test), {"kept": {**kept, "test": test}, "epochs": trainer.history}
+
+    def _folds(self) -> list[tuple[str, ...]]:
+        """Training trials that are left out in turn, without those that leave no trial with inputs."""
+        trials, inputs = self.motions.trials, self.motions.trials.inputs.values()
+        driven = {n for n in self.train if any(values[trials.names.index(n)].any() for values in inputs)}
+        folds = left_out_in_turn(trials, self.train, self.validation)
+        return [fold for fold in folds if driven.difference(fold)]
 
     def _held_out(
         self, folds: Sequence[tuple[str, ...]], settings: ActuatorSettings, name: str

@@ -93,7 +93,7 @@ def work_of(stage: str, experiment: Experiment) -> tuple[float, float, float] | 
     if stage.startswith("train_"):
         model, training = settings.model, settings.training
         trained, rolled = (steps_of(experiment, model, names) for names in (train, judged))
-        loop, trainer, times = training.in_the_loop, training.trainer, 1  # fits, of which those of a test are more
+        loop, trainer, times = training.in_the_loop, training.trainer, 1  # fits: the one used, those that test it
         if model != SIMFREE and trainer.gate:
             times += len(left_out_in_turn(experiment.trials, train, settings.split.validation))
         if loop is not None:

@@ -24,7 +24,7 @@ from .replay import Start
 from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
 
 HELD_OUT: Final = "left-out training"
-FOLDS: Final = 3  # of the training trials, where validation trials do not suffice
+_FOLDS: Final = 3  # of the training trials, where validation trials do not suffice
 POSE_STEPS: Final = 200  # after which the roll-out of a network without simulator is taken to be at rest
 
 
@@ -288,7 +288,7 @@ def left_out_in_turn(trials: Trials, names: Sequence[str], validation: Sequence[
     if len(validation) > 1 or any(trials.begin_of(name) != STATIC for name in validation):
         return []
     alike = [batch for batch in trials.batches(names) if len(batch) > 1]
-    count = min(max(map(len, alike), default=0), FOLDS)
+    count = min(max(map(len, alike), default=0), _FOLDS)
     return [tuple(name for batch in alike for name in batch[number::count]) for number in range(count)]
 
 

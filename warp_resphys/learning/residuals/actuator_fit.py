@@ -143,7 +143,7 @@ class ActuatorFitting:
         return replace(found, test=test), {"kept": {**kept, "test": test}, "epochs": trainer.history}
 
     def _folds(self) -> list[tuple[str, ...]]:
-        """Training trials that are left out in turn, without those that leave no trial with inputs."""
+        """Names of training trials that are left out of a fit together, as long as others have inputs."""
         trials, inputs = self.motions.trials, self.motions.trials.inputs.values()
         driven = {n for n in self.train if any(values[trials.names.index(n)].any() for values in inputs)}
         folds = left_out_in_turn(trials, self.train, self.validation)

@@ -85,3 +85,4 @@ def _escape(_app: Sphinx, what: str, _name: str, _found: Any, _options: Any, lin
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
     app.connect("autodoc-process-docstring", _escape, priority=600)  # after Napoleon
+    app.extensions["sphinx-mathjax-offline"].parallel_read_safe = True  # it copies files after the pages are read

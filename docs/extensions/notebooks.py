@@ -29,8 +29,17 @@ def link_notebook(app: Sphinx, page: str, _template: str, context: dict[str, Any
             context["body"] = context["body"].replace("</h1>", f"</h1>\n{link}", 1)
 
 
+def spread_tutorials(app: Sphinx, _environment: Any, pages: list[str]) -> None:
+    """Orders the pages such that processes that read neighbouring pages run equally many tutorials."""
+    slow = {f"tutorials/{path.stem}" for path in tutorials(app)}
+    groups = [[page for page in pages if (page in slow) is among] for among in (True, False)]
+    place = {page: number / len(group) for group in groups for number, page in enumerate(group)}
+    pages.sort(key=place.__getitem__)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
+    app.connect("env-before-read-docs", spread_tutorials)
     app.connect("build-finished", write_notebooks)
     app.connect("html-page-context", link_notebook)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

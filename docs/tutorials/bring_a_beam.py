@@ -162,12 +162,14 @@ print(", ".join(f"{name} {value:.4g}" for name, value in identified.items()))
 # ## Better physics
 #
 # A Prony branch adds memory: an additional shear modulus, given as a ratio to the long-term one, relaxes with a time
-# constant ([materials](../simulator.md#creep)). A configuration based on the first one identifies both.
+# constant ([materials](../simulator.md#creep)). A configuration based on the first one identifies both, and learns no
+# force.
 
 # %%
 Path("configs/experiment/my_creeping_robot.yaml").write_text("""# @package _global_
 defaults:
   - my_robot
+  - override /reconstruction: none
   - _self_
 name: my_creeping_robot
 title: My robot, which creeps

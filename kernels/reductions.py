@@ -27,15 +27,14 @@ def block_max(value: wp.float64) -> wp.float64:
 @wp.kernel
 def masked_norm(
     free: wp.array[wp.float64],  # (N) one at free vertices, zero at fixed ones
-    vectors_out: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices
+    vectors: wp.array2d[wp.vec3d],  # (B, N)
     norm_out: wp.array[wp.float64],  # (B)
 ):
     """Computes the norm over all free vertices."""
     b, lane = wp.tid()
     total = wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):
-        value = free[i] * vectors_out[b, i]
-        vectors_out[b, i] = value
+        value = free[i] * vectors[b, i]
         total += wp.dot(value, value)
     total = block_sum(total)
     if lane == 0:
@@ -49,6 +48,7 @@ def totals(
     vertex_energy: wp.array2d[wp.float64],  # (B, N) [J]
     point_energy: wp.array2d[wp.float64],  # (B, P) [J]
     residual_out: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices [N]
+    held_out: wp.array2d[wp.vec3d],  # (B, N) what it was there [N]
     energy_out: wp.array[wp.float64],  # (B) [J]
     size_out: wp.array[wp.float64],  # (B) sum of the energies' absolute values [J]
     norm_out: wp.array[wp.float64],  # (B) of the residual [N]
@@ -57,6 +57,8 @@ def totals(
     b, lane = wp.tid()
     energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):
+        if free[i] == wp.float64(0.0) and active[b] != 0:
+            held_out[b, i] = residual_out[b, i]
         value = free[i] * residual_out[b, i]
         residual_out[b, i] = value
         square += wp.dot(value, value)

@@ -113,8 +113,27 @@ class EquationsOfMotion:
         refuse_transforms(values)
         return torch.as_tensor(values, device=self.rest_positions.device, dtype=self.rest_positions.dtype)
 
-    def prepare(self, parameters: Mapping[str, Any]) -> Constants:
+    def rest_state(self, batch: int) -> State:
+        """Returns the undeformed body at rest, for a batch of one or more environments."""
+        check_count("batch", batch)
+        q = self.rest_positions.expand(batch, -1, -1).clone()
+        return State(q, torch.zeros_like(q))
+
+    def before_equilibrium(
+        self, inputs: Inputs, constants: Constants, start: torch.Tensor | None, batch: int | None, after: State | None
+    ) -> State:
+        """Returns the state that a static equilibrium continues (arguments: `Simulator.static_equilibrium`)."""
+        if batch is None:
+            sizes = [len(value) for value in inputs.fields.values()] + ([] if start is None else [len(start)])
+            batch = max(*sizes, constants.batch, 1 if after is None else after.batch)
+        state = self.rest_state(batch) if after is None else after
+        return state.repeat(batch) if state.batch == 1 < batch else state
+
+    def prepare(self, parameters: Mapping[str, Any] | Constants | None) -> Constants:
         """Computes stiffness, mass and weight from values that replace the defaults of parameters, by name."""
+        if isinstance(parameters, Constants):
+            return parameters
+        parameters = parameters or {}
         for name, value in parameters.items():
             if name not in self.parameters:
                 raise InputError(f"{name!r} is not a parameter of this simulator: it has {', '.join(self.parameters)}.")
@@ -139,12 +158,16 @@ class EquationsOfMotion:
         accepted = {name: (quantity, self.counts[name]) for name, quantity in self.energies.inputs.items()}
         inputs.check(accepted, batch, self.body.n_vertices, len(self.fixed), self.rest_positions)
 
-    def check(self, state: State, inputs: Inputs, constants: Constants) -> None:
-        """Raises InputError for a state, inputs or constants that do not fit."""
+    def checked(
+        self, state: State, inputs: Inputs | None, parameters: Mapping[str, Any] | Constants | None
+    ) -> tuple[Inputs, Constants]:
+        """Returns inputs and constants, or raises InputError if these or the state do not fit."""
+        inputs, constants = self.fitted(inputs, state.batch), self.prepare(parameters)
         state.check(self.body.n_vertices, self.rest_positions)
         self.check_inputs(inputs, state.batch)
         constants.check_batch(state.batch)
         self.energies.check_memory(state.memory, state.batch, self.rest_positions)
+        return inputs, constants
 
 
 def check_count(name: str, value: object) -> None:

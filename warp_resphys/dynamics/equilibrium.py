@@ -1,4 +1,14 @@
-"""Differentiable minimisation of an incremental potential, with an implicit adjoint."""
+"""Differentiable minimisation of an incremental potential, with an implicit adjoint, and the reactions there.
+
+At a fixed vertex i the potential (``energies.potential``) does not balance. Its gradient there,
+
+    r_i = k_i (x_i - y_i) - f_i + sum_e dE_e / dx_i,
+
+is the force with which the clamp holds the vertex: that of the energies, damping included, the rate of change of the
+vertex's momentum, less its share of the loads. The sum over all fixed vertices and contacts with the world is the rate
+of change of the body's momentum in the step, less its weight and the external forces. That of a midpoint step is in its
+middle. Planes of symmetry hold a body, too, which is not included.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -8,19 +18,18 @@ import torch
 from torch.autograd import forward_ad
 from typing_extensions import override
 
-from ..energies.potential import IncrementalPotential, StepTerms
+from ..energies.potential import IncrementalPotential, Names, StepTerms
 from ..io.errors import ConvergenceError
 from ..linalg.threads import in_threads, threads_for
 from ..settings.body import SolverSettings
 from ..stepping.adjoints import AdjointFunction, first_derivatives
-from ..stepping.state import SolveReport
+from ..stepping.state import Reaction, SolveReport
 from .hessian import ExactHessian
 from .minimiser import Minimiser
 from .workspace import Workspace
 
 P = TypeVar("P")
 T = TypeVar("T")
-Names = tuple[tuple[int, str], ...]  # number of an energy, and name of a value of its term
 
 _REFINEMENTS = 8  # iterations of an adjoint solve with a float32 factor before a float64 factor is used
 _LEAST_WAY, _MOST_PARTS = 1e-2, 32  # of the way of fixed vertices that bodies bar: a part of it, and their number
@@ -35,7 +44,7 @@ def equilibrium(
     start: torch.Tensor,
     fixed_positions: torch.Tensor,
     follows: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, SolveReport]:
+) -> tuple[torch.Tensor, SolveReport, Reaction | None]:
     """Returns the minimiser (B, N, 3) of a step's potential, differentiable in the terms and fixed positions.
 
     Args:
@@ -48,7 +57,8 @@ def equilibrium(
         follows: passed to `Minimiser.solve`.
 
     Returns:
-        The last iterate, and the solver's report, which says whether it converged (`check_converged`).
+        The last iterate, the solver's report, which says whether it converged (`check_converged`), and the reaction at
+        the fixed vertices, if there are any.
     """
     problem = _Minimisation(workspace, purpose, settings, follows, workspace.potential.value_names)
     values = (terms.values[energy][name] for energy, name in problem.names)
@@ -58,7 +68,8 @@ def equilibrium(
     through_graph = needs_grad or forward_ad._current_level >= 0
     x: torch.Tensor = _Equilibrium.apply(problem, *tensors) if through_graph else problem.minimise(tensors)
     assert problem.report is not None
-    return x, problem.report
+    assert problem.held is not None
+    return x, problem.report, _reaction(workspace, terms, x, problem.held) if len(workspace.fixed) else None
 
 
 @dataclass
@@ -71,13 +82,14 @@ class _Minimisation:
     follows: torch.Tensor | None
     names: Names  # of the values
     report: SolveReport | None = None
+    held: torch.Tensor | None = None  # (B, D, 3) derivatives of the energies at fixed vertices [N]
 
     def minimise(self, tensors: Sequence[torch.Tensor | None]) -> torch.Tensor:
-        """Returns the minimiser for a start, fixed positions and terms, and sets the report."""
+        """Returns the minimiser for a start, fixed positions and terms, and sets the report and what is held."""
         start, *others = (None if tensor is None else tensor.detach() for tensor in tensors)
         assert start is not None
 
-        def work(rows: slice, workspace: Workspace, minimiser: Minimiser) -> tuple[torch.Tensor, SolveReport]:
+        def work(rows: slice, workspace: Workspace, minimiser: Minimiser) -> tuple[torch.Tensor, SolveReport, Any]:
             follows = None if self.follows is None else self.follows[rows]
             return _minimise(
                 workspace, minimiser, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others))
@@ -86,8 +98,10 @@ class _Minimisation:
         results = self._in_shards(
             lambda workspace: workspace.minimiser(self.purpose, self.settings), work, start[0].numel()
         )
-        self.report = _joined([report for _, report in results])
-        return results[0][0] if len(results) == 1 else torch.cat([solution for solution, _ in results])
+        solutions, reports, held = zip(*results, strict=True)
+        self.report = _joined(reports)
+        self.held = held[0] if len(results) == 1 else torch.cat(held)
+        return solutions[0] if len(results) == 1 else torch.cat(solutions)
 
     def differentiate(
         self, gradient: torch.Tensor, x: torch.Tensor, terms: Sequence[torch.Tensor | None], needed: Sequence[bool]
@@ -151,6 +165,65 @@ class _Equilibrium(AdjointFunction):
         return None, None, *ctx.problem.differentiate(gradient, x, terms, ctx.needs_input_grad[2:])
 
 
+def _reaction(workspace: Workspace, terms: StepTerms, x: torch.Tensor, held: torch.Tensor) -> Reaction:
+    """Returns the reaction at the fixed vertices in a solve, differentiable.
+
+    Args:
+        workspace: of the batch.
+        terms: of the solve.
+        x: (B, N, 3) its solution [m].
+        held: (B, D, 3) derivatives of the energies by the fixed positions there [N].
+    """
+    fixed, held = workspace.fixed, held.to(x)
+    if torch.is_grad_enabled():
+        names = workspace.potential.value_names
+        held = _Held.apply(workspace, terms, held, x, *(terms.values[energy][name] for energy, name in names))
+    places = x[:, fixed]
+    inertia = terms.inertia[:, fixed, None] * (places - terms.target[:, fixed])
+    return Reaction(fixed, held + inertia - terms.force[:, fixed], places)
+
+
+class _Held(AdjointFunction):
+    """r = sum_e dE_e / dx at fixed vertices. For a loss with gradient z there, dL/dx = K z, dL/dtheta = z . dr/dtheta.
+
+    K is the stiffness, and theta are the values of the energies.
+    """
+
+    @override
+    @staticmethod
+    def forward(
+        ctx: Any, workspace: Workspace, terms: StepTerms, held: torch.Tensor, x: torch.Tensor, *values: Any
+    ) -> torch.Tensor:
+        ctx.workspace, ctx.names = workspace, workspace.potential.value_names
+        ctx.save_for_backward(terms.target, terms.inertia, terms.force, x, *values)
+        return held.clone()
+
+    @override
+    @staticmethod
+    @first_derivatives
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        target, inertia, force, x, *values = ctx.saved_tensors
+        needed = ctx.needs_input_grad
+        potential: IncrementalPotential = ctx.workspace.potential
+        with potential.lock:
+            potential.set_terms(StepTerms.of(ctx.names, target, inertia, force, *values))
+            potential.positions.copy_(x)
+            along = torch.zeros_like(potential.positions)
+            along[:, ctx.workspace.fixed] = gradient.double()
+            by_position = None
+            if needed[3]:
+                potential.update_tangent()
+                by_position = potential.stiffness_product(along).to(x)
+            slopes = potential.value_adjoint(along) if any(needed[4:]) else []
+        by_values: list[torch.Tensor | None] = []
+        for (energy, name), value, is_needed in zip(ctx.names, values, needed[4:], strict=True):
+            slope = slopes[energy].get(name) if is_needed else None
+            if slope is not None:
+                slope = -(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope).to(value)
+            by_values.append(slope)
+        return None, None, None, by_position, *by_values
+
+
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
     """Returns the values of some environments; values shared by all are returned unchanged."""
     return values if values is None or len(values) == 1 else values[rows]
@@ -172,14 +245,6 @@ def _join_gradients(value: torch.Tensor | None, slopes: tuple[torch.Tensor | Non
     return torch.stack(parts).sum(0) if value is not None and len(value) == 1 else torch.cat(parts)
 
 
-def _terms(names: Names, tensors: Sequence[Any]) -> StepTerms:
-    target, inertia, force, *values = tensors
-    by_energy = [dict[str, torch.Tensor | None]() for _ in range(1 + max((energy for energy, _ in names), default=-1))]
-    for (energy, name), value in zip(names, values, strict=True):
-        by_energy[energy][name] = value
-    return StepTerms(target, inertia, force, by_energy)
-
-
 def _minimise(
     workspace: Workspace,
     minimiser: Minimiser,
@@ -188,15 +253,15 @@ def _minimise(
     start: Any,
     fixed_positions: Any,
     *terms: Any,
-) -> tuple[torch.Tensor, SolveReport]:
-    """Returns the minimiser and the report of one shard.
+) -> tuple[torch.Tensor, SolveReport, torch.Tensor]:
+    """Returns the minimiser, the report, and the derivatives at fixed vertices of one shard.
 
     Where bodies bar the way of fixed vertices, these go as far as they can, and the others give way to them by a solve,
     again and again; the last solve has every fixed vertex in its place. A batch of which that holds agrees with its
     environments alone within the tolerance, not bit for bit.
     """
     potential, fixed = workspace.potential, workspace.fixed
-    potential.set_terms(_terms(names, terms))
+    potential.set_terms(StepTerms.of(names, *terms))
     potential.check_start(follows is not None and bool(follows.all()))
     parts: list[SolveReport] = []
     while not potential.place_fixed(fixed, fixed_positions, _LEAST_WAY if len(parts) < _MOST_PARTS else 1.0):
@@ -208,7 +273,7 @@ def _minimise(
         start[:, fixed] = fixed_positions
     report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
     work = {name: sum(getattr(part, name) for part in [*parts, report]) for name in ("iterations", "factorisations")}
-    return potential.positions.to(start.dtype, copy=True), replace(report, **work)
+    return potential.positions.to(start.dtype, copy=True), replace(report, **work), potential.held[:, fixed]
 
 
 def _adjoint(
@@ -221,7 +286,7 @@ def _adjoint(
     *saved: Any,
 ) -> tuple[torch.Tensor | None, ...]:
     """Returns the gradients by fixed positions and terms (equations in `_Equilibrium`)."""
-    terms = _terms(names, saved)
+    terms = StepTerms.of(names, *saved)
     potential = workspace.potential
     potential.set_terms(terms)
     potential.positions.copy_(x)

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 import scipy.sparse
+import torch
 
 from ..energies.base import PlacedEnergy
 from ..energies.solid import Solid
@@ -28,9 +29,27 @@ from ..mesh.quality import is_one_cell_thick
 from .plausibility import mean_of
 
 NOTICED: Final = 0.07  # change of the deflection
-CHECKED: Final = 4  # equilibria of a simulator, as the first one is often that of its weight alone
+_CHECKED: Final = 4  # equilibria of a simulator, as the first one is often that of its weight alone
 _LEAST: Final = 1e-7  # strain, below which rounding dominates
 _INCOMPRESSIBLE: Final = 0.5  # Poisson's ratio of materials without this parameter
+
+
+class CellCheck:
+    """Warns once of cells that are too coarse for one of the first equilibria of a simulator (`warn_of_cells`).
+
+    Args:
+        body: a body, or a `fem.scene.Scene`.
+        placed: energies of its simulator.
+    """
+
+    def __init__(self, body: Body, placed: Sequence[PlacedEnergy]) -> None:
+        self._body, self._placed, self._left = body, placed, _CHECKED
+
+    def __call__(self, q: torch.Tensor, values: Sequence[Values]) -> None:
+        """Checks positions (B, N, 3) of equilibria [m], with values of every energy by name."""
+        if self._left:
+            at = q[0].detach().double().cpu().numpy()
+            self._left = 0 if warn_of_cells(self._body, self._placed, at, values) else self._left - 1
 
 
 def warn_of_cells(body: Body, placed: Sequence[PlacedEnergy], q: FloatArray, values: Sequence[Values]) -> bool:

@@ -30,12 +30,13 @@ from ..io.errors import ConvergenceError
 from ..kernels.minimisation import NEVER, Tolerances
 from ..linalg.choice import make_linear_solver
 from ..settings.body import SolverName, SolverSettings
-from ..stepping.state import SolveReport
+from ..stepping.state import SolveReport, State
 from .assembly import BlockPattern
 from .hessian import ExactHessian, ProjectiveHessian
 from .minimiser import Minimiser
 
 SOLVERS: tuple[SolverName, ...] = get_args(SolverName)
+_STEPS_TO_CHECK = 32  # of a roll-out on a GPU, after which their convergence is checked
 _REFACTOR_AFTER = 4  # iterations of a step above which ``quasi_newton`` refactorises
 _PATIENCE = 3  # by which it is multiplied where factors are kept
 
@@ -55,6 +56,30 @@ def check_converged(settings: SolverSettings, report: SolveReport | None, positi
         positions.detach(),
         report,
     )
+
+
+class ConvergenceCheck:
+    """Checks the states of a roll-out, on a GPU those of many steps at once: the host waits for it only then.
+
+    Args:
+        settings: settings of the solver.
+    """
+
+    def __init__(self, settings: SolverSettings) -> None:
+        self._settings, self._states = settings, list[State]()
+
+    def add(self, state: State) -> State:
+        """Returns a new state, and raises ConvergenceError if a step that is checked failed."""
+        self._states.append(state)
+        if state.q.device.type == "cpu" or len(self._states) == _STEPS_TO_CHECK:
+            self.finish()
+        return state
+
+    def finish(self) -> None:
+        """Raises ConvergenceError if a step since the last check failed."""
+        states, self._states = self._states, []
+        for state in states:
+            check_converged(self._settings, state.report, state.q)
 
 
 def make_minimiser(

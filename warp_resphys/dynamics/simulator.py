@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
+from numpy.typing import ArrayLike
 
 from ..energies.contact.barrier import ContactForces
 from ..energies.materials import Corotated, Material
@@ -15,12 +16,12 @@ from ..io.settings import parse
 from ..settings.body import SolverSettings
 from ..stepping.inputs import Inputs, check_tensor
 from ..stepping.rollout import rollout
-from ..stepping.state import Constants, State
+from ..stepping.state import Constants, Reaction, State
 from .energy_set import Materials, joined_names
 from .equations import EquationsOfMotion, check_count
 from .linearisation import Linearisation
-from .mesh_error import CHECKED, warn_of_cells
-from .nonlinear_solver import check_converged
+from .mesh_error import CellCheck
+from .nonlinear_solver import ConvergenceCheck, check_converged
 from .plausibility import warn_of_implausible
 from .statics import SHIFT, StaticEquilibrium, friction_holds
 from .time_step import TimeStep
@@ -28,8 +29,6 @@ from .trajectory import Motion
 from .workspace import Workspace
 
 GRAVITY = (0.0, 0.0, -9.80709)
-# Steps of a roll-out on a GPU after which the host checks their convergence: it waits for the GPU only then.
-_STEPS_TO_CHECK = 32
 
 Parameters = Mapping[str, Any]
 
@@ -108,7 +107,7 @@ class Simulator:
         self.parameters, self.defaults, self.counts = equations.parameters, equations.defaults, equations.counts
         self.energies = equations.energies
         self.inputs, self.parts = self.energies.inputs, self.energies.parts
-        self._checked_cells: list[bool] = []  # whether they are too coarse in the first equilibria
+        self._check_cells = CellCheck(self.body, self.energies.placed)
         self._built = True
 
     def __repr__(self) -> str:
@@ -144,9 +143,7 @@ class Simulator:
         Raises:
             InputError: an unknown name, a value out of range, or a wrong number of values.
         """
-        if isinstance(parameters, Constants):
-            return parameters
-        return self._equations.prepare(parameters or {})
+        return self._equations.prepare(parameters)
 
     def workspace(self, batch: int) -> Workspace:
         """Returns the calling thread's buffers for a batch size (`EquationsOfMotion.workspace`)."""
@@ -154,9 +151,7 @@ class Simulator:
 
     def rest_state(self, batch: int = 1) -> State:
         """Returns the undeformed body at rest, for a batch of one or more environments."""
-        check_count("batch", batch)
-        q = self.rest_positions.expand(batch, -1, -1).clone()
-        return State(q, torch.zeros_like(q))
+        return self._equations.rest_state(batch)
 
     def state(self, q: object, v: object = None) -> State:
         """Returns a state without memory from arrays or tensors.
@@ -209,7 +204,7 @@ class Simulator:
 
     def _time_step(self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None) -> TimeStep:
         """Returns a time step, or raises InputError if state, inputs or parameters do not fit."""
-        return TimeStep(self._equations, state, *self._checked(state, inputs, parameters))
+        return TimeStep(self._equations, state, *self._equations.checked(state, inputs, parameters))
 
     def remember(self, state: State, q: torch.Tensor, constants: Constants, inputs: Inputs | None = None) -> State:
         """Returns a state at given positions, with the memory variables after a step to these positions.
@@ -244,6 +239,20 @@ class Simulator:
         problem = self._time_step(state, inputs, parameters)
         with problem.workspace.potential.lock:
             return self.energies.contacts(problem.step, after.q)
+
+    def reaction(self, state: State | Motion, at: str | ArrayLike | None = None) -> Reaction:
+        """Returns what holds the fixed vertices in the step or equilibrium that led to a state, differentiable.
+
+        Args:
+            state: state from `step` or `static_equilibrium`, or a motion from `rollout`, of which it is for every step.
+            at: a region of the mesh, a body of a scene, or numbers of fixed vertices; None: all of these.
+
+        Raises:
+            InputError: no step led to the state, or nothing holds the body there.
+        """
+        if state.reaction is None:
+            raise InputError("no step of a body with fixed vertices led to this state: it has no reaction.")
+        return state.reaction if at is None else state.reaction.at(self.body.fixed_at(at))
 
     def is_held(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -308,13 +317,8 @@ class Simulator:
             ResphysWarning: linear cells that are too coarse for one of the first equilibria (`dynamics.mesh_error`).
         """
         inputs, constants = self._equations.fitted(inputs), self.prepare(parameters)
-        if batch is None:
-            sizes = [len(value) for value in inputs.fields.values()] + ([] if start is None else [len(start)])
-            batch = max(*sizes, constants.batch, 1 if after is None else after.batch)
-        state = self.rest_state(batch) if after is None else after
-        if state.batch == 1 < batch:
-            state = state.map(lambda value: torch.cat([value] * batch))
-        inputs, constants = self._checked(state, inputs, constants)
+        state = self._equations.before_equilibrium(inputs, constants, start, batch, after)
+        inputs, constants = self._equations.checked(state, inputs, constants)
         if start is not None:
             check_tensor("start", start, tuple(state.q.shape), "m", "vertex", state.q)
         if not self.is_held(state, inputs, constants):
@@ -323,9 +327,7 @@ class Simulator:
                 "with friction, within the distance of contact."
             )
         balanced = StaticEquilibrium(self._equations, state, inputs, constants).solve(start)
-        if len(self._checked_cells) < CHECKED and True not in self._checked_cells:
-            at = balanced.q[0].detach().double().cpu().numpy()
-            self._checked_cells.append(warn_of_cells(self.body, self.energies.placed, at, constants.values))
+        self._check_cells(balanced.q, constants.values)
         return balanced
 
     def linearise_equilibrium(
@@ -345,7 +347,7 @@ class Simulator:
         if self.energies.follow_pose:
             raise InputError("forces of this body depend on its pose without a potential: solve its equilibria.")
         state = self.rest_state(batch)
-        inputs, constants = self._checked(state, inputs, parameters)
+        inputs, constants = self._equations.checked(state, inputs, parameters)
         return Linearisation(StaticEquilibrium(self._equations, state, inputs, constants))
 
     def rollout(
@@ -370,31 +372,14 @@ class Simulator:
         inputs = self._equations.fitted(inputs, state.batch)
         inputs.check_steps(steps)
         constants = self.prepare(parameters)
-        self._checked(state, inputs.at(0), constants)
-        together, unchecked = 1 if state.q.device.type == "cpu" else _STEPS_TO_CHECK, list[State]()
-
-        def check() -> None:
-            for solved in unchecked:
-                check_converged(self.settings, solved.report, solved.q)
-            unchecked.clear()
+        self._equations.checked(state, inputs.at(0), constants)
+        check = ConvergenceCheck(self.settings)
 
         def step(before: State, now: Inputs) -> State:
             if now is not inputs:
                 self._equations.check_inputs(now, before.batch)
-            unchecked.append(TimeStep(self._equations, before, now, constants).solve())
-            after = unchecked[-1]
-            if len(unchecked) == together:
-                check()
-            return after
+            return check.add(TimeStep(self._equations, before, now, constants).solve())
 
         states = rollout(step, state, inputs.by_step(steps), lambda reached: reached)
-        check()
+        check.finish()
         return Motion.of(states, self.body, self.time_step, obstacles=self.energies.obstacles(states, constants))
-
-    def _checked(
-        self, state: State, inputs: Inputs | None, parameters: Parameters | Constants | None
-    ) -> tuple[Inputs, Constants]:
-        """Returns inputs and constants, or raises InputError if these or the state do not fit."""
-        inputs, constants = self._equations.fitted(inputs, state.batch), self.prepare(parameters)
-        self._equations.check(state, inputs, constants)
-        return inputs, constants

@@ -64,7 +64,7 @@ class TimeStep:
         equations, workspace, state = self.equations, self.workspace, self.step.state
         start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
         terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
-        x, report = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
-        new = replace(self.finish(equations.coordinates.expand(x)), report=report)
+        x, report, reaction = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
+        new = replace(self.finish(equations.coordinates.expand(x)), report=report, reaction=reaction)
         workspace.record_positions(new.q)
         return new

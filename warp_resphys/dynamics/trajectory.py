@@ -18,7 +18,7 @@ from ..io.safe_files import atomic_hdf5, create
 from ..mesh.motion_files import input_columns, write_csv, write_usd, write_vtk
 from ..stepping.inputs import shapes
 from ..stepping.rollout import sample
-from ..stepping.state import SolveReport, State
+from ..stepping.state import Reaction, SolveReport, State
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,6 +42,7 @@ class Motion:
         lost: (T + 1, B) bool, whether the simulation has diverged.
         inputs: (T, B, C) commands of a robot, by name.
         units: unit and names of the C parts of the commands that drive actuators, by name.
+        reaction: what holds the fixed vertices in each of the T steps; None where it is not known.
     """
 
     q: torch.Tensor
@@ -59,6 +60,7 @@ class Motion:
     lost: torch.Tensor | None = None
     inputs: Mapping[str, torch.Tensor] = field(default_factory=dict)
     units: Mapping[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
+    reaction: Reaction | None = None
 
     def __post_init__(self) -> None:
         """Observes the vertices where there are no markers."""
@@ -70,7 +72,8 @@ class Motion:
         """Returns the motion of a body in T + 1 states of a roll-out; ``more`` are other attributes."""
         q, v = (torch.stack([getattr(state, name) for state in states]) for name in ("q", "v"))
         reports = [state.report for state in states[1:] if state.report is not None]
-        return cls(q, v, states[-1], body, time_step, reports, **more)
+        reaction = Reaction.stack([state.reaction for state in states[1:]])
+        return cls(q, v, states[-1], body, time_step, reports, reaction=reaction, **more)
 
     def __repr__(self) -> str:
         """Number and length of the steps, environments, and how many left the training range or diverged."""

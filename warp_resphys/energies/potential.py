@@ -24,6 +24,8 @@ from .base import PlacedEnergy
 from .launcher import CapturedGraph, Launcher, LaunchSequence, warp_view
 from .term import PairTangents, PointSet, Term, Values
 
+Names = Sequence[tuple[int, str]]  # number of an energy, and name of a value of its term
+
 
 @dataclass(frozen=True)
 class StepTerms:
@@ -34,6 +36,15 @@ class StepTerms:
     force: torch.Tensor  # (B, N, 3) f [N]
     # values of each energy's term by name (`Term.values`), with a first axis of 1 or B; None if not needed
     values: Sequence[Values] = ()
+
+    @classmethod
+    def of(cls, names: Names, target: Any, inertia: Any, force: Any, *values: Any) -> "StepTerms":
+        """Returns terms with values by energy and name, from a list of them."""
+        count = 1 + max((energy for energy, _ in names), default=-1)
+        by_energy: list[dict[str, torch.Tensor | None]] = [{} for _ in range(count)]
+        for (energy, name), value in zip(names, values, strict=True):
+            by_energy[energy][name] = value
+        return cls(target, inertia, force, by_energy)
 
 
 class IncrementalPotential(Launcher):
@@ -56,7 +67,9 @@ class IncrementalPotential(Launcher):
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
         evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums.
-            Environments that are not ``active`` keep energies and norm of the residual, and have no valid ``residual``.
+            Environments that are not ``active`` keep ``held``, energies and norm of the residual, and have no valid
+            ``residual``.
+        held: (B, N, 3) derivatives of the energies by the positions of fixed vertices, where these are [N].
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
@@ -107,7 +120,7 @@ class IncrementalPotential(Launcher):
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
-        self.residual = self.zeros(n_vertices, 3)
+        self.residual, self.held = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
         self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
@@ -150,7 +163,11 @@ class IncrementalPotential(Launcher):
                     self.record(kernel, (b, s.n_points), [active, *inputs], [stress, energy]),
                     self.gather(s, stress, self.residual),
                 ]
-        free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
+        free, residual, held = (
+            warp_view(self.free_mask, wp.float64),
+            warp_view(self.residual, wp.vec3d),
+            warp_view(self.held, wp.vec3d),
+        )
         project, c = [], self.coordinates
         if c.slides:  # removes the residual normal to symmetry planes
             planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
@@ -163,7 +180,7 @@ class IncrementalPotential(Launcher):
         sums = [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
         self._internal_commands += project
         self._internal_commands.append(
-            self.record_blocks(reductions.totals, b, [active, free, *energies, residual], sums)
+            self.record_blocks(reductions.totals, b, [active, free, *energies, residual], [held, *sums])
         )
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)

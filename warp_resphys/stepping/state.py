@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
+from numpy.typing import ArrayLike
 
 from ..io.arrays import BoolArray, Brief
 from ..io.errors import InputError
@@ -25,6 +26,48 @@ class SolveReport(Brief):
 
 
 @dataclass(frozen=True)
+class Reaction(Brief):
+    """Forces with which the rest of the world holds bodies at some vertices, differentiable.
+
+    Attributes:
+        vertices: (D,) the vertices.
+        forces: (..., D, 3) on the body at each of them [N].
+        places: (..., D, 3) their positions [m].
+    """
+
+    vertices: torch.Tensor
+    forces: torch.Tensor
+    places: torch.Tensor
+
+    @classmethod
+    def stack(cls, reactions: "Sequence[Reaction | None]") -> "Reaction | None":
+        """Returns those of T steps with a first axis of time; None unless each has one."""
+        known = [one for one in reactions if one is not None]
+        if not known or len(known) < len(reactions):
+            return None
+        return cls(
+            known[0].vertices, *(torch.stack([getattr(one, key) for one in known]) for key in ("forces", "places"))
+        )
+
+    @property
+    def force(self) -> torch.Tensor:
+        """(..., 3) their sum [N]."""
+        return self.forces.sum(-2)
+
+    def moment(self, about: object = (0.0, 0.0, 0.0)) -> torch.Tensor:
+        """Returns their moment (..., 3) about a point (..., 3) [N m, m]."""
+        arms = self.places - torch.as_tensor(about, dtype=self.places.dtype, device=self.places.device)[..., None, :]
+        return torch.linalg.cross(arms, self.forces).sum(-2)
+
+    def at(self, vertices: ArrayLike | torch.Tensor | slice) -> "Reaction":
+        """Returns those at some of the vertices, by number (K,) or in a range (`Scene.vertex_slice`)."""
+        if isinstance(vertices, slice):
+            vertices = range(vertices.stop)[vertices]
+        places = torch.isin(self.vertices, torch.as_tensor(vertices).to(self.vertices))
+        return Reaction(self.vertices[places], self.forces[..., places, :], self.places[..., places, :])
+
+
+@dataclass(frozen=True)
 class State:
     """State of a batch of bodies, robots or scenes: everything on which their next step depends."""
 
@@ -34,7 +77,9 @@ class State:
     # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest. Variables
     # OWNER.NAME are those of robots (`own`), such as commands on their way; a simulator ignores them
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    report: SolveReport | None = field(default=None, compare=False)  # of the step that led here; None for other states
+    # of the step that led here; None for other states: what the solver did, and what held the fixed vertices
+    report: SolveReport | None = field(default=None, compare=False)
+    reaction: Reaction | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         """Shapes of the tensors."""

@@ -6,7 +6,9 @@ from typing import Any
 import torch
 from typing_extensions import override
 
+from ...io.errors import InputError
 from ...stepping.adjoints import AdjointFunction, first_derivatives
+from ...stepping.state import Reaction
 
 
 def barrier_pressure(d: torch.Tensor, reach: float) -> torch.Tensor:
@@ -62,6 +64,7 @@ class ContactForces:
             implicit Euler the slide in the step, for BDF2 not, whose h_e is two thirds of a step.
         sticks: (B, P, O) whether a vertex that is pressed against an obstacle slides less than friction needs to be
             fully developed.
+        places: (B, P, 3) positions of the vertices [m].
     """
 
     obstacles: tuple[str, ...]
@@ -71,3 +74,19 @@ class ContactForces:
     friction: torch.Tensor
     slide: torch.Tensor
     sticks: torch.Tensor
+    places: torch.Tensor
+
+    def reaction(self, obstacle: str | None = None) -> Reaction:
+        """Returns the forces of the barrier and friction on the surface, of one obstacle or of all.
+
+        Raises:
+            InputError: no obstacle of that name.
+        """
+        forces = self.normal + self.friction
+        if obstacle is not None:
+            if obstacle not in self.obstacles:
+                raise InputError(f"there is no obstacle {obstacle!r}: choose one of {', '.join(self.obstacles)}.")
+            forces = forces[:, :, self.obstacles.index(obstacle)]
+        elif self.obstacles:
+            forces = forces.sum(2)
+        return Reaction(self.vertices, forces, self.places)

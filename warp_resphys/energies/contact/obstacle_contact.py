@@ -318,6 +318,7 @@ class BoundContact(BoundEnergy):
             -(most * factor)[..., None] * u,
             y,
             (value_of(values, "contact_load") > 0.0) & (y < slip),
+            at,
         )
 
     def _remembered(self, step: EnergyStep, now: Pose) -> tuple[Pose, Pose]:

@@ -189,4 +189,6 @@ class BoundSurfaceContact(BoundEnergy):
         values = {n: v.double() for n, v in {**shared, **self.begin_step(step)}.items() if v is not None}
         gap, normal, friction, slide = (out.to(x) for out in step.term.forces(values, x.double()))
         sticks = (slide >= 0.0) & (slide < value_of(values, "surface_slip").to(x))
-        return ContactForces((), self._vertices, gap, normal, friction, slide.clamp_min(0.0), sticks)
+        return ContactForces(
+            (), self._vertices, gap, normal, friction, slide.clamp_min(0.0), sticks, x[:, self._vertices]
+        )

@@ -20,6 +20,7 @@ from warp_resphys import (
     Pressure,
     Scene,
     Simulator,
+    SolverSettings,
     SurfaceContact,
     Tendons,
     box_hexahedra,
@@ -27,6 +28,7 @@ from warp_resphys import (
 )
 from warp_resphys.fem.bodies import PointMass
 from warp_resphys.io.errors import InputError
+from warp_resphys.learning.residuals.correction import CorrectedSimulator
 from warp_resphys.mesh import find_chambers
 from warp_resphys.settings.body import Rigid
 
@@ -58,19 +60,18 @@ def test_a_clamp_holds_the_weight_and_its_moment(device):
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
 def test_a_clamp_gives_the_rate_of_change_of_the_momentum(integrator):
-    """Under pushes, of a clamp that moves, and in the middle of midpoint steps of one that stands."""
+    """Under pushes, of a clamp that moves; in the middle of midpoint steps."""
     simulator, clamp = swinging(integrator), BEAM.vertices[select_vertices(BEAM, x=0.0)]
     constants, state = simulator.prepare(), simulator.rest_state()
     mass, weight = constants.mass[..., None], constants.load_mass[..., None] * constants.gravity[:, None]
     for number, push in enumerate(1e-3 * noise(6, 1, len(BEAM.vertices), 3)):
         inputs = PULL.replace(external_force=push)
-        if integrator != "midpoint":
-            way = (1e-3 * math.sin(number), 0.0, 5e-4 * number)
-            inputs = inputs.replace(fixed_positions=simulator.tensor(clamp + way)[None])
+        way = (1e-3 * math.sin(number), 0.0, 5e-4 * number)
+        inputs = inputs.replace(fixed_positions=simulator.tensor(clamp + way)[None])
         after = simulator.step(state, inputs)
         change, velocity = after.v - state.v, after.v
         if integrator == "midpoint":
-            velocity = 0.5 * (after.v + state.v)
+            velocity = (after.q - state.q) / simulator.time_step
         elif state.previous is not None:
             change = 0.5 * (3.0 * after.v - 4.0 * state.v + state.previous[1])
         rate = mass * (change / simulator.time_step + constants.mass_damping[..., None] * velocity)
@@ -126,14 +127,21 @@ def test_gradients_in_steps_and_equilibria():
     check_slopes(lambda given: loss({**given, **constant}, static=True), at_rest, sizes)
 
 
-def test_a_batch_is_what_its_environments_are_alone():
-    """Also of environments whose solves end earlier than those of others, in several threads."""
+def test_a_batch_is_what_its_environments_are_alone(monkeypatch):
+    """Also of environments whose solves end earlier than those of others, in two threads."""
+    monkeypatch.setenv("WARP_RESPHYS_THREADS", "2")
     simulator = swinging(relative_tolerance=1e-9)
     tensions = simulator.tensor([[0.0], [0.5], [1.5], [3.0], [20.0]])
     start = simulator.rest_state(5)
-    held = simulator.reaction(simulator.step(start, Inputs(tendon_tension=tensions)))
+    leaf, weights = tensions.clone().requires_grad_(), noise(len(simulator.fixed), 3)
+    held = simulator.reaction(simulator.step(start, Inputs(tendon_tension=leaf)))
+    (slopes,) = torch.autograd.grad((held.forces * weights).sum(), leaf)
+    assert len(simulator.workspace(5).shards) == 2
     for b in range(5):
-        after = simulator.step(start.select([b]), Inputs(tendon_tension=tensions[b : b + 1]))
+        alone = tensions[b : b + 1].clone().requires_grad_()
+        after = simulator.step(start.select([b]), Inputs(tendon_tension=alone))
+        (slope,) = torch.autograd.grad((simulator.reaction(after).forces * weights).sum(), alone)
+        torch.testing.assert_close(slopes[b], slope[0], rtol=1e-10, atol=1e-10)
         assert torch.equal(held.forces[b], simulator.reaction(after).forces[0])
         assert torch.equal(held.moment()[b], simulator.reaction(after).moment()[0])
 
@@ -179,19 +187,21 @@ def test_grasping_plates_carry_a_cube():
     assert float(left.force[0, 0] + right.force[0, 0]) == pytest.approx(0.0, abs=1e-3 * float(left.force[0, 0]))
 
 
-def test_rigid_clamps_and_muscles_are_held():
-    """A rigid part of which every vertex is fixed, by the name of its region."""
+def test_a_rigid_clamp_is_held_by_the_name_of_its_region():
     base = np.flatnonzero(BEAM.vertices[BEAM.cells].mean(1)[:, 0] < 0.02)
     mesh = replace(BEAM, regions={"base": base, "rest": np.setdiff1d(np.arange(len(BEAM.cells)), base)})
     body = Body(mesh, fixed=np.unique(mesh.cells[base]), rigid={"base": Rigid(density=2000.0)})
     simulator = Simulator(body, SILICONE, relative_tolerance=1e-12)
     state, constants = simulator.static_equilibrium(), simulator.prepare()
     held = simulator.reaction(state, "base").force[0]
-    assert float(held[2]) == pytest.approx(9.80709 * float(constants.load_mass.sum()), rel=1e-10)
+    weight = 9.80709 * float(constants.load_mass.sum())
+    assert held.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-10, abs=1e-10 * weight)
+    tip = replace(mesh, regions={"tip": np.setdiff1d(np.arange(len(BEAM.cells)), base)[-2:]})
+    other = Simulator(clamped(tip), SILICONE)
+    refuses(InputError, "no vertex of 'tip' is fixed", other.reaction, other.step(other.rest_state()), "tip")
 
 
 def test_a_motion_has_the_reaction_of_every_step():
-    """In roll-outs of simulators and robots' scenes: by names of bodies and regions, and none of free bodies."""
     simulator, start = swinging(), swinging().rest_state(2)
     pull = Inputs(tendon_tension=simulator.tensor([[1.0], [2.0]]))
     motion = simulator.rollout(start, 3, pull)
@@ -206,9 +216,63 @@ def test_a_motion_has_the_reaction_of_every_step():
     assert Simulator(Body(BEAM), SILICONE).rollout(start, 1).reaction is None
 
 
+def test_gradients_of_an_equilibrium_with_friction_of_a_tendon():
+    """Its friction depends on the pose without a potential; alone, and beside a loss on the positions."""
+    body = clamped(BEAM, energies=[Tendons(ROUTE, friction=0.5)])
+    simulator = Simulator(body, SILICONE, relative_tolerance=1e-13)
+    weights = noise(2, len(BEAM.vertices), 3)
+
+    def loss(given, positions):
+        balance = simulator.static_equilibrium(Inputs(tendon_tension=given["tendon_tension"]))
+        forces = (simulator.reaction(balance).forces * weights[0, simulator.fixed]).sum()
+        return forces + positions * (balance.q * weights[1]).sum()
+
+    tension = {"tendon_tension": simulator.tensor([[1.0]])}
+    for positions in (0.0, 30.0):
+        check_slopes(
+            lambda given, share=positions: loss(given, share), tension, {"tendon_tension": 1e-3}, tolerance=1e-5
+        )
+
+
+def test_gradients_of_a_clamp_that_moves_and_a_body_that_lands():
+    simulator = on_obstacles(
+        HalfSpace(position=(0.0, 0.0, -5e-4)), mu=0.5, fixed=[8], integrator="bdf2", relative_tolerance=1e-13
+    )
+    start, weights = simulator.rest_positions[simulator.fixed], noise(3, seed=1)
+
+    def loss(given):
+        state, total = simulator.rest_state(), 0.0
+        for number in range(1, 5):
+            inputs = Inputs(fixed_positions=(start + 0.25 * number * given["way"])[None])
+            state = simulator.step(state, inputs, {"youngs_modulus": given["youngs_modulus"]})
+            total = total + (simulator.reaction(state).force[0] * weights).sum()
+        return total
+
+    values = {"way": simulator.tensor([[1e-3, 0.0, -8e-4]]), "youngs_modulus": simulator.tensor([[2.64e5]])}
+    check_slopes(loss, values, {"way": 1e-7, "youngs_modulus": 10.0})
+
+
+def test_an_environment_that_diverges_has_no_reaction_and_the_other_keeps_its_own():
+    simulator = Simulator(clamped(BEAM), SILICONE, solver=SolverSettings(on_failure="count"))
+    thrown = torch.zeros(2, len(BEAM.vertices), 3, dtype=torch.float64)
+    thrown[1, -1] = 1e9
+    corrected = CorrectedSimulator(simulator, lambda state, number: thrown)
+    after = corrected.step(simulator.rest_state(2), 0)
+    alone = CorrectedSimulator(simulator, lambda state, number: thrown[:1]).step(simulator.rest_state(), 0)
+    assert after.lost.tolist() == [False, True]
+    assert torch.equal(simulator.reaction(after).forces[0], simulator.reaction(alone).forces[0])
+    assert simulator.reaction(after).forces[1].isnan().all()
+
+
 def test_wrong_places_are_refused():
     simulator = swinging()
     refuses(InputError, "no step of a body with fixed vertices led to this", simulator.reaction, simulator.rest_state())
     state = simulator.step(simulator.rest_state())
-    refuses(InputError, "no region 'roof'", simulator.reaction, state, "roof")
-    refuses(InputError, "not fixed: give numbers", simulator.reaction, state, [0, len(BEAM.vertices) - 1])
+    refuses(InputError, "no region 'roof': its mesh has no regions", simulator.reaction, state, "roof")
+    whole, some = simulator.reaction(state), simulator.fixed[[3, 0, 5]]
+    chosen = simulator.reaction(state, some)
+    assert chosen.vertices.tolist() == some.tolist()
+    assert torch.equal(chosen.forces, whole.forces[:, [3, 0, 5]])
+    for wrong in ([0, len(BEAM.vertices) - 1], np.ones(len(whole.vertices), dtype=bool), []):
+        refuses(InputError, "there is no reaction at some of these vertices", simulator.reaction, state, wrong)
+    refuses(InputError, "it is a copy, as by `detach`", simulator.reaction, state.detach())

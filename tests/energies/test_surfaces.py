@@ -188,8 +188,9 @@ def thrown(simulator, velocity, spin, batch=1):
     return State(rest.q, v)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("integrator", "rigid"), [("implicit_euler", "layer"), ("bdf2", "")])
+@pytest.mark.parametrize(
+    ("integrator", "rigid"), [("implicit_euler", "layer"), pytest.param("bdf2", "", marks=pytest.mark.slow)]
+)
 def test_gradients_of_an_oblique_impact(integrator, rigid, device):
     """Throws of a turning cube on a plate, which stick, slide and rebound, against central differences."""
     simulator = landing(integrator=integrator, rigid=rigid, device=device)

@@ -5,9 +5,8 @@ At a fixed vertex i the potential (``energies.potential``) does not balance. Its
     r_i = k_i (x_i - y_i) - f_i + sum_e dE_e / dx_i,
 
 is the force with which the clamp holds the vertex: that of the energies, damping included, the rate of change of the
-vertex's momentum, less its share of the loads. The sum over all fixed vertices and contacts with the world is the rate
-of change of the body's momentum in the step, less its weight and the external forces. That of a midpoint step is in its
-middle. Planes of symmetry hold a body, too, which is not included.
+vertex's momentum, less its share of the loads. In a midpoint step, forces and places are those of its middle. What
+planes of symmetry, obstacles and guides in the world exert is not included.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +43,7 @@ def equilibrium(
     start: torch.Tensor,
     fixed_positions: torch.Tensor,
     follows: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, SolveReport, Reaction | None]:
+) -> tuple[torch.Tensor, SolveReport, torch.Tensor]:
     """Returns the minimiser (B, N, 3) of a step's potential, differentiable in the terms and fixed positions.
 
     Args:
@@ -57,8 +56,8 @@ def equilibrium(
         follows: passed to `Minimiser.solve`.
 
     Returns:
-        The last iterate, the solver's report, which says whether it converged (`check_converged`), and the reaction at
-        the fixed vertices, if there are any.
+        The last iterate, the solver's report, which says whether it converged (`check_converged`), and the derivatives
+        (B, D, 3) of the energies by the positions of the fixed vertices, without gradient (`reaction_of`) [N].
     """
     problem = _Minimisation(workspace, purpose, settings, follows, workspace.potential.value_names)
     values = (terms.values[energy][name] for energy, name in problem.names)
@@ -69,7 +68,7 @@ def equilibrium(
     x: torch.Tensor = _Equilibrium.apply(problem, *tensors) if through_graph else problem.minimise(tensors)
     assert problem.report is not None
     assert problem.held is not None
-    return x, problem.report, _reaction(workspace, terms, x, problem.held) if len(workspace.fixed) else None
+    return x, problem.report, problem.held
 
 
 @dataclass
@@ -95,9 +94,10 @@ class _Minimisation:
                 workspace, minimiser, follows, self.names, *(_rows(tensor, rows) for tensor in (start, *others))
             )
 
-        results = self._in_shards(
-            lambda workspace: workspace.minimiser(self.purpose, self.settings), work, start[0].numel()
-        )
+        def prepare(workspace: Workspace) -> Minimiser:
+            return workspace.minimiser(self.purpose, self.settings)
+
+        results = _in_shards(self.workspace, prepare, work, start[0].numel())
         solutions, reports, held = zip(*results, strict=True)
         self.report = _joined(reports)
         self.held = held[0] if len(results) == 1 else torch.cat(held)
@@ -122,19 +122,20 @@ class _Minimisation:
             return _adjoint(workspace, hessians, self.names, needed, *(_rows(t, rows) for t in (gradient, x, *terms)))
 
         try:
-            gradients = self._in_shards(prepare, work, gradient[0].numel())
+            gradients = _in_shards(self.workspace, prepare, work, gradient[0].numel())
         except ConvergenceError as error:
             raise ConvergenceError(str(error), x.clone(), None) from None
         return [_join_gradients(*pair) for pair in zip((None, *terms), zip(*gradients, strict=True), strict=True)]
 
-    def _in_shards(
-        self, prepare: Callable[[Workspace], P], work: Callable[[slice, Workspace, P], T], unknowns: int
-    ) -> list[T]:
-        """Returns the results of work in all shards, each with what was prepared for it in this thread."""
-        with self.workspace.potential.lock:
-            parts = [(rows, workspace, prepare(workspace)) for rows, workspace in self.workspace.parts]
-            with threads_for(unknowns, len(parts)):
-                return in_threads(lambda part: work(*part), parts)
+
+def _in_shards(
+    workspace: Workspace, prepare: Callable[[Workspace], P], work: Callable[[slice, Workspace, P], T], unknowns: int
+) -> list[T]:
+    """Returns the results of work in all shards, each with what was prepared for it in this thread."""
+    with workspace.potential.lock:
+        parts = [(rows, shard, prepare(shard)) for rows, shard in workspace.parts]
+        with threads_for(unknowns, len(parts)):
+            return in_threads(lambda part: work(*part), parts)
 
 
 class _Equilibrium(AdjointFunction):
@@ -165,19 +166,21 @@ class _Equilibrium(AdjointFunction):
         return None, None, *ctx.problem.differentiate(gradient, x, terms, ctx.needs_input_grad[2:])
 
 
-def _reaction(workspace: Workspace, terms: StepTerms, x: torch.Tensor, held: torch.Tensor) -> Reaction:
-    """Returns the reaction at the fixed vertices in a solve, differentiable.
+def reaction_of(workspace: Workspace, terms: StepTerms, x: torch.Tensor, held: torch.Tensor) -> Reaction | None:
+    """Returns the reaction at the fixed vertices in a solve, differentiable; None without such vertices.
 
     Args:
         workspace: of the batch.
         terms: of the solve.
         x: (B, N, 3) its solution [m].
-        held: (B, D, 3) derivatives of the energies by the fixed positions there [N].
+        held: (B, D, 3) from `equilibrium` [N].
     """
-    fixed, held = workspace.fixed, held.to(x)
+    if not len(fixed := workspace.fixed):
+        return None
+    held = held.to(x)
     if torch.is_grad_enabled():
-        names = workspace.potential.value_names
-        held = _Held.apply(workspace, terms, held, x, *(terms.values[energy][name] for energy, name in names))
+        values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
+        held = _Held.apply(workspace, held, x, terms.target, terms.inertia, terms.force, *values)
     places = x[:, fixed]
     inertia = terms.inertia[:, fixed, None] * (places - terms.target[:, fixed])
     return Reaction(fixed, held + inertia - terms.force[:, fixed], places)
@@ -186,42 +189,42 @@ def _reaction(workspace: Workspace, terms: StepTerms, x: torch.Tensor, held: tor
 class _Held(AdjointFunction):
     """r = sum_e dE_e / dx at fixed vertices. For a loss with gradient z there, dL/dx = K z, dL/dtheta = z . dr/dtheta.
 
-    K is the stiffness, and theta are the values of the energies.
+    K is the stiffness, and theta are the values of the energies. Inertia and loads are added later.
     """
 
     @override
     @staticmethod
-    def forward(
-        ctx: Any, workspace: Workspace, terms: StepTerms, held: torch.Tensor, x: torch.Tensor, *values: Any
-    ) -> torch.Tensor:
-        ctx.workspace, ctx.names = workspace, workspace.potential.value_names
-        ctx.save_for_backward(terms.target, terms.inertia, terms.force, x, *values)
+    def forward(ctx: Any, workspace: Workspace, held: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
+        ctx.workspace = workspace
+        ctx.save_for_backward(*tensors)
         return held.clone()
 
     @override
     @staticmethod
     @first_derivatives
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        target, inertia, force, x, *values = ctx.saved_tensors
-        needed = ctx.needs_input_grad
-        potential: IncrementalPotential = ctx.workspace.potential
-        with potential.lock:
-            potential.set_terms(StepTerms.of(ctx.names, target, inertia, force, *values))
-            potential.positions.copy_(x)
+        tensors: list[Any] = [None if tensor is None else tensor.detach() for tensor in ctx.saved_tensors]
+        x, *terms = tensors
+        by_position, _, _, _, *by_values = ctx.needs_input_grad[2:]
+        names = ctx.workspace.potential.value_names
+
+        def work(rows: slice, workspace: Workspace, _: None) -> tuple[torch.Tensor | None, ...]:
+            potential, mine = workspace.potential, StepTerms.of(names, *(_rows(tensor, rows) for tensor in terms))
+            potential.set_terms(mine)
+            potential.positions.copy_(x[rows])
             along = torch.zeros_like(potential.positions)
-            along[:, ctx.workspace.fixed] = gradient.double()
-            by_position = None
-            if needed[3]:
+            along[:, workspace.fixed] = gradient[rows].double()
+            if by_position:
                 potential.update_tangent()
-                by_position = potential.stiffness_product(along).to(x)
-            slopes = potential.value_adjoint(along) if any(needed[4:]) else []
-        by_values: list[torch.Tensor | None] = []
-        for (energy, name), value, is_needed in zip(ctx.names, values, needed[4:], strict=True):
-            slope = slopes[energy].get(name) if is_needed else None
-            if slope is not None:
-                slope = -(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope).to(value)
-            by_values.append(slope)
-        return None, None, None, by_position, *by_values
+            slopes = _by_values(potential, names, mine, by_values, along)
+            product = potential.stiffness_product(along).to(x) if by_position else None
+            return product, *(None if slope is None else -slope for slope in slopes)
+
+        found = _in_shards(ctx.workspace, lambda shard: shard.potential.prepare_adjoint(), work, x[0].numel())
+        product, *slopes = (
+            _join_gradients(*pair) for pair in zip((x, *terms[3:]), zip(*found, strict=True), strict=True)
+        )
+        return None, None, product, None, None, None, *slopes
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
@@ -293,21 +296,27 @@ def _adjoint(
     gradient = gradient.double()
     z, product = _adjoint_solution(potential, hessians, gradient)
     fixed, target, inertia, force, *values = needed
-    slopes = potential.value_adjoint(z) if any(values) else None
-    by_values: list[torch.Tensor | None] = []
-    for (energy, name), is_needed in zip(names, values, strict=True):
-        value, slope = terms.values[energy][name], slopes[energy].get(name) if slopes else None
-        if value is None or slope is None or not is_needed:
-            by_values.append(None)
-        else:
-            by_values.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
     return (
         (gradient - product)[:, workspace.fixed] if fixed else None,
         potential.restrict(terms.inertia[..., None] * z) if target else None,
         -(z * (x - terms.target)).sum(-1) * potential.free_mask if inertia else None,
         z if force else None,
-        *by_values,
+        *_by_values(potential, names, terms, values, z),
     )
+
+
+def _by_values(
+    potential: IncrementalPotential, names: Names, terms: StepTerms, needed: Sequence[bool], z: torch.Tensor
+) -> list[torch.Tensor | None]:
+    """Returns the needed -z . d residual / d value at the potential's positions, for an adjoint z (B, N, 3) [m]."""
+    slopes, found = potential.value_adjoint(z) if any(needed) else None, list[torch.Tensor | None]()
+    for (energy, name), is_needed in zip(names, needed, strict=True):
+        value, slope = terms.values[energy][name], slopes[energy].get(name) if slopes else None
+        if value is None or slope is None or not is_needed:
+            found.append(None)
+        else:
+            found.append(slope.sum(0, keepdim=True) if len(value) < len(slope) else slope)
+    return found
 
 
 def _adjoint_solution(

@@ -190,7 +190,7 @@ class Simulator:
                 parameters; they affect the result only within the solver's tolerance [m].
 
         Returns:
-            The new state, differentiable, with the solver's report.
+            The new state, differentiable, with the solver's report and the reaction at fixed vertices.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
@@ -245,14 +245,20 @@ class Simulator:
 
         Args:
             state: state from `step` or `static_equilibrium`, or a motion from `rollout`, of which it is for every step.
-            at: a region of the mesh, a body of a scene, or numbers of fixed vertices; None: all of these.
+            at: a region of the mesh or a body of a scene, with vertices that it shares with others, or numbers of fixed
+                vertices; None: all of these.
 
         Raises:
             InputError: no step led to the state, or nothing holds the body there.
         """
         if state.reaction is None:
-            raise InputError("no step of a body with fixed vertices led to this state: it has no reaction.")
-        return state.reaction if at is None else state.reaction.at(self.body.fixed_at(at))
+            raise InputError(
+                "no step of a body with fixed vertices led to this state, or it is a copy, as by `detach`: it has no "
+                "reaction."
+            )
+        if at is None:
+            return state.reaction
+        return state.reaction.at(self.body.fixed_in(at) if isinstance(at, str) else at)
 
     def is_held(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None

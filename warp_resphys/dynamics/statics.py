@@ -14,9 +14,9 @@ from ..energies.potential import IncrementalPotential, StepTerms
 from ..io.errors import ConvergenceError
 from ..io.progress import QUIET_SECONDS, Progress
 from ..stepping.inputs import Inputs
-from ..stepping.state import Constants, Reaction, SolveReport, State
+from ..stepping.state import Constants, SolveReport, State
 from .energy_set import SimulatorStep
-from .equilibrium import equilibrium
+from .equilibrium import equilibrium, reaction_of
 from .nonlinear_solver import check_converged
 from .time_step import TimeStep
 
@@ -36,7 +36,7 @@ Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 class StaticEquilibrium(TimeStep):
     """A static equilibrium under constant inputs after a state: a step without end, in which inertia has no part."""
 
-    _reaction: Reaction | None = None  # in the last equilibrium
+    _held: torch.Tensor  # what `equilibrium` returns of the last one [N]
 
     @override
     def _begin(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
@@ -61,8 +61,10 @@ class StaticEquilibrium(TimeStep):
 
     @override
     def finish(self, x: torch.Tensor) -> State:
-        memory = self.equations.energies.end_step(self.step, x, x)
-        return State(x, torch.zeros_like(x), memory=memory, reaction=self._reaction)
+        energies = self.equations.energies
+        terms = self.terms(near=x if energies.follow_pose else None)
+        reaction = reaction_of(self.workspace, terms, x, self._held)
+        return State(x, torch.zeros_like(x), memory=energies.end_step(self.step, x, x), reaction=reaction)
 
     @override
     def solve(self, near: torch.Tensor | None = None) -> State:
@@ -94,7 +96,7 @@ class StaticEquilibrium(TimeStep):
         settings = equations.settings.changed(name="newton", on_failure="raise", max_iterations=most)
         terms, fixed = self.terms(share, near), self.fixed_positions(share)
         with _progress_of(workspace.parts[0][1].potential, share, most):
-            x, report, self._reaction = equilibrium(workspace, "statics", settings, terms, start, fixed)
+            x, report, self._held = equilibrium(workspace, "statics", settings, terms, start, fixed)
         check_converged(settings, report, x)
         return equations.coordinates.expand(x), report
 

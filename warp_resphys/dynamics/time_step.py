@@ -6,10 +6,10 @@ import torch
 
 from ..energies.potential import StepTerms
 from ..stepping.inputs import Inputs
-from ..stepping.state import Constants, State
+from ..stepping.state import Constants, Reaction, State
 from .energy_set import SimulatorStep
 from .equations import EquationsOfMotion
-from .equilibrium import equilibrium
+from .equilibrium import equilibrium, reaction_of
 
 
 class TimeStep:
@@ -55,6 +55,20 @@ class TimeStep:
         moved = torch.zeros_like(now) if fixed is None else fixed - now
         return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
 
+    def _driven(self, reaction: Reaction | None) -> Reaction | None:
+        """Returns a reaction whose inertia is that of the known velocities of fixed vertices (`finish`).
+
+        In the middle of a step, that of free ones changes twice as fast.
+        """
+        step, fixed = self.step, self.equations.fixed
+        if reaction is None or step.stage.end == 1.0:
+            return reaction
+        mass, inputs = step.constants.mass, step.inputs
+        mass = (mass if inputs.attached_mass is None else mass + inputs.attached_mass)[:, fixed, None]
+        velocity = (reaction.places - step.state.q[:, fixed]) / step.stage.step
+        excess = mass * (velocity - step.state.v[:, fixed]) / self.equations.time_step
+        return replace(reaction, forces=reaction.forces - excess)
+
     def solve(self, near: torch.Tensor | None = None) -> State:
         """Returns the new state, differentiable, whose report says whether the solve has converged.
 
@@ -64,7 +78,8 @@ class TimeStep:
         equations, workspace, state = self.equations, self.workspace, self.step.state
         start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
         terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
-        x, report, reaction = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
+        x, report, held = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
+        reaction = self._driven(reaction_of(workspace, terms, x, held))
         new = replace(self.finish(equations.coordinates.expand(x)), report=report, reaction=reaction)
         workspace.record_positions(new.q)
         return new

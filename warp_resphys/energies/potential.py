@@ -66,10 +66,10 @@ class IncrementalPotential(Launcher):
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
-        evaluation: launches that evaluate at ``positions`` and set ``residual`` and the following four sums.
+        evaluation: launches that evaluate at ``positions`` and set ``residual``, ``held`` and the following four sums.
             Environments that are not ``active`` keep ``held``, energies and norm of the residual, and have no valid
             ``residual``.
-        held: (B, N, 3) derivatives of the energies by the positions of fixed vertices, where these are [N].
+        held: (B, N, 3) derivatives of the energies by the positions of fixed vertices; zero elsewhere [N].
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
@@ -383,7 +383,7 @@ class IncrementalPotential(Launcher):
         """Returns -z . d residual / d value, (B, *shape), at ``positions`` for the values of each term, by name.
 
         Args:
-            adjoint: (B, N, 3) z = H^-1 dL/dx, zero at fixed vertices [m].
+            adjoint: (B, N, 3) z [m].
         """
         self.prepare_adjoint()
         self._direction.copy_(adjoint)

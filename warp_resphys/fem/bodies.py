@@ -229,27 +229,22 @@ class Body:
         """(D,) vertices with prescribed positions, in ascending order."""
         return np.asarray(self.fixed)
 
-    def fixed_at(self, at: str | ArrayLike) -> NDArray[np.int64]:
-        """Returns fixed vertices (K,) by the name of a region or, in a scene, of a body, or by number.
+    def fixed_in(self, part: str) -> NDArray[np.int64]:
+        """Returns the fixed vertices (K,) of a region, or of a body of a scene.
 
         Raises:
             InputError: an unknown name, or nothing that is fixed.
         """
-        if not isinstance(at, str):
-            chosen = _vertex_indices(at, self.n_vertices, "fixed vertices")
-            if not np.isin(chosen, self.fixed_vertices).all():
-                raise InputError("some of these vertices are not fixed: give numbers of fixed vertices.")
-            return chosen
         named: dict[str, NDArray[np.int64]] = {}
         for name, member, first in self.members:
             named |= {name: first + np.arange(member.n_vertices)} if name else {}
             for region, cells in member.mesh.regions.items():
                 named[f"{name}_{region}" if name else region] = first + np.unique(member.mesh.cells[cells])
-        if at not in named:
-            known = ", ".join(named) or "regions, of which the mesh has none, or vertices"
-            raise InputError(f"the body has no region {at!r}: choose one of {known}.")
-        if not len(found := np.intersect1d(self.fixed_vertices, named[at])):
-            raise InputError(f"no vertex of {at!r} is fixed: fix some, or choose another region.")
+        if part not in named:
+            known = f"choose one of {', '.join(named)}" if named else "its mesh has no regions"
+            raise InputError(f"the body has no region {part!r}: {known}.")
+        if not len(found := np.intersect1d(self.fixed_vertices, named[part])):
+            raise InputError(f"no vertex of {part!r} is fixed: fix some, or choose another region.")
         return found
 
     @cached_property

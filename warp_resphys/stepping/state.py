@@ -55,16 +55,26 @@ class Reaction(Brief):
         return self.forces.sum(-2)
 
     def moment(self, about: object = (0.0, 0.0, 0.0)) -> torch.Tensor:
-        """Returns their moment (..., 3) about a point (..., 3) [N m, m]."""
+        """Returns their moment (..., 3) [N m] about a point (..., 3) [m]."""
         arms = self.places - torch.as_tensor(about, dtype=self.places.dtype, device=self.places.device)[..., None, :]
         return torch.linalg.cross(arms, self.forces).sum(-2)
 
     def at(self, vertices: ArrayLike | torch.Tensor | slice) -> "Reaction":
-        """Returns those at some of the vertices, by number (K,) or in a range (`Scene.vertex_slice`)."""
+        """Returns those at some of the vertices: by number (K,), in that order, or all in a range such as of a body.
+
+        Raises:
+            InputError: no numbers, or a vertex at which there is none.
+        """
+        place = {vertex: k for k, vertex in enumerate(self.vertices.tolist())}
         if isinstance(vertices, slice):
-            vertices = range(vertices.stop)[vertices]
-        places = torch.isin(self.vertices, torch.as_tensor(vertices).to(self.vertices))
-        return Reaction(self.vertices[places], self.forces[..., places, :], self.places[..., places, :])
+            chosen = sorted(place.keys() & {*range(*vertices.indices(1 + max(place, default=0)))})
+        else:
+            numbers = torch.as_tensor(vertices).reshape(-1)
+            if numbers.is_floating_point() or numbers.dtype == torch.bool or not place.keys() >= {*numbers.tolist()}:
+                raise InputError("there is no reaction at some of these vertices: give numbers of those of `vertices`.")
+            chosen = numbers.tolist()
+        rows = [place[vertex] for vertex in chosen]
+        return Reaction(self.vertices[rows], self.forces[..., rows, :], self.places[..., rows, :])
 
 
 @dataclass(frozen=True)
@@ -77,8 +87,9 @@ class State:
     # (B, ...) by name (`energies.base.Memory`); a missing variable has its value in a body long at rest. Variables
     # OWNER.NAME are those of robots (`own`), such as commands on their way; a simulator ignores them
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    # of the step that led here; None for other states: what the solver did, and what held the fixed vertices
+    # of the step that led here; None for other states, and for copies by `map`, such as `detach`
     report: SolveReport | None = field(default=None, compare=False)
+    # what held the fixed vertices in the step or equilibrium that led here; None as above, meaningless where it failed
     reaction: Reaction | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
@@ -154,7 +165,7 @@ class State:
         return State.from_tensors(joined)
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
-        """Returns the state with a function applied to every tensor, without report."""
+        """Returns the state with a function applied to every tensor, without report and reaction."""
         return State.from_tensors({name: change(tensor) for name, tensor in self.tensors().items()})
 
     def detach(self) -> "State":

@@ -85,7 +85,10 @@ class ContactForces:
         forces = self.normal + self.friction
         if obstacle is not None:
             if obstacle not in self.obstacles:
-                raise InputError(f"there is no obstacle {obstacle!r}: choose one of {', '.join(self.obstacles)}.")
+                known = (
+                    f"choose one of {', '.join(self.obstacles)}" if self.obstacles else "bodies touch one another here"
+                )
+                raise InputError(f"there is no obstacle {obstacle!r}: {known}.")
             forces = forces[:, :, self.obstacles.index(obstacle)]
         elif self.obstacles:
             forces = forces.sum(2)

@@ -101,7 +101,11 @@ class CorrectedSimulator:
             where = lost.view(-1, *[1] * (value.ndim - 1))
             return torch.where(where, rest.get(name, value.new_zeros(())), value)
 
-        return State.from_tensors({name: masked(name, value) for name, value in state.tensors().items()})
+        reset = State.from_tensors({name: masked(name, value) for name, value in state.tensors().items()})
+        if (reaction := state.reaction) is not None:
+            forces = torch.where(lost[:, None, None], torch.nan, reaction.forces)
+            reset = replace(reset, reaction=replace(reaction, forces=forces))
+        return reset
 
 
 def known_positions(state: State) -> torch.Tensor:

@@ -39,6 +39,9 @@ def test_a_series_for_paraview_has_every_step(trajectory, tmp_path):
     last = meshio.read(tmp_path / "beam" / "beam_3.vtu")
     assert np.allclose(last.points, trajectory.q[3, 0].numpy())
     assert np.allclose(last.point_data["velocity"], trajectory.v[3, 0].numpy())
+    held = last.point_data["reaction"]
+    assert np.array_equal(np.flatnonzero(held.any(1)), trajectory.reaction.vertices.numpy())
+    assert np.allclose(held.sum(0), trajectory.reaction.force[2, 0].numpy())
 
 
 PLATE = Box(position=(0.09, 0.01, -0.015), edges=(0.02, 0.04, 0.02), moves=True)

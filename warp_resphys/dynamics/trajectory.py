@@ -191,8 +191,8 @@ class Motion:
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
-        The vertices have ``displacement`` and ``velocity``. Markers are in ``NAME_markers.pvd``, and obstacles in
-        ``NAME_obstacles.pvd``, a half-space as a plate.
+        The vertices have ``displacement``, ``velocity`` and, if it is known, the ``reaction`` in the step that led there
+        [N]. Markers are in ``NAME_markers.pvd``, and obstacles in ``NAME_obstacles.pvd``, a half-space as a plate.
 
         Args:
             path: path of the ``.pvd`` file.
@@ -203,7 +203,13 @@ class Motion:
             DataFileError: the files cannot be written.
         """
         q, v, markers = (self._of(values, environment) for values in (self.q, self.v, self._labelled))
-        return write_vtk(Path(path), self.body.mesh, self.times, q, v, markers, self.surface(environment).solids)
+        fields = dict[str, FloatArray]()
+        if self.reaction is not None:
+            fields["reaction"] = np.zeros_like(q)
+            fields["reaction"][1:, self.reaction.vertices.cpu()] = self._of(self.reaction.forces, environment)
+        return write_vtk(
+            Path(path), self.body.mesh, self.times, q, v, markers, self.surface(environment).solids, fields
+        )
 
     def write_usd(self, path: str | Path, environment: int = 0) -> Path:
         """Writes the moving surfaces of the body and its obstacles, and its markers, to a USD file (extra ``usd``).

@@ -53,6 +53,7 @@ def write_vtk(
     v: FloatArray,
     markers: FloatArray,
     obstacles: Mapping[str, Solid],
+    fields: Mapping[str, FloatArray],
 ) -> Path:
     """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
@@ -65,11 +66,13 @@ def write_vtk(
         markers: (T + 1, M, 3) markers, written to ``NAME_markers.pvd`` unless M is 0 [m].
         obstacles: corners (T + 1, P, 3) [m] and triangles (S, 3) by name, counter-clockwise seen from outside; written
             to ``NAME_obstacles.pvd`` if there are any, numbered by ``obstacle``.
+        fields: further vectors (T + 1, N, 3) at the vertices, by name.
     """
     if path.suffix != ".pvd":
         raise InputError(f"{path} does not end in .pvd: give such a name, which ParaView opens as a time series.")
-    fields = ({"displacement": x - mesh.vertices, "velocity": w} for x, w in zip(q, v, strict=True))
-    _write_series(path, times, q, (mesh.element.file_type, mesh.cells), fields)
+    every = {"displacement": q - mesh.vertices, "velocity": v, **fields}
+    at_times = ({name: values[number] for name, values in every.items()} for number in range(len(times)))
+    _write_series(path, times, q, (mesh.element.file_type, mesh.cells), at_times)
     dots = np.arange(markers.shape[1])
     if len(dots):
         place = path.with_name(f"{path.stem}_markers.pvd")

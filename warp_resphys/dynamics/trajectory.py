@@ -191,8 +191,9 @@ class Motion:
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
         """Writes a time series for ParaView: a ``.pvd`` file, and a folder of the same name with one file per step.
 
-        The vertices have ``displacement``, ``velocity`` and, if it is known, the ``reaction`` in the step that led there
-        [N]. Markers are in ``NAME_markers.pvd``, and obstacles in ``NAME_obstacles.pvd``, a half-space as a plate.
+        The vertices have ``displacement``, ``velocity`` and, if it is known, the ``reaction`` in the step that led
+        there [N]. Markers are in ``NAME_markers.pvd``, and obstacles in ``NAME_obstacles.pvd``, a half-space as
+        a plate.
 
         Args:
             path: path of the ``.pvd`` file.

@@ -87,6 +87,10 @@ class TestRollouts:
             for now in pressure:
                 state = robot.step(state, pressure=now)
             assert torch.equal(state.q, motion.q[-1])
+            assert torch.equal(state.reaction.forces, motion.reaction.forces[-1])
+            constants = robot.constants
+            weight = (constants.load_mass[..., None] * constants.gravity[:, None]).sum(1)
+            torch.testing.assert_close(start.reaction.force, -weight.expand(2, -1), rtol=0.0, atol=1e-6)
             one = robot.rollout(start.select([1]), pressure=pressure[:, 1:])
             further = robot.rollout(motion.final, 2, pressure=[HIGH, 0.0])
         torch.testing.assert_close(one.q[:, 0], motion.q[:, 1], atol=1e-9, rtol=0.0)

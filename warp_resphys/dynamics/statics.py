@@ -61,10 +61,12 @@ class StaticEquilibrium(TimeStep):
 
     @override
     def finish(self, x: torch.Tensor) -> State:
-        energies = self.equations.energies
-        terms = self.terms(near=x if energies.follow_pose else None)
-        reaction = reaction_of(self.workspace, terms, x, self._held)
-        return State(x, torch.zeros_like(x), memory=energies.end_step(self.step, x, x), reaction=reaction)
+        return State(x, torch.zeros_like(x), memory=self.equations.energies.end_step(self.step, x, x))
+
+    def _solved(self, x: torch.Tensor) -> State:
+        """Returns the state of the last `_balance`, with its reaction."""
+        terms = self.terms(near=x if self.equations.energies.follow_pose else None)
+        return replace(self.finish(x), reaction=reaction_of(self.workspace, terms, x, self._held))
 
     @override
     def solve(self, near: torch.Tensor | None = None) -> State:
@@ -80,12 +82,12 @@ class StaticEquilibrium(TimeStep):
         limited = equations.settings.max_iterations < _MOST_ITERATIONS
         rest, guess = equations.rest_positions.expand_as(state.q), (state.q if near is None else near).detach()
         if not equations.energies.follow_pose:
-            return self.finish(find_equilibrium(self._balance, rest, guess, limited))
+            return self._solved(find_equilibrium(self._balance, rest, guess, limited))
         try:
             x = find_equilibrium(partial(self._balance, near=guess), rest, guess, limited)
         except ConvergenceError:  # The guess is far away.
             x = find_equilibrium(self._balance, rest, guess, limited)
-        return self.finish(settle(lambda at: self._balance(1.0, at.detach(), at)[0], x))
+        return self._solved(settle(lambda at: self._balance(1.0, at.detach(), at)[0], x))
 
     def _balance(
         self, share: float, start: torch.Tensor, near: torch.Tensor | None = None

@@ -48,7 +48,7 @@ def totals(
     vertex_energy: wp.array2d[wp.float64],  # (B, N) [J]
     point_energy: wp.array2d[wp.float64],  # (B, P) [J]
     residual_out: wp.array2d[wp.vec3d],  # (B, N) set to zero at fixed vertices [N]
-    held_out: wp.array2d[wp.vec3d],  # (B, N) what it was there [N]
+    fixed_out: wp.array2d[wp.vec3d],  # (B, N) the residual at fixed vertices before [N]
     energy_out: wp.array[wp.float64],  # (B) [J]
     size_out: wp.array[wp.float64],  # (B) sum of the energies' absolute values [J]
     norm_out: wp.array[wp.float64],  # (B) of the residual [N]
@@ -58,7 +58,7 @@ def totals(
     energy, size, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     for i in range(lane, free.shape[0], wp.block_dim()):
         if free[i] == wp.float64(0.0) and active[b] != 0:
-            held_out[b, i] = residual_out[b, i]
+            fixed_out[b, i] = residual_out[b, i]
         value = free[i] * residual_out[b, i]
         residual_out[b, i] = value
         square += wp.dot(value, value)

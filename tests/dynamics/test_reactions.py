@@ -49,13 +49,13 @@ def swinging(integrator="implicit_euler", device="cpu", **options):
 def test_a_clamp_holds_the_weight_and_its_moment(device):
     simulator = swinging(device=device)
     balance = simulator.static_equilibrium(PULL)
-    held, constants = simulator.reaction(balance), simulator.prepare()
+    reaction, constants = simulator.reaction(balance), simulator.prepare()
     weight = constants.load_mass[..., None] * constants.gravity[:, None]
     arms = balance.q - simulator.tensor([0.01, 0.02, 0.03])
-    torch.testing.assert_close(held.force, -weight.sum(1), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(reaction.force, -weight.sum(1), rtol=1e-10, atol=1e-10)
     moment = -torch.linalg.cross(arms, weight.expand_as(arms)).sum(1)
-    torch.testing.assert_close(held.moment((0.01, 0.02, 0.03)), moment, rtol=1e-9, atol=1e-10)
-    assert held.vertices.tolist() == simulator.fixed.tolist()
+    torch.testing.assert_close(reaction.moment((0.01, 0.02, 0.03)), moment, rtol=1e-9, atol=1e-10)
+    assert reaction.vertices.tolist() == simulator.fixed.tolist()
 
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "midpoint"])
@@ -76,8 +76,8 @@ def test_a_clamp_gives_the_rate_of_change_of_the_momentum(integrator):
             change = 0.5 * (3.0 * after.v - 4.0 * state.v + state.previous[1])
         rate = mass * (change / simulator.time_step + constants.mass_damping[..., None] * velocity)
         expected = (rate - weight - push).sum(1)
-        held = simulator.reaction(after).force
-        torch.testing.assert_close(held, expected, rtol=0.0, atol=1e-8 * float(expected.norm()))
+        reaction = simulator.reaction(after).force
+        torch.testing.assert_close(reaction, expected, rtol=0.0, atol=1e-8 * float(expected.norm()))
         state = after
 
 
@@ -90,8 +90,8 @@ def test_the_ends_of_a_chamber_are_held_against_pressure_times_area():
     state = simulator.static_equilibrium(Inputs(pressure=torch.full((1, len(chambers)), 2e4).double()))
     area = BRICK / 0.01  # of the chambers from 10 to 30 mm and from 40 to 50 mm
     for x, pushed in ((0.01, -1.0), (0.03, 1.0), (0.04, -1.0), (0.05, 1.0)):
-        held = simulator.reaction(state, select_vertices(soft.mesh, x=x)).force[0]
-        assert held.numpy() == pytest.approx([-pushed * 2e4 * area, 0.0, 0.0], rel=1e-12, abs=1e-12)
+        reaction = simulator.reaction(state, select_vertices(soft.mesh, x=x)).force[0]
+        assert reaction.numpy() == pytest.approx([-pushed * 2e4 * area, 0.0, 0.0], rel=1e-12, abs=1e-12)
 
 
 def test_gradients_in_steps_and_equilibria():
@@ -116,8 +116,8 @@ def test_gradients_in_steps_and_equilibria():
             return (simulator.reaction(balance).forces * weights).sum((1, 2))
         first = simulator.step(simulator.state(simulator.rest_state(2).q, given["v"]), inputs, parameters)
         after = simulator.step(first, inputs, parameters)
-        held = simulator.reaction(after)
-        return (held.forces * weights).sum((1, 2)) + 10.0 * held.moment((0.0, 0.01, 0.02)).sum(1)
+        reaction = simulator.reaction(after)
+        return (reaction.forces * weights).sum((1, 2)) + 10.0 * reaction.moment((0.0, 0.01, 0.02)).sum(1)
 
     sizes = {"youngs_modulus": 30.0, "stiffness_damping": 1e-6, "tendon_tension": 1e-4, "attached_mass": 1e-7}
     sizes |= {"external_force": 1e-5, "v": 1e-4}
@@ -134,16 +134,16 @@ def test_a_batch_is_what_its_environments_are_alone(monkeypatch):
     tensions = simulator.tensor([[0.0], [0.5], [1.5], [3.0], [20.0]])
     start = simulator.rest_state(5)
     leaf, weights = tensions.clone().requires_grad_(), noise(len(simulator.fixed), 3)
-    held = simulator.reaction(simulator.step(start, Inputs(tendon_tension=leaf)))
-    (slopes,) = torch.autograd.grad((held.forces * weights).sum(), leaf)
+    reaction = simulator.reaction(simulator.step(start, Inputs(tendon_tension=leaf)))
+    (slopes,) = torch.autograd.grad((reaction.forces * weights).sum(), leaf)
     assert len(simulator.workspace(5).shards) == 2
     for b in range(5):
         alone = tensions[b : b + 1].clone().requires_grad_()
         after = simulator.step(start.select([b]), Inputs(tendon_tension=alone))
         (slope,) = torch.autograd.grad((simulator.reaction(after).forces * weights).sum(), alone)
         torch.testing.assert_close(slopes[b], slope[0], rtol=1e-10, atol=1e-10)
-        assert torch.equal(held.forces[b], simulator.reaction(after).forces[0])
-        assert torch.equal(held.moment()[b], simulator.reaction(after).moment()[0])
+        assert torch.equal(reaction.forces[b], simulator.reaction(after).forces[0])
+        assert torch.equal(reaction.moment()[b], simulator.reaction(after).moment()[0])
 
 
 def test_a_floor_carries_a_block_and_a_wall_nothing():
@@ -152,9 +152,9 @@ def test_a_floor_carries_a_block_and_a_wall_nothing():
     state = simulator.static_equilibrium()
     contact = simulator.contacts(state, state)["obstacles"]
     for obstacle, expected in (("floor", WEIGHT), ("wall", 0.0), (None, WEIGHT)):
-        held = contact.reaction(obstacle)
-        assert held.force[0].numpy() == pytest.approx([0.0, 0.0, expected], abs=1e-6 * WEIGHT)
-        assert held.moment((0.01, 0.01, 0.0))[0].numpy() == pytest.approx(np.zeros(3), abs=1e-6 * WEIGHT)
+        reaction = contact.reaction(obstacle)
+        assert reaction.force[0].numpy() == pytest.approx([0.0, 0.0, expected], abs=1e-6 * WEIGHT)
+        assert reaction.moment((0.01, 0.01, 0.0))[0].numpy() == pytest.approx(np.zeros(3), abs=1e-6 * WEIGHT)
     refuses(InputError, "no obstacle 'roof': choose one of floor, wall", contact.reaction, "roof")
     refuses(InputError, "it has no reaction", simulator.reaction, state)
 
@@ -163,11 +163,11 @@ def test_grasping_plates_carry_a_cube():
     """Two plates close on a rigid cube: friction and the clamps carry its weight, and the clamps press alike."""
     plate, cube = box_hexahedra((0.004, 0.02, 0.02), (1, 2, 2)), box_hexahedra((0.01, 0.01, 0.01), (1, 1, 1))
     shifted = replace(plate, vertices=plate.vertices + (0.0148, 0.0, 0.0))
-    held = replace(cube, vertices=cube.vertices + (0.0044, 0.005, 0.005))
+    raised = replace(cube, vertices=cube.vertices + (0.0044, 0.005, 0.005))
     bodies = {
         "left": Body(plate, fixed=select_vertices(plate, x=0.0)),
         "right": Body(shifted, fixed=select_vertices(shifted, x=0.0188)),
-        "cube": Body.rigid_body(held, Rigid(density=1000.0)),
+        "cube": Body.rigid_body(raised, Rigid(density=1000.0)),
     }
     scene = Scene(bodies, SurfaceContact(1e5, 0.8, slip_speed=1e-4))
     simulator = Simulator(scene, SOFT, time_step=0.005, gravity=(0.0, 0.0, -G), relative_tolerance=1e-9)
@@ -193,9 +193,9 @@ def test_a_rigid_clamp_is_held_by_the_name_of_its_region():
     body = Body(mesh, fixed=np.unique(mesh.cells[base]), rigid={"base": Rigid(density=2000.0)})
     simulator = Simulator(body, SILICONE, relative_tolerance=1e-12)
     state, constants = simulator.static_equilibrium(), simulator.prepare()
-    held = simulator.reaction(state, "base").force[0]
+    reaction = simulator.reaction(state, "base").force[0]
     weight = 9.80709 * float(constants.load_mass.sum())
-    assert held.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-10, abs=1e-10 * weight)
+    assert reaction.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-10, abs=1e-10 * weight)
     tip = replace(mesh, regions={"tip": np.setdiff1d(np.arange(len(BEAM.cells)), base)[-2:]})
     other = Simulator(clamped(tip), SILICONE)
     refuses(InputError, "no vertex of 'tip' is fixed", other.reaction, other.step(other.rest_state()), "tip")
@@ -206,13 +206,13 @@ def test_a_motion_has_the_reaction_of_every_step():
     pull = Inputs(tendon_tension=simulator.tensor([[1.0], [2.0]]))
     motion = simulator.rollout(start, 3, pull)
     half = simulator.fixed[::2].tolist()
-    held, state = simulator.reaction(motion, half), start
-    assert held.forces.shape == (3, 2, len(half), 3)
+    reaction, state = simulator.reaction(motion, half), start
+    assert reaction.forces.shape == (3, 2, len(half), 3)
     for number in range(3):
         state = simulator.step(state, pull)
         now = simulator.reaction(state, half)
-        torch.testing.assert_close(held.force[number], now.force)
-        torch.testing.assert_close(held.moment((0.0, 0.01, 0.0))[number], now.moment((0.0, 0.01, 0.0)))
+        torch.testing.assert_close(reaction.force[number], now.force)
+        torch.testing.assert_close(reaction.moment((0.0, 0.01, 0.0))[number], now.moment((0.0, 0.01, 0.0)))
     assert Simulator(Body(BEAM), SILICONE).rollout(start, 1).reaction is None
 
 
@@ -262,6 +262,8 @@ def test_an_environment_that_diverges_has_no_reaction_and_the_other_keeps_its_ow
     assert after.lost.tolist() == [False, True]
     assert torch.equal(simulator.reaction(after).forces[0], simulator.reaction(alone).forces[0])
     assert simulator.reaction(after).forces[1].isnan().all()
+    lost = CorrectedSimulator(simulator, lambda state, number: thrown[1:]).step(simulator.rest_state(), 0)
+    assert simulator.reaction(lost).forces.isnan().all()
 
 
 def test_wrong_places_are_refused():

@@ -56,8 +56,8 @@ def equilibrium(
         follows: passed to `Minimiser.solve`.
 
     Returns:
-        The last iterate, the solver's report, which says whether it converged (`check_converged`), and the derivatives
-        (B, D, 3) of the energies by the positions of the fixed vertices, without gradient (`reaction_of`) [N].
+        The last iterate, the solver's report, which says whether it converged (`check_converged`), and the gradient
+        (B, D, 3) of the energies at the fixed vertices, as numbers for `reaction_of` [N].
     """
     problem = _Minimisation(workspace, purpose, settings, follows, workspace.potential.value_names)
     values = (terms.values[energy][name] for energy, name in problem.names)
@@ -67,8 +67,8 @@ def equilibrium(
     through_graph = needs_grad or forward_ad._current_level >= 0
     x: torch.Tensor = _Equilibrium.apply(problem, *tensors) if through_graph else problem.minimise(tensors)
     assert problem.report is not None
-    assert problem.held is not None
-    return x, problem.report, problem.held
+    assert problem.fixed_gradient is not None
+    return x, problem.report, problem.fixed_gradient
 
 
 @dataclass
@@ -81,10 +81,10 @@ class _Minimisation:
     follows: torch.Tensor | None
     names: Names  # of the values
     report: SolveReport | None = None
-    held: torch.Tensor | None = None  # (B, D, 3) derivatives of the energies at fixed vertices [N]
+    fixed_gradient: torch.Tensor | None = None  # (B, D, 3) of the energies, at the minimiser [N]
 
     def minimise(self, tensors: Sequence[torch.Tensor | None]) -> torch.Tensor:
-        """Returns the minimiser for a start, fixed positions and terms, and sets the report and what is held."""
+        """Returns the minimiser for a start, fixed positions and terms, and sets `report` and `fixed_gradient`."""
         start, *others = (None if tensor is None else tensor.detach() for tensor in tensors)
         assert start is not None
 
@@ -98,9 +98,9 @@ class _Minimisation:
             return workspace.minimiser(self.purpose, self.settings)
 
         results = _in_shards(self.workspace, prepare, work, start[0].numel())
-        solutions, reports, held = zip(*results, strict=True)
+        solutions, reports, gradients = zip(*results, strict=True)
         self.report = _joined(reports)
-        self.held = held[0] if len(results) == 1 else torch.cat(held)
+        self.fixed_gradient = gradients[0] if len(results) == 1 else torch.cat(gradients)
         return solutions[0] if len(results) == 1 else torch.cat(solutions)
 
     def differentiate(
@@ -166,38 +166,39 @@ class _Equilibrium(AdjointFunction):
         return None, None, *ctx.problem.differentiate(gradient, x, terms, ctx.needs_input_grad[2:])
 
 
-def reaction_of(workspace: Workspace, terms: StepTerms, x: torch.Tensor, held: torch.Tensor) -> Reaction | None:
+def reaction_of(workspace: Workspace, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor) -> Reaction | None:
     """Returns the reaction at the fixed vertices in a solve, differentiable; None without such vertices.
 
     Args:
         workspace: of the batch.
         terms: of the solve.
         x: (B, N, 3) its solution [m].
-        held: (B, D, 3) from `equilibrium` [N].
+        gradient: (B, D, 3) of the energies at the fixed vertices, from `equilibrium` [N].
     """
     if not len(fixed := workspace.fixed):
         return None
-    held = held.to(x)
+    gradient = gradient.to(x)
     if torch.is_grad_enabled():
         values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
-        held = _Held.apply(workspace, held, x, terms.target, terms.inertia, terms.force, *values)
+        gradient = _FixedGradient.apply(workspace, gradient, x, terms.target, terms.inertia, terms.force, *values)
     places = x[:, fixed]
     inertia = terms.inertia[:, fixed, None] * (places - terms.target[:, fixed])
-    return Reaction(fixed, held + inertia - terms.force[:, fixed], places)
+    return Reaction(fixed, gradient + inertia - terms.force[:, fixed], places)
 
 
-class _Held(AdjointFunction):
-    """r = sum_e dE_e / dx at fixed vertices. For a loss with gradient z there, dL/dx = K z, dL/dtheta = z . dr/dtheta.
+class _FixedGradient(AdjointFunction):
+    """g = sum_e dE_e / dx at the fixed vertices, known from the solve, and its adjoint.
 
-    K is the stiffness, and theta are the values of the energies. Inertia and loads are added later.
+    For a loss with derivatives z by g, zero at other vertices, dL/dx = K z and dL/dtheta = z . dg/dtheta, with the
+    stiffness K at x and the values theta of the energies.
     """
 
     @override
     @staticmethod
-    def forward(ctx: Any, workspace: Workspace, held: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
+    def forward(ctx: Any, workspace: Workspace, known: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
         ctx.workspace = workspace
         ctx.save_for_backward(*tensors)
-        return held.clone()
+        return known.clone()
 
     @override
     @staticmethod
@@ -257,7 +258,7 @@ def _minimise(
     fixed_positions: Any,
     *terms: Any,
 ) -> tuple[torch.Tensor, SolveReport, torch.Tensor]:
-    """Returns the minimiser, the report, and the derivatives at fixed vertices of one shard.
+    """Returns the minimiser, the report, and the gradient at fixed vertices of one shard.
 
     Where bodies bar the way of fixed vertices, these go as far as they can, and the others give way to them by a solve,
     again and again; the last solve has every fixed vertex in its place. A batch of which that holds agrees with its
@@ -276,7 +277,7 @@ def _minimise(
         start[:, fixed] = fixed_positions
     report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
     work = {name: sum(getattr(part, name) for part in [*parts, report]) for name in ("iterations", "factorisations")}
-    return potential.positions.to(start.dtype, copy=True), replace(report, **work), potential.held[:, fixed]
+    return potential.positions.to(start.dtype, copy=True), replace(report, **work), potential.fixed_gradient[:, fixed]
 
 
 def _adjoint(

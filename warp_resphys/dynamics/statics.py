@@ -36,7 +36,7 @@ Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 class StaticEquilibrium(TimeStep):
     """A static equilibrium under constant inputs after a state: a step without end, in which inertia has no part."""
 
-    _held: torch.Tensor  # what `equilibrium` returns of the last one [N]
+    _gradient: torch.Tensor  # of the energies at the fixed vertices, in the last `_balance` [N]
 
     @override
     def _begin(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
@@ -66,7 +66,7 @@ class StaticEquilibrium(TimeStep):
     def _solved(self, x: torch.Tensor) -> State:
         """Returns the state of the last `_balance`, with its reaction."""
         terms = self.terms(near=x if self.equations.energies.follow_pose else None)
-        return replace(self.finish(x), reaction=reaction_of(self.workspace, terms, x, self._held))
+        return replace(self.finish(x), reaction=reaction_of(self.workspace, terms, x, self._gradient))
 
     @override
     def solve(self, near: torch.Tensor | None = None) -> State:
@@ -98,7 +98,7 @@ class StaticEquilibrium(TimeStep):
         settings = equations.settings.changed(name="newton", on_failure="raise", max_iterations=most)
         terms, fixed = self.terms(share, near), self.fixed_positions(share)
         with _progress_of(workspace.parts[0][1].potential, share, most):
-            x, report, self._held = equilibrium(workspace, "statics", settings, terms, start, fixed)
+            x, report, self._gradient = equilibrium(workspace, "statics", settings, terms, start, fixed)
         check_converged(settings, report, x)
         return equations.coordinates.expand(x), report
 

@@ -55,10 +55,11 @@ class TimeStep:
         moved = torch.zeros_like(now) if fixed is None else fixed - now
         return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
 
-    def _driven(self, reaction: Reaction | None) -> Reaction | None:
-        """Returns a reaction whose inertia is that of the known velocities of fixed vertices (`finish`).
+    def _at_known_velocity(self, reaction: Reaction | None) -> Reaction | None:
+        """Returns the reaction with the inertia of fixed vertices, whose velocity V at the end is prescribed.
 
-        In the middle of a step, that of free ones changes twice as fast.
+        The potential of a midpoint step has the acceleration 2 (V - v) / h of a vertex that moves by V h, as the
+        velocity of a free vertex would then be 2 V - v at the end; that of a fixed one is V (`finish`).
         """
         step, fixed = self.step, self.equations.fixed
         if reaction is None or step.stage.end == 1.0:
@@ -78,8 +79,8 @@ class TimeStep:
         equations, workspace, state = self.equations, self.workspace, self.step.state
         start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
         terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
-        x, report, held = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
-        reaction = self._driven(reaction_of(workspace, terms, x, held))
+        x, report, gradient = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
+        reaction = self._at_known_velocity(reaction_of(workspace, terms, x, gradient))
         new = replace(self.finish(equations.coordinates.expand(x)), report=report, reaction=reaction)
         workspace.record_positions(new.q)
         return new

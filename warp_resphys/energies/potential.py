@@ -66,10 +66,10 @@ class IncrementalPotential(Launcher):
         sets: sets of points of all energies.
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
-        evaluation: launches that evaluate at ``positions`` and set ``residual``, ``held`` and the following four sums.
-            Environments that are not ``active`` keep ``held``, energies and norm of the residual, and have no valid
+        evaluation: launches that evaluate at ``positions`` and set ``residual`` and what follows here. Environments
+            that are not ``active`` keep energies, norm of the residual and ``fixed_gradient``, and have no valid
             ``residual``.
-        held: (B, N, 3) derivatives of the energies by the positions of fixed vertices; zero elsewhere [N].
+        fixed_gradient: (B, N, 3) gradient of the energies at fixed vertices, zero at others [N].
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
@@ -120,7 +120,7 @@ class IncrementalPotential(Launcher):
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
-        self.residual, self.held = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
+        self.residual, self.fixed_gradient = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
         self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
@@ -163,11 +163,7 @@ class IncrementalPotential(Launcher):
                     self.record(kernel, (b, s.n_points), [active, *inputs], [stress, energy]),
                     self.gather(s, stress, self.residual),
                 ]
-        free, residual, held = (
-            warp_view(self.free_mask, wp.float64),
-            warp_view(self.residual, wp.vec3d),
-            warp_view(self.held, wp.vec3d),
-        )
+        free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
         project, c = [], self.coordinates
         if c.slides:  # removes the residual normal to symmetry planes
             planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
@@ -177,10 +173,11 @@ class IncrementalPotential(Launcher):
             self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
         )
         energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
-        sums = [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
+        sums = [warp_view(self.fixed_gradient, wp.vec3d)]
+        sums += [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
         self._internal_commands += project
         self._internal_commands.append(
-            self.record_blocks(reductions.totals, b, [active, free, *energies, residual], [held, *sums])
+            self.record_blocks(reductions.totals, b, [active, free, *energies, residual], sums)
         )
         self.evaluation = [self._inertia_command, *self._load_commands, *self._internal_commands]
         self._evaluation = self.capture(*self.evaluation)

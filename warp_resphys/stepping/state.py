@@ -89,7 +89,8 @@ class State:
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
     # of the step that led here; None for other states, and for copies by `map`, such as `detach`
     report: SolveReport | None = field(default=None, compare=False)
-    # what held the fixed vertices in the step or equilibrium that led here; None as above, meaningless where it failed
+    # at the fixed vertices, in the step or equilibrium that led here; None for others. NaN in environments that were
+    # reset (`where`), and meaningless where the solve failed
     reaction: Reaction | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
@@ -153,16 +154,23 @@ class State:
         return self.map(lambda tensor: torch.cat([tensor] * times))
 
     def where(self, chosen: torch.Tensor | BoolArray, other: "State") -> "State":
-        """Joins two states: this one where chosen (B,) bool, the other one elsewhere."""
+        """Joins two states: this one where chosen (B,) bool, the other one elsewhere.
+
+        If one of them has a reaction, that of the other is NaN.
+        """
         chosen = torch.as_tensor(chosen, device=self.q.device)
+        reaction = self.reaction or other.reaction
+        if reaction is not None:
+            a, b = (torch.nan if one.reaction is None else one.reaction.forces for one in (self, other))
+            reaction = replace(reaction, forces=torch.where(chosen[:, None, None], a, b))
         if bool(chosen.all()):
-            return self
+            return replace(self, reaction=reaction)
         mine, theirs = ({"previous_q": state.q, "previous_v": state.v} | state.tensors() for state in (self, other))
         joined = {}
         for name, like in (self.tensors() | other.tensors()).items():
             a, b = (tensors[name] if name in tensors else torch.zeros_like(like) for tensors in (mine, theirs))
             joined[name] = torch.where(chosen.view(-1, *[1] * (like.ndim - 1)), a, b)
-        return State.from_tensors(joined)
+        return replace(State.from_tensors(joined), reaction=reaction)
 
     def map(self, change: Callable[[torch.Tensor], torch.Tensor]) -> "State":
         """Returns the state with a function applied to every tensor, without report and reaction."""

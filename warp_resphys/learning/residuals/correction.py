@@ -70,7 +70,9 @@ class CorrectedSimulator:
         new, failed = self._advance(state, number, lost)
         distance = (new.q - self._rest).abs().flatten(1).amax(1)
         lost = lost | failed | ~(distance < DIVERGENCE_DISTANCE * self._length)
-        return (self._reset(new, lost) if bool(lost.any()) else new).with_memory({"lost": lost})
+        if bool(lost.any()):
+            new = self.simulator.rest_state(state.batch).where(lost, new)
+        return new.with_memory({"lost": lost})
 
     def _advance(self, state: State, number: int, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """Returns the next state, and which environments (B,) failed."""
@@ -92,20 +94,6 @@ class CorrectedSimulator:
             inputs = inputs.replace(**idle)
         new = self.simulator.step(state, inputs.plus(force), self._constants)
         return new, failed | ~new.converged
-
-    def _reset(self, state: State, lost: torch.Tensor) -> State:
-        """Returns the state with its lost environments at rest."""
-        rest = dict.fromkeys(("q", "previous_q"), self._rest)
-
-        def masked(name: str, value: torch.Tensor) -> torch.Tensor:
-            where = lost.view(-1, *[1] * (value.ndim - 1))
-            return torch.where(where, rest.get(name, value.new_zeros(())), value)
-
-        reset = State.from_tensors({name: masked(name, value) for name, value in state.tensors().items()})
-        if (reaction := state.reaction) is not None:
-            forces = torch.where(lost[:, None, None], torch.nan, reaction.forces)
-            reset = replace(reset, reaction=replace(reaction, forces=forces))
-        return reset
 
 
 def known_positions(state: State) -> torch.Tensor:

@@ -30,6 +30,7 @@ from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.folds import Fold, intervals_of_folds, run_folds, workers_for
 from .experiment.laboratory import run_laboratory
 from .experiment.learning_stages import evaluate, identify, identify_law, reconstruct, train, train_actuator
+from .experiment.material_tests import material_stages, print_material, table_files
 from .experiment.mesh_check import check_mesh
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
@@ -280,7 +281,9 @@ def prepare(run: RunSettings) -> None:
     os.environ.setdefault("WARP_RESPHYS_THREADS", str(min(torch.get_num_threads(), _MOST_THREADS)))
     if run.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are too small for several threads (linalg/threads.py).
-    if run.pictures is None:
+    if run.material_tests is not None:
+        table_files(run.material_tests)
+    elif run.pictures is None:
         check_run(run)
     else:
         from .experiment.pictures.picture_stages import check_pictures
@@ -310,6 +313,11 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
 
         run_stages(picture_stages(run, files_read(run, run)), folder)
         print_pictures(run, folder)
+        return
+    if run.material_tests is not None:
+        paths = table_files(run.material_tests)
+        run_stages(material_stages(run, {str(path): digest(path) for path in paths}), folder)
+        print_material(run, folder)
         return
     if run.ablation is not None:
         run_stages(ablation_stages(run, files_read(run, run, run.target)), folder)

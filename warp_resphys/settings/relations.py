@@ -35,6 +35,12 @@ def _check_data(run: RunKeys) -> None:
         if run.identify is None:
             raise ValueError("identify is null, but data.kind is pictures: name parameters to identify.")
         return
+    if run.material_tests is not None:
+        if run.law is None:
+            raise ValueError("law is null, but data.kind is material_tests: give its terms, law={terms: [ogden_3]}.")
+        if lost := {"density", "poissons_ratio"} - {*run.simulation.values}:
+            raise ValueError(f"simulation lacks {min(lost)}, which tests of specimens do not show: give it.")
+        return
     if run.tip is None:
         raise ValueError("tip is null: name the vertices whose mean motion is reported, such as {x: 0.1}.")
     if run.shapes and (run.recorded is not None or (run.identify is None and run.law is None)):

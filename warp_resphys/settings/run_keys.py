@@ -23,6 +23,7 @@ from .learning import (
     TrainerSettings,
     TrainingSettings,
 )
+from .material_tests import MaterialTestData
 from .mesh import Place
 from .observed import BindingSettings, MarkerSettings
 from .performed import MotionSettings, by_file
@@ -35,7 +36,8 @@ Name = Annotated[
 ]
 
 DataSettings = Annotated[
-    RecordedData | ReleaseFromLoad | ReleaseFromTwist | MovingBase | PictureData, Field(discriminator="kind")
+    RecordedData | ReleaseFromLoad | ReleaseFromTwist | MovingBase | PictureData | MaterialTestData,
+    Field(discriminator="kind"),
 ]
 
 
@@ -131,14 +133,19 @@ class RunKeys(SimulatorSettings):
         return self.data.limited() if isinstance(self.data, PictureData) else None
 
     @property
+    def material_tests(self) -> MaterialTestData | None:
+        """Tests of specimens; None for other data."""
+        return self.data if isinstance(self.data, MaterialTestData) else None
+
+    @property
     def trial_data(self) -> RecordedData | SimulatedData:
         """Data of trials.
 
         Raises:
-            InputError: the run has pictures.
+            InputError: the run has pictures or tests of specimens.
         """
-        if isinstance(self.data, PictureData):
-            raise InputError("data.kind is pictures: they have no trials to show, to track or to learn from.")
+        if isinstance(self.data, PictureData | MaterialTestData):
+            raise InputError(f"data.kind is {self.data.kind}: it has no trials to show, to track or to learn from.")
         return self.data
 
     @property

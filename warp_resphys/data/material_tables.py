@@ -1,0 +1,81 @@
+"""Tables of material tests: columns of time, strain or displacement, and stress or force, as text."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ..io.arrays import FloatArray
+from ..io.errors import DataFileError, did_you_mean, listed
+from ..io.text import Rows, number, read_rows
+from ..settings.data_kinds import TableSettings
+from .recordings.recording import METRES_PER_UNIT
+from .recordings.text_exports import name_and_unit
+
+_PRESSURES: Final = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "N/mm^2": 1e6, "psi": 6894.757}
+_UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    "time": {"s": 1.0, "min": 60.0, "ms": 1e-3},
+    "strain": {"": 1.0, "1": 1.0, "mm/mm": 1.0, "%": 0.01},
+    "displacement": METRES_PER_UNIT,
+    "stress": _PRESSURES,
+    "force": {"N": 1.0, "kN": 1e3, "mN": 1e-3, "lbf": 4.448222, "kgf": 9.80665, "gf": 9.80665e-3},
+}
+_PAIRS: Final = (("strain", "displacement"), ("stress", "force"))
+
+
+def read_test(path: Path, table: TableSettings | None = None) -> dict[str, FloatArray]:
+    """Returns the columns (N,) of a table in SI units, by their names; lines without a number are left out.
+
+    Args:
+        path: of the text file, whose header has ``time [s]``, ``strain`` or ``displacement [mm]``, and ``stress [kPa]``
+            or ``force [N]``, of the undeformed section and length.
+        table: columns of a file with another header.
+
+    Raises:
+        DataFileError: the file is no table, a column is missing, or a unit is not known.
+    """
+    rows = read_rows(path)
+    first, named = _header(rows, path) if table is None else _described(rows, table, path)
+    factors, names = dict[int, float](), dict[int, str]()
+    for column, cell in named.items():
+        name, unit = name_and_unit(cell)
+        if (known := _UNITS.get(name.lower())) is None:
+            if table is None:
+                continue
+            raise DataFileError(f"{path}: data.table has the column {cell!r}: choose from {', '.join(_UNITS)}.")
+        if (unit or "") not in known:
+            missing = f"the column {cell!r} has {'the unit ' + repr(unit) if unit else 'no unit'}"
+            raise DataFileError(f"{path}: {missing}: write '{name} [{listed([*filter(None, known)])}]', one of these.")
+        if name.lower() in names.values():
+            raise DataFileError(f"{path} has two columns of {name}: leave one of them out in data.table.")
+        names[column], factors[column] = name.lower(), known[unit or ""]
+    for pair in _PAIRS:
+        if (present := [name for name in pair if name in names.values()]) != present[:1] or not present:
+            raise DataFileError(
+                f"{path} has {len(present)} of the columns {' and '.join(pair)}: a test has one of them. Write a header "
+                "such as 'time [s], strain, stress [kPa]', or name all columns in data.table."
+            )
+    values = [[number(row[column]) if column < len(row) else None for column in names] for row in rows[first:]]
+    kept = np.array([one for one in values if None not in one], dtype=np.float64).reshape(-1, len(names))
+    return {name: kept[:, k] * factors[column] for k, (column, name) in enumerate(names.items())}
+
+
+def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
+    """Returns the number of the first line of numbers, and the cells of the line before, by column."""
+    for line, row in enumerate(rows):
+        filled = [cell for cell in row if cell]
+        if line and len(filled) > 1 and all(number(cell) is not None for cell in filled):
+            return line, {column: cell for column, cell in enumerate(rows[line - 1]) if cell}
+    raise DataFileError(f"{path} has no line of numbers below a header: export it as CSV, with names of its columns.")
+
+
+def _described(rows: Rows, table: TableSettings, path: Path) -> tuple[int, dict[int, str]]:
+    """Returns the number of the first line of numbers, and the names of the columns by settings."""
+    if not table.names:
+        return table.header_lines, {column: cell for column, cell in enumerate(table.columns) if cell}
+    header = rows[table.header_lines] if len(rows) > table.header_lines else []
+    if lost := [name for name in table.names if header.count(name) != 1]:
+        known = did_you_mean(lost[0], header) or f"; it has {listed([cell for cell in header if cell])}."
+        raise DataFileError(f"{path}, line {table.header_lines + 1}: no single column is named {lost[0]!r}{known}")
+    return table.header_lines + 1, {header.index(name): cell for name, cell in table.names.items()}

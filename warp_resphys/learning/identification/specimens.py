@@ -1,0 +1,306 @@
+"""Tests of specimens: what was measured, and the stress of a law in closed form, or of a simulated specimen.
+
+Homogeneous deformations have a closed form (`energies.isochoric`). Where ends are glued, or an indenter presses on a
+block, the specimen is simulated at a few strains, from which the stress is interpolated; its derivatives by the
+parameters are those of the reactions at the end that moves.
+"""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+
+from ...dynamics.simulator import Simulator
+from ...energies.base import Energy
+from ...energies.catalogue import make_material
+from ...energies.contact.obstacle_contact import Contact
+from ...energies.isochoric import TERMS, stress_columns
+from ...fem.bodies import Body
+from ...io.arrays import BoolArray, Brief, FloatArray, IntArray
+from ...io.errors import ConvergenceError, InputError, ResphysWarning
+from ...mesh.boxes import box_hexahedra
+from ...mesh.rod import rod
+from ...mesh.selection import select_vertices
+from ...mesh.volume_mesh import Mesh
+from ...settings.contact import Sphere
+from ...stepping.inputs import Inputs
+
+LEAST_SAMPLES: Final = 5  # of a test
+NUISANCES: Final = ("zero", "toe", "compliance")
+_LEAST: Final = 0.02  # of the largest stress, below which errors are not relative to the stress
+_LOWER: Final = 0.6  # share of the range of strains from which classes are fitted to predict the rest
+_SLOPE: Final = 1e-5  # difference of strains for derivatives
+_STRAINS: Final = 6  # at which a specimen is simulated
+_GRADED: Final = 3  # times the cells across, of a quarter of a block under an indenter
+_MARGIN: Final = 1.02  # of the largest simulated strain over the largest measured one
+_SAME: Final = 1.2  # the largest such ratio with which simulated strains stay
+_LONGEST: Final = 5.0  # times the cells across, along an edge
+_NEAR: Final = 0.4  # size of the cells there, over the mean
+_GAP: Final = 0.01  # distance of contact over the radius of the indenter, half of which counts as touching
+_STIFF: Final = 1e6  # stiffness of its contact [Pa]
+_GLUED: Final = ("tension", "compression", "shear")
+_CHOICES: Final = "glued ends have tension, compression and shear, an indenter has indentation."
+
+Machine = Mapping[str, float]  # zero [Pa], toe, compliance [1/Pa]
+
+
+@dataclass(frozen=True)
+class Specimen(Brief):
+    """A specimen whose deformation is not homogeneous: a block or a cylinder along z, simulated.
+
+    Its lower end is fixed. The upper one is glued to a plate that moves along z (tension, compression) or along x
+    (shear), or an indenter without friction presses on its middle.
+
+    Args:
+        length: along z [m].
+        section: width and thickness, along x and y, or the diameter alone [m].
+        poissons_ratio: at small strains.
+        indenter: radius of the spherical indenter [m]; None: glued ends.
+        cells: cells across the thinnest direction.
+
+    Raises:
+        InputError: a length that is not positive, or an indenter on a cylinder.
+    """
+
+    length: float
+    section: Sequence[float]
+    poissons_ratio: float = 0.4995
+    indenter: float | None = None
+    cells: int = 2
+    _simulators: dict[tuple[str, ...], Simulator] = field(default_factory=dict, init=False, repr=False, compare=False)
+    # depths (S, 1) and positions (S, N, 3) of the last solutions, by kind of test
+    _last: dict[str, tuple[torch.Tensor, torch.Tensor]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def __post_init__(self) -> None:
+        """Checks the sizes."""
+        sizes = {"length": self.length, "section": min(self.section), "indenter": self.indenter or 1.0}
+        for name, size in sizes.items():
+            if not (math.isfinite(size) and size > 0.0):
+                raise InputError(f"{name} of a specimen is {size:g}: give a positive length, in m.")
+        if self.indenter is not None and len(self.section) == 1:
+            raise InputError("an indenter presses on a block: give its width and thickness.")
+
+    @property
+    def area(self) -> float:
+        """Undeformed cross-section [m^2]."""
+        return float(np.prod(self.section)) if len(self.section) == 2 else 0.25 * math.pi * self.section[0] ** 2
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """Quadratic hexahedra; linear ones under an indenter, of whose contact no node then lies between others."""
+        if len(self.section) == 1:
+            radius = 0.5 * self.section[0]
+            layers = math.ceil(self.length * self.cells / min(self.length, 2.0 * radius))
+            return rod([[0.0, 0.0, 0.0], [0.0, 0.0, self.length]], radius, layers, core=self.cells // 2 or 1)
+        size = np.array([*self.section, self.length])
+        if self.indenter is None:
+            divisions = np.minimum(np.ceil(size / size.min()), _LONGEST) * self.cells
+            return box_hexahedra(size.tolist(), divisions.astype(int).tolist(), nodes=27)
+        halves = _GRADED * self.cells
+        block = box_hexahedra((2.0, 2.0, 1.0), (2 * halves, 2 * halves, halves))
+        away = block.vertices - 1.0  # from the point under the indenter
+        return Mesh((away * (_NEAR + (1.0 - _NEAR) * np.abs(away)) + 1.0) * size * [0.5, 0.5, 1.0], block.cells)
+
+    @cached_property
+    def moved(self) -> IntArray:
+        """Vertices of the end that moves."""
+        return select_vertices(self.mesh, z=self.length)
+
+    def _simulator(self, terms: Sequence[str]) -> Simulator:
+        """Returns the simulator of a specimen with a law that has some elastic terms."""
+        fixed, energies = select_vertices(self.mesh, z=0.0), list[Energy]()
+        if self.indenter is None:
+            fixed = np.union1d(fixed, self.moved)
+        else:
+            ball = Sphere(
+                radius=self.indenter,
+                position=(*(0.5 * np.array(self.section)), self.length + (1.0 + _GAP) * self.indenter),
+            )
+            energies = [Contact({"indenter": ball}, stiffness=_STIFF, distance=_GAP * self.indenter)]
+        body = Body(self.mesh, fixed=fixed, energies=energies)
+        material = make_material("law", **dict.fromkeys(("c10", *terms), 1e5), bulk_1=1e7)
+        return Simulator(body, material, gravity=(0.0, 0.0, 0.0))
+
+    def response(
+        self, kind: str, strain: FloatArray, parameters: Mapping[str, float]
+    ) -> tuple[FloatArray, dict[str, FloatArray], FloatArray]:
+        """Returns the stress (N,) of a law at strains (N,), and its derivatives by the parameters and the strain.
+
+        Raises:
+            InputError: a kind of test that has no such specimen.
+            ConvergenceError: the specimen has no equilibrium.
+        """
+        if kind not in (("indentation",) if self.indenter is not None else _GLUED):
+            raise InputError(f"a {kind} test has no simulated specimen: {_CHOICES}")
+        names = tuple(name for name in parameters if TERMS.fullmatch(name))
+        if names not in self._simulators:
+            self._simulators[names] = self._simulator(names)
+        simulator = self._simulators[names]
+        levels = self._levels(kind, float(strain.max()))
+        values = {name: simulator.tensor([[parameters[name]]]).repeat(_STRAINS, 1) for name in names}
+        for value in values.values():
+            value.requires_grad_()
+        bulk = simulator.tensor([[parameters["bulk_1"]]]).repeat(_STRAINS, 1)
+        try:
+            force = self._forces(simulator, kind, simulator.tensor(levels), {**values, "bulk_1": bulk})
+        except ConvergenceError as error:
+            raise ConvergenceError(
+                f"a simulated specimen has no equilibrium at strains up to {levels[-1]:.2g}: identify from smaller "
+                "ones, or take the closed form, which needs free ends.",
+                error.positions,
+                error.report,
+            ) from error
+        by_parameters = torch.autograd.grad(force.sum(), [*values.values()])
+        curve = _curve(levels, force, strain)
+        columns = {name: _curve(levels, slope, strain)[0] for name, slope in zip(values, by_parameters, strict=True)}
+        return curve[0], {name: columns.get(name, np.zeros_like(strain)) for name in parameters}, curve[1]
+
+    def _forces(
+        self, simulator: Simulator, kind: str, strains: torch.Tensor, parameters: Mapping[str, torch.Tensor]
+    ) -> torch.Tensor:
+        """Returns the forces over the cross-section (S,) of equilibria at strains (S,)."""
+        rest, depth = simulator.rest_positions, strains[:, None] * self.length
+        whole = rest.expand(len(strains), -1, -1)
+        if self.indenter is not None:
+            shift = depth + 0.5 * _GAP * self.indenter
+            away = (rest[:, :2] - simulator.tensor(self.section) / 2.0).norm(dim=1)
+            above = self.indenter - (self.indenter**2 - away.clamp_max(0.99 * self.indenter) ** 2).sqrt()
+            room = self.length + above - depth - _GAP * self.indenter  # up to the indenter, at each place
+            dented = torch.cat([whole[..., :2], (whole[..., 2] * (room / self.length).clamp_max(1.0))[..., None]], -1)
+            given, dented = {**parameters, "obstacle_z": -shift}, self._near(kind, depth, dented)
+            with warnings.catch_warnings():  # Cells under the indenter are coarse, which hardly changes its force.
+                warnings.simplefilter("ignore", ResphysWarning)
+                balance = simulator.static_equilibrium(parameters=given, start=dented, after=simulator.state(dented))
+            self._last[kind] = depth, balance.q.detach()
+            return simulator.reaction(balance).force[:, 2] / self.area
+        axis, sign = (0 if kind == "shear" else 2), (-1.0 if kind == "compression" else 1.0)
+        share, change = rest[:, 2] / self.length, torch.zeros_like(whole)
+        change[..., axis] = sign * depth * share
+        guess = whole + change
+        if axis == 2:
+            middle = rest[:, :2].mean(0)
+            guess[..., :2] = middle + (rest[:, :2] - middle) * (1.0 + sign * strains[:, None, None]) ** -0.5
+            guess[:, simulator.fixed] = (whole + change)[:, simulator.fixed]
+        inputs = Inputs(fixed_positions=(whole + change)[:, simulator.fixed])
+        balance = simulator.static_equilibrium(inputs, parameters, start=self._near(kind, depth, guess))
+        self._last[kind] = depth, balance.q.detach()
+        return sign / self.area * simulator.reaction(balance, at=self.moved).force[:, axis]
+
+    def _levels(self, kind: str, most: float) -> FloatArray:
+        """Returns strains (S,) to simulate, the last ones where they still fit, whose solutions are known."""
+        last = self._last[kind][0][:, 0].cpu().numpy() / self.length if kind in self._last else np.zeros(1)
+        return last if most <= last[-1] <= _SAME * most else np.linspace(0.0, _MARGIN * most, _STRAINS + 1)[1:]
+
+    def _near(self, kind: str, depth: torch.Tensor, guess: torch.Tensor) -> torch.Tensor:
+        """Returns the last solution at the same depths (S, 1), or a guess (S, N, 3)."""
+        known, last = self._last.get(kind, (depth[:0], guess))
+        return last if torch.equal(known, depth) else guess
+
+
+def _curve(levels: FloatArray, values: torch.Tensor, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns values and slopes (N,) at strains (N,) of a curve through the origin and values (S,) at levels (S,)."""
+    spline = CubicSpline(np.append(0.0, levels), np.append(0.0, values.detach().cpu().numpy()))
+    return np.asarray(spline(strain)), np.asarray(spline(strain, 1))
+
+
+@dataclass(frozen=True)
+class MaterialTest(Brief):
+    """A test of a specimen.
+
+    Args:
+        kind: ``tension``, ``compression``, ``biaxial``, ``planar``, ``shear``, or ``indentation`` of a `Specimen`.
+        strain: (N,) nominal strains, angles of shear, or depths over the thickness; positive in compression, too.
+        stress: (N,) force over the undeformed cross-section [Pa].
+        seconds: (N,) rising times [s], which relaxing branches need; the specimen is relaxed at the first.
+        zero: standard deviation of the zero of the stress [Pa]; 0 if it is known.
+        toe: that of the strain at which the specimen becomes taut.
+        compliance: that of the machine's displacement over the length of the specimen, by stress [1/Pa].
+        specimen: simulated where the deformation is not homogeneous, as between glued ends or under an indenter.
+
+    Raises:
+        InputError: arrays that do not fit, are not finite, or have less than five samples; times that do not rise; or
+            strains or stresses that are all the same.
+    """
+
+    kind: str
+    strain: FloatArray
+    stress: FloatArray
+    seconds: FloatArray | None = None
+    zero: float = 0.0
+    toe: float = 0.0
+    compliance: float = 0.0
+    specimen: Specimen | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the samples."""
+        arrays = {"strain": self.strain, "stress": self.stress, "seconds": self.seconds}
+        for name, values in arrays.items():
+            if values is not None and (np.shape(values) != (len(self.strain),) or not np.isfinite(values).all()):
+                raise InputError(f"{name} has the shape {np.shape(values)}: give a finite number for every sample.")
+        if len(self.strain) < LEAST_SAMPLES or not np.any(self.stress) or not np.ptp(np.append(self.strain, 0.0)) > 0.0:
+            raise InputError(
+                f"the test has {len(self.strain)} samples: give {LEAST_SAMPLES} or more, of a specimen under load."
+            )
+        if self.seconds is not None and not (np.diff(self.seconds) > 0.0).all():
+            raise InputError("seconds do not rise: sort the samples by time, and leave out those that repeat one.")
+
+    @property
+    def weights(self) -> FloatArray:
+        """(N,) reciprocals of the stresses that errors are relative to [1/Pa]."""
+        size = np.abs(self.stress)
+        return np.asarray(1.0 / np.maximum(size, _LEAST * size.max()))
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Standard deviations of the unknown constants of the machine, by name."""
+        return {name: value for name in NUISANCES if (value := float(getattr(self, name))) > 0.0}
+
+    @property
+    def lower(self) -> BoolArray:
+        """(N,) whether classes are fitted to a sample: the lower part of the strains, or the first part of a hold."""
+        size = np.abs(self.strain)
+        low, high = float(size.min()), float(size.max())
+        if self.seconds is not None and np.quantile(size, 0.25) > low + 0.9 * (high - low):
+            first, last = self.seconds[0], self.seconds[-1]
+            return np.asarray(self.seconds <= first + _LOWER * (last - first))
+        return np.asarray(size <= low + _LOWER * (high - low))
+
+    def chosen(self, rows: BoolArray) -> "MaterialTest":
+        """Returns the test with some of its samples (N,)."""
+        seconds = None if self.seconds is None else self.seconds[rows]
+        return replace(self, strain=self.strain[rows], stress=self.stress[rows], seconds=seconds)
+
+    def taut(self, machine: Machine) -> FloatArray:
+        """Returns the strains (N,) of the specimen, by the constants of the machine."""
+        return np.asarray(self.strain - machine.get("toe", 0.0) - machine.get("compliance", 0.0) * self.stress)
+
+    def response(
+        self, strain: FloatArray, parameters: Mapping[str, float]
+    ) -> tuple[FloatArray, dict[str, FloatArray], FloatArray]:
+        """Returns the stress (N,) of a law at strains (N,), and its derivatives (N,) by the parameters and the strain.
+
+        Raises:
+            ConvergenceError: a simulated specimen has no equilibrium.
+        """
+        if self.specimen is not None:
+            return self.specimen.response(self.kind, strain, parameters)
+
+        def total(strain: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
+            columns = stress_columns(self.kind, strain, tuple(parameters), self.seconds)
+            return np.sum([parameters[name] * column for name, column in columns.items()], axis=0), columns
+
+        value, columns = total(strain)
+        return value, columns, (total(strain + _SLOPE)[0] - total(strain - _SLOPE)[0]) / (2.0 * _SLOPE)
+
+    def away(self, parameters: Mapping[str, float], machine: Machine) -> FloatArray:
+        """Returns the relative errors (N,) of a law, with the constants of the machine."""
+        predicted = self.response(self.taut(machine), parameters)[0] + machine.get("zero", 0.0)
+        return np.asarray((predicted - self.stress) * self.weights)

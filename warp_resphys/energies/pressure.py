@@ -5,10 +5,11 @@ F = sum_a x_a g_a^T has the columns x, t1 and t2: position and tangents of the d
 sum of -w/3 x . (t1 x t2) = -w/3 det F, as the faces are oriented into the chamber, and the potential of a gauge
 pressure p is -p V (Bonet and Wood 2008, section 8.5.2).
 
-Over open faces, V is the volume of the cone from a constant apex c, of x - c in place of x. Its slopes are the forces
-of the pressure, -w (t1 x t2) N_a in sum, except at vertices of the open edges, by an integral along these. There it
-does no work where they are fixed, or slide in a symmetry plane through c, so that -p V is a potential too (Bonet and
-Wood, section 8.5.2). What is missing in the reactions of fixed vertices is added (`BoundPressure.load_at_fixed`).
+Over open faces, V is the volume of the cone from a constant apex c, with x - c in place of x. Its derivatives are the
+forces of the pressure, the sums of -w (t1 x t2) N_a, except at vertices of the open edges, where they differ by an
+integral along the edges. That part does no work where the edges are fixed, or slide in a symmetry plane through c, so
+that -p V is a potential there too. In the reactions of fixed vertices it is corrected (`BoundPressure.load_at_fixed`).
+Verified in tests/energies/test_open_faces.py.
 """
 
 from collections.abc import Mapping, Sequence
@@ -142,10 +143,10 @@ class BoundPressure(BoundEnergy):
 
     @override
     def load_at_fixed(self, q: torch.Tensor, values: Values) -> torch.Tensor | None:
-        """Returns the force of the pressure at the vertices of open edges, less the slope of p V.
+        """Returns the force of the pressure at the vertices of open edges, less the derivative of p V [N].
 
-        With the columns a0 = t1 x t2, a1 = t2 x (x - c) and a2 = (x - c) x t1 of cof F, these are -w p 3 a0 N_a and
-        -w p cof F g_a at a point of weight w (a third of the face's).
+        A point of weight w (a third of the face's) has the force -3 w p a0 N_a and the derivative -w p cof F g_a, with
+        the columns a0 = t1 x t2, a1 = t2 x (x - c) and a2 = (x - c) x t1 of cof F.
         """
         if not len(self._nodes):
             return None

@@ -59,6 +59,17 @@ def test_shape_gradients_equal_differences(kind):
         np.testing.assert_allclose(shape(points)[1][..., axis], difference, atol=1e-9)
 
 
+@pytest.mark.parametrize("nodes", FACES)
+def test_rules_of_faces_integrate_linear_fields(nodes):
+    """So that every corner of a flat face has the same share of a pressure, a drag or an area."""
+    face = FACES[nodes]
+    points, weights = face.rule(2)
+    values, area = face.shape(points)[0][:, : face.corners], 0.5 if face.corners == 3 else 4.0
+    if nodes == face.corners:
+        np.testing.assert_allclose(weights @ values, area / face.corners, rtol=1e-13)
+    np.testing.assert_allclose(weights @ points, area * face.shape.nodes[: face.corners].mean(axis=0), atol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("rule", "degree"), [(degree_two_tetrahedron(), 2), (conical_simplex(4), 5)], ids=["4 points", "64 points"]
 )

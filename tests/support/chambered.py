@@ -1,12 +1,15 @@
-"""Small bodies with closed chambers."""
+"""Small bodies with closed chambers, and forces of pressure."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import torch
 
 from support.clamped import clamped
 from warp_resphys import Body, Fibres, Mesh, Pressure, box_hexahedra, box_tetrahedra, quadratic
+from warp_resphys.energies.base import PlacedEnergy
+from warp_resphys.energies.potential import IncrementalPotential, StepTerms
 from warp_resphys.mesh import find_chambers
 
 SIZE, DIVISIONS = (0.06, 0.03, 0.02), (6, 3, 3)
@@ -33,3 +36,15 @@ def chambered(kind: str, fibres: Mapping[str, Any] | None = None) -> Body:
     chambers = find_chambers(mesh, (1.0, 0.0, 0.0))
     energies = [Pressure(chambers), *([] if fibres is None else [Fibres(chambers, **fibres)])]
     return clamped(mesh, energies=energies)
+
+
+def force_of(s, q, pressure):
+    """Forces of the pressure alone."""
+    energy, none = s.body.energies[0], torch.zeros(0, dtype=torch.int64)
+    placed = [PlacedEnergy(energy, energy.points(s.body.mesh))]
+    potential = IncrementalPotential(placed, s.body.coordinates, none, len(q), q.device)
+    zeros = torch.zeros_like(q)
+    potential.set_terms(StepTerms(zeros, zeros[..., 0], zeros, [{"pressure": pressure, "apex": None}]))
+    potential.positions.copy_(q)
+    potential.evaluate()
+    return -potential.residual

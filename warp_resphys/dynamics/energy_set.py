@@ -113,9 +113,9 @@ class EnergySet:
                 if energy.names and energy.count_of(q) == energy.count:
                     self.parts[f"{prefix}{q.name}"] = energy.names
             self.memory |= {f"{prefix}{m.name}": replace(m, name=f"{prefix}{m.name}") for m in bound.memory}
-        self._loading, self._stepping, self._posing = (
+        self._loading, self._stepping, self._posing, self._holding = (
             [k for k, bound in enumerate(self._bound) if getattr(type(bound), name) is not getattr(BoundEnergy, name)]
-            for name in ("load", "begin_step", "at_pose")
+            for name in ("load", "begin_step", "at_pose", "load_at_fixed")
         )
         self._remembering = [k for k, bound in enumerate(self._bound) if bound.memory]
         self._rate_independent = [k for k, bound in enumerate(self._bound) if bound.rate_independent]
@@ -200,6 +200,12 @@ class EnergySet:
             force = force + inputs.external_force
         loads = (self._bound[k].load(self._step(step, k)) for k in self._loading)
         return sum((load for load in loads if load is not None), start=force)
+
+    def loads_at_fixed(self, terms: StepTerms, q: torch.Tensor) -> torch.Tensor | None:
+        """Returns what forces (B, N, 3) at fixed vertices have beyond the energies' slopes at q (B, N, 3), or None."""
+        loads = (self._bound[k].load_at_fixed(q, terms.values[k]) for k in self._holding)
+        found = [load for load in loads if load is not None]
+        return sum(found[1:], found[0]) if found else None
 
     @property
     def follow_pose(self) -> bool:

@@ -5,8 +5,9 @@ At a fixed vertex i the potential (``energies.potential``) does not balance. Its
     r_i = k_i (x_i - y_i) - f_i + sum_e dE_e / dx_i,
 
 is the force with which the clamp holds the vertex: that of the energies, damping included, the rate of change of the
-vertex's momentum, less its share of the loads. In a midpoint step, forces and places are those of its middle. What
-planes of symmetry, obstacles and guides in the world exert is not included.
+vertex's momentum, less its share of the loads and what energies add there (`BoundEnergy.load_at_fixed`). In a midpoint
+step, forces and places are those of its middle. What planes of symmetry, obstacles and guides in the world exert is not
+included.
 """
 
 from collections.abc import Callable, Sequence
@@ -166,7 +167,9 @@ class _Equilibrium(AdjointFunction):
         return None, None, *ctx.problem.differentiate(gradient, x, terms, ctx.needs_input_grad[2:])
 
 
-def reaction_of(workspace: Workspace, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor) -> Reaction | None:
+def reaction_of(
+    workspace: Workspace, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor, loads: torch.Tensor | None = None
+) -> Reaction | None:
     """Returns the reaction at the fixed vertices in a solve, differentiable; None without such vertices.
 
     Args:
@@ -174,6 +177,7 @@ def reaction_of(workspace: Workspace, terms: StepTerms, x: torch.Tensor, gradien
         terms: of the solve.
         x: (B, N, 3) its solution [m].
         gradient: (B, D, 3) of the energies at the fixed vertices, from `equilibrium` [N].
+        loads: (B, N, 3) further loads on the fixed vertices, from `EnergySet.loads_at_fixed` [N].
     """
     if not len(fixed := workspace.fixed):
         return None
@@ -183,7 +187,8 @@ def reaction_of(workspace: Workspace, terms: StepTerms, x: torch.Tensor, gradien
         gradient = _FixedGradient.apply(workspace, gradient, x, terms.target, terms.inertia, terms.force, *values)
     places = x[:, fixed]
     inertia = terms.inertia[:, fixed, None] * (places - terms.target[:, fixed])
-    return Reaction(fixed, gradient + inertia - terms.force[:, fixed], places)
+    force = terms.force if loads is None else terms.force + loads
+    return Reaction(fixed, gradient + inertia - force[:, fixed], places)
 
 
 class _FixedGradient(AdjointFunction):

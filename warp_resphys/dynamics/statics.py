@@ -65,8 +65,10 @@ class StaticEquilibrium(TimeStep):
 
     def _solved(self, x: torch.Tensor) -> State:
         """Returns the state of the last `_balance`, with its reaction."""
-        terms = self.terms(near=x if self.equations.energies.follow_pose else None)
-        return replace(self.finish(x), reaction=reaction_of(self.workspace, terms, x, self._gradient))
+        energies = self.equations.energies
+        terms = self.terms(near=x if energies.follow_pose else None)
+        loads = energies.loads_at_fixed(terms, x)
+        return replace(self.finish(x), reaction=reaction_of(self.workspace, terms, x, self._gradient, loads))
 
     @override
     def solve(self, near: torch.Tensor | None = None) -> State:

@@ -80,7 +80,8 @@ class TimeStep:
         start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
         terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
         x, report, gradient = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
-        reaction = self._at_known_velocity(reaction_of(workspace, terms, x, gradient))
-        new = replace(self.finish(equations.coordinates.expand(x)), report=report, reaction=reaction)
+        whole = equations.coordinates.expand(x)
+        reaction = reaction_of(workspace, terms, x, gradient, equations.energies.loads_at_fixed(terms, whole))
+        new = replace(self.finish(whole), report=report, reaction=self._at_known_velocity(reaction))
         workspace.record_positions(new.q)
         return new

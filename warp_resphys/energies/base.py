@@ -250,6 +250,16 @@ class BoundEnergy:
         del step
         return None
 
+    def load_at_fixed(self, q: torch.Tensor, values: Values) -> torch.Tensor | None:
+        """Returns what the forces (B, N, 3) at fixed vertices have beyond the energy's slope [N], or None.
+
+        Args:
+            q: (B, N, 3) solution of a step or an equilibrium [m].
+            values: the values of the term by name.
+        """
+        del q, values
+        return None
+
     def end_step(self, step: EnergyStep, x: torch.Tensor, q: torch.Tensor) -> dict[str, torch.Tensor]:
         """Returns the memory variables (B, ...) after a step, by name; called only if `memory` is not empty.
 

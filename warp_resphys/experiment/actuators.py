@@ -14,12 +14,14 @@ from ..energies.muscles import STRESS, Muscle, Muscles
 from ..energies.pressure import PRESSURE, Pressure
 from ..energies.tendons import CONTRACTION, TENSION, Tendons
 from ..fem.bodies import Body
-from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.arrays import FloatArray, IntArray
+from ..io.errors import InputError, MeshError, naming
 from ..mesh.chambers import Chamber, find_chambers, outer_surface
-from ..mesh.selection import select_cells
+from ..mesh.readers import read_surfaces
+from ..mesh.selection import faces_at, select_cells
 from ..mesh.volume_mesh import Mesh
-from ..settings.body import BodySettings, ChamberSettings, MuscleSettings
+from ..settings.body import BodySettings, MuscleSettings
+from ..settings.mesh import FileMesh, Place
 from ..stepping.quantity import Quantity
 
 # Driving input by group and the value of its key ``commanded``.
@@ -45,12 +47,13 @@ def build_actuators(settings: BodySettings, mesh: Mesh) -> list[Energy]:
     Raises:
         InputError: the number of chambers differs from the mesh, or tendons or muscles do not fit.
     """
-    chambers = build_chambers(settings.chambers, mesh)
+    chambers = build_chambers(settings, mesh)
     energies: list[Energy] = [Pressure(chambers)] if chambers else []
     if settings.fibres is not None:
         if settings.chambers is None:
             raise InputError("fibres is set, but chambers is null: fibres need chambers, so leave them out.")
-        around = chambers if settings.fibres.around == "chambers" else (outer_surface(mesh, settings.chambers.axis),)
+        closed = chambers[: settings.chambers.count]
+        around = closed if settings.fibres.around == "chambers" else (outer_surface(mesh, settings.chambers.axis),)
         wound = {key: value for key, value in settings.fibres if key != "around"}
         energies.append(Fibres(around, axis=settings.chambers.axis, **wound))
     if settings.tendons is not None:
@@ -75,21 +78,39 @@ def energies_of_packages(settings: BodySettings) -> dict[str, Energy]:
     return {name: energy.factory(Energy, f"energies.{name}")() for name, energy in settings.energies.items()}
 
 
-def build_chambers(settings: ChamberSettings | None, mesh: Mesh) -> tuple[Chamber, ...]:
-    """Finds the closed chambers of a mesh, if the group ``chambers`` is set.
+def build_chambers(settings: BodySettings, mesh: Mesh) -> tuple[Chamber, ...]:
+    """Finds the closed chambers of a mesh, and the open faces after them, if the group ``chambers`` is set.
 
     Raises:
-        InputError: their number differs from ``chambers.count``.
+        InputError: their number differs from ``chambers.count``, or open faces have the name of one of them.
+        MeshError: no face lies at a place, or the mesh has no such surface.
     """
-    if settings is None:
+    if (group := settings.chambers) is None:
         return ()
-    chambers = find_chambers(mesh, settings.axis)
-    if len(chambers) != settings.count:
+    closed = find_chambers(mesh, group.axis)
+    if len(closed) != group.count:
         raise InputError(
-            f"the mesh has {len(chambers)} closed chambers, but chambers.count is {settings.count}: open chambers do "
-            "not count, so close them in the mesh, or change chambers.count."
+            f"the mesh has {len(closed)} closed chambers, but chambers.count is {group.count}: open chambers do "
+            "not count, so close them in the mesh, name them in chambers.faces, or change chambers.count."
         )
-    return chambers
+    if twice := group.faces.keys() & {chamber.name for chamber in closed}:
+        raise InputError(f"chambers.faces.{min(twice)}: a closed chamber has this name: choose another.")
+    return *closed, *(Chamber(name, _open_faces(settings, mesh, name)) for name in group.faces)
+
+
+def _open_faces(settings: BodySettings, mesh: Mesh, name: str) -> IntArray:
+    """Returns the faces (F, n) of an entry of ``chambers.faces``, by their place or the surface of the mesh file."""
+    assert settings.chambers is not None
+    place = settings.chambers.faces[name]
+    with naming(f"chambers.faces.{name}: "):
+        if isinstance(place, Place):
+            return faces_at(mesh, place)
+        if not isinstance(settings.mesh, FileMesh):
+            raise MeshError("only meshes from a file have named surfaces: give the place of the faces, as in {z: 0.0}")
+        surfaces = read_surfaces(**settings.mesh.arguments())
+        if place not in surfaces:
+            raise MeshError(f"the mesh has no surface {place!r}; it has {', '.join(surfaces) or 'none with a name'}")
+        return surfaces[place]
 
 
 @dataclass(frozen=True)
@@ -113,7 +134,7 @@ def _driving(settings: BodySettings) -> tuple[Quantity, int] | None:
     """
     driving: dict[str, tuple[Quantity, int]] = {}
     if settings.chambers is not None:
-        driving["chambers"] = PRESSURE, settings.chambers.count
+        driving["chambers"] = PRESSURE, settings.chambers.count + len(settings.chambers.faces)
     if settings.tendons is not None:
         driving["tendons"] = _COMMANDED["tendons"][settings.tendons.commanded], len(settings.tendons.routes)
     if settings.muscles is not None and settings.muscles.commanded is not None:

@@ -375,7 +375,7 @@ class RunReader:
 
     def _driven_chambers(self) -> tuple[Chamber, ...]:
         """Chambers under pressure, in the order of the pressures."""
-        by_name = {chamber.name: chamber for chamber in build_chambers(self.run.chambers, self.body.mesh)}
+        by_name = {chamber.name: chamber for chamber in build_chambers(self.run, self.body.mesh)}
         names = () if self.driven is None or not by_name else self.driven.channels
         if unknown := [name for name in names if name not in by_name]:
             raise DataFileError(

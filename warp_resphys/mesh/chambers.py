@@ -1,4 +1,4 @@
-"""Closed chambers of a body: the inner surfaces on which pressure acts; open cavities."""
+"""Surfaces of a body on which pressure acts: closed chambers, and open faces; open cavities."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,17 +27,27 @@ ensure_kernel_cache()  # before Warp is first used
 
 @dataclass(frozen=True, eq=False)
 class Chamber:
-    """A closed surface inside a body."""
+    """A surface under pressure: a closed one inside a body (`find_chambers`), or open faces (`select_faces`)."""
 
     name: str  # name in results and messages
-    # (F, 3 | 4 | 6) vertices of the faces as from `boundary_faces`, counter-clockwise seen from outside the solid,
-    # that is, from inside the chamber
+    # (F, 3 | 4 | 6 | 8 | 9) vertices of the faces as from `boundary_faces`, counter-clockwise seen from outside the
+    # solid, that is, from the side of the pressure
     faces: NDArray[np.int64]
 
     @property
     def vertices(self) -> NDArray[np.int64]:
         """(S,) vertices of the faces, sorted."""
         return np.unique(self.faces)
+
+    @property
+    def edges(self) -> NDArray[np.int64]:
+        """(E, 2 | 3) vertices of the edges that belong to one face alone, ends first; none if the surface is closed."""
+        corners = FACES[self.faces.shape[1]].corners
+        ends, middles = self.faces[:, :corners], self.faces[:, corners : 2 * corners]
+        nodes = [ends, np.roll(ends, -1, axis=1), *([middles] if middles.shape[1] else [])]
+        edges, count = np.stack(nodes, axis=-1).reshape(-1, len(nodes)), int(self.faces.max(initial=0)) + 1
+        ahead, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+        return edges[~np.isin(ahead, back)]
 
 
 def face_rule(chambers: Sequence[Chamber], degree: int) -> tuple[Shape, Rule]:
@@ -99,11 +109,11 @@ def _along(mesh: Mesh, surfaces: Sequence[NDArray[np.int64]], axis: NDArray[np.f
 
 
 def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
-    """Checks that chambers are closed and correctly oriented, so that pressure has no net force.
+    """Checks that chambers are surfaces of a mesh, correctly oriented if closed (open ones: `check_open_faces`).
 
     Raises:
-        MeshError: a chamber without faces, with vertices that the mesh does not have, with a boundary edge, with wrong
-            orientation, or with a face of another chamber.
+        MeshError: a chamber without faces, with vertices that the mesh does not have, with wrong orientation, or with a
+            face of another chamber.
     """
     owners: dict[frozenset[int], str] = {}
     for chamber in chambers:
@@ -114,20 +124,9 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
             raise MeshError(
                 f"{chamber.name} has faces of vertices that the mesh does not have: take both from one file."
             )
-        corners = faces[:, : FACES[faces.shape[1]].corners]
-        edges = np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2)
-        ahead = edges[:, 0] * len(mesh.vertices) + edges[:, 1]
-        back = edges[:, 1] * len(mesh.vertices) + edges[:, 0]
-        rim = np.flatnonzero(~np.isin(ahead, back))
-        if len(rim):
-            where = ", ".join(f"{1e3 * x:.1f}" for x in mesh.vertices[edges[rim[0]]].mean(axis=0))
-            raise MeshError(
-                f"{chamber.name} is open: {len(rim)} edges of its surface belong to one face alone, one of them at "
-                f"({where}) mm; close the surface, or the pressure would push the body away."
-            )
         triangles = face_triangles(faces)
         volume = -float(np.linalg.det(mesh.vertices[triangles] - mesh.vertices[triangles[0, 0]]).sum()) / 6.0
-        if volume <= 0.0:
+        if volume <= 0.0 and not len(chamber.edges):
             raise MeshError(
                 f"the faces of {chamber.name} look into the solid, or it is the outer surface of the body: list the "
                 "vertices of each face counter-clockwise as seen from inside the chamber."
@@ -136,6 +135,40 @@ def check_chambers(chambers: Sequence[Chamber], mesh: Mesh) -> None:
             other = owners.setdefault(face, chamber.name)
             if other != chamber.name:
                 raise MeshError(f"{chamber.name} and {other} share a face: every face belongs to one chamber.")
+
+
+def check_open_faces(chamber: Chamber, mesh: Mesh, held: NDArray[np.bool_]) -> None:
+    """Checks that open faces look out of the solid, and that their pressure has a potential: their edges are held.
+
+    Args:
+        chamber: with edges.
+        mesh: of the body.
+        held: (E,) whether an edge is fixed, or stays in a symmetry plane.
+
+    Raises:
+        MeshError: a face that is not on the surface of the body, or an edge that can move.
+    """
+    surface = {*map(tuple, _from_lowest(boundary_faces(mesh)).tolist())}
+    inner = [face for face in map(tuple, _from_lowest(chamber.faces).tolist()) if face not in surface]
+    if inner:
+        raise MeshError(
+            f"{len(inner)} of the {len(chamber.faces)} faces of {chamber.name} look into the solid, or are not on the "
+            "surface of the body: take faces from select_faces, read_surfaces or boundary_faces."
+        )
+    if not held.all():
+        where = ", ".join(f"{1e3 * x:.1f}" for x in mesh.vertices[chamber.edges[~held][0]].mean(axis=0))
+        raise MeshError(
+            f"{chamber.name} has {int((~held).sum())} open edges that can move, one of them at ({where}) mm: close the "
+            "surface, fix the vertices of its edges, or let these lie in symmetry planes, as pressure has no potential "
+            "otherwise."
+        )
+
+
+def _from_lowest(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Returns the corners of faces, each from that of the lowest number on."""
+    corners = faces[:, : FACES[faces.shape[1]].corners]
+    order = corners.argmin(axis=1)[:, None] + np.arange(corners.shape[1])
+    return np.take_along_axis(corners, order % corners.shape[1], axis=1)
 
 
 @dataclass(frozen=True)

@@ -83,11 +83,11 @@ class Face:
     triangles: IntArray  # (T, 3) nodes of its triangles, with the face's orientation
 
     def rule(self, degree: int) -> Rule:
-        """Returns a rule that is exact for linear faces, and for a polynomial degree on quadratic ones."""
+        """Returns a rule that is exact for linear fields on linear faces, and for a degree on quadratic ones."""
         quadratic = len(self.shape.nodes) > self.corners
         if self.corners == 4:
             return gauss_box(degree // 2 + 1 if quadratic else 2, 2)
-        return conical_simplex(degree // 2 + 1 if quadratic else 1, 2)
+        return conical_simplex(degree // 2 + 1, 2) if quadratic else (np.full((1, 2), 1.0 / 3.0), np.full(1, 0.5))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Vertices in planes, slabs and boxes, and cells in boxes."""
+"""Vertices and faces in planes, slabs and boxes, and cells in boxes."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from ..io.errors import MeshError
 from ..io.settings import parse
 from ..settings.mesh import Place
 from .elements import ELEMENTS
-from .volume_mesh import Mesh
+from .volume_mesh import Mesh, boundary_faces
 
 Extent = float | Sequence[float]  # a coordinate, or a range of coordinates
 
@@ -30,9 +30,31 @@ def select_vertices(
         InputError: an invalid coordinate.
         MeshError: No coordinate, or no vertex lies there.
     """
-    coordinates = {"x": x, "y": y, "z": z}
+    return vertices_at(mesh, _place("select_vertices", tolerance, x=x, y=y, z=z))
+
+
+def select_faces(
+    mesh: Mesh, x: Extent | None = None, y: Extent | None = None, z: Extent | None = None, tolerance: float = 1e-9
+) -> IntArray:
+    """Returns the faces (F, n) of the surface with all vertices in a plane, a slab or a box, as `boundary_faces`.
+
+    Args:
+        mesh: The mesh.
+        x: A coordinate, or a range of coordinates [m].
+        y: Likewise [m].
+        z: Likewise [m].
+        tolerance: Tolerance of the coordinates [m].
+
+    Raises:
+        InputError: an invalid coordinate.
+        MeshError: No coordinate, or no face lies there.
+    """
+    return faces_at(mesh, _place("select_faces", tolerance, x=x, y=y, z=z))
+
+
+def _place(function: str, tolerance: float, **coordinates: Extent | None) -> Place:
     values = {axis: np.asarray(at).tolist() for axis, at in coordinates.items() if at is not None}
-    return vertices_at(mesh, parse(Place, {**values, "tolerance": tolerance}, "select_vertices"))
+    return parse(Place, {**values, "tolerance": tolerance}, function)
 
 
 def vertices_at(mesh: Mesh, place: Place) -> IntArray:
@@ -54,6 +76,19 @@ def vertices_at(mesh: Mesh, place: Place) -> IntArray:
             "larger tolerance"
         )
     return chosen
+
+
+def faces_at(mesh: Mesh, place: Place) -> IntArray:
+    """Returns the faces (F, n) of the surface with all vertices in a place.
+
+    Raises:
+        MeshError: the place has no coordinate, or no vertex or face lies there.
+    """
+    faces = boundary_faces(mesh)
+    faces = faces[np.isin(faces, vertices_at(mesh, place)).all(axis=1)]
+    if not len(faces):
+        raise MeshError(f"no face of the surface has all its vertices at {place} m: choose a place with whole faces")
+    return faces
 
 
 def select_cells(

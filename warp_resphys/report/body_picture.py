@@ -48,7 +48,7 @@ class MeshSummary:
 
     mesh: Mesh
     fixed: IntArray  # (P,) clamped vertices.
-    chambers: tuple[Chamber, ...]  # Closed chambers.
+    chambers: tuple[Chamber, ...]  # Closed chambers, and open faces under pressure.
     tendons: Mapping[str, FloatArray] = field(default_factory=dict)  # (G, 3) guides [m], by name.
     inside: str = "Chambers"  # Title of the coloured parts.
     obstacles: ObstacleSurface = field(default_factory=ObstacleSurface)  # That the body touches.
@@ -110,7 +110,8 @@ def mesh_picture(summary: MeshSummary, markers: FloatArray | None = None) -> Bod
     ((axes, focus),), half, size = _framed(points, [TOWARDS_VIEWER])
     views = [View(layers, axes, focus, half[1]) for layers in _layers(summary, dots, _line(size))]
     labels = [
-        f"{chamber.name.replace('_', ' ')}: {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³"
+        chamber.name.replace("_", " ")
+        + ("" if len(chamber.edges) else f": {_CUBIC_CENTI * summary.chamber_volume(chamber):.1f} cm³")
         for chamber in summary.chambers
     ]
     labels += [name.replace("_", " ") for name in summary.tendons]

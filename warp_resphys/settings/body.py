@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from typing_extensions import override
 
 from ..io.classes import ClassSettings, package_of
-from ..io.settings import Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
+from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
 from .contact import ContactSettings, ObstacleSettings, SurfaceContactSettings
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, Place, SymmetrySettings
 
@@ -133,10 +133,19 @@ class GlueSettings(Settings):
 
 
 class ChamberSettings(Settings):
-    """Closed chambers of the mesh, each with its own pressure."""
+    """Closed chambers of the mesh, and open faces, each with its own pressure."""
 
-    count: Natural = setting(description="expected number of chambers of the mesh")
-    axis: Direction = setting(description="direction in which chambers are numbered")
+    count: Count = setting(0, "expected number of closed chambers of the mesh")
+    axis: Direction = setting((0.0, 0.0, -1.0), "direction in which closed chambers are numbered")
+    faces: dict[str, Place | Word] = setting(
+        {}, "open faces by name: those with all vertices at a place, or a named surface of the mesh file"
+    )
+
+    @model_validator(mode="after")
+    def _presses(self) -> Self:
+        if not self.count and not self.faces:
+            raise ValueError("count is 0, and faces has none: give the number of chambers, or faces under pressure.")
+        return self
 
 
 class FibreSettings(Settings):
@@ -257,7 +266,7 @@ class BodySettings(Settings):
     rigid: dict[str, Rigid] = setting({}, "rigid regions")
     fixed: Place | None = setting(description="fixed vertices; null: none, of a body that lies on obstacles")
     symmetry: SymmetrySettings | None = setting(None, "symmetry planes that cut the body")
-    chambers: ChamberSettings | None = setting(None, "chambers under pressure")
+    chambers: ChamberSettings | None = setting(None, "chambers and open faces under pressure")
     fibres: FibreSettings | None = setting(None, "fibres around the chambers, or around the body")
     tendons: TendonSettings | None = setting(None, "tendons that pull")
     muscles: MuscleSettings | None = setting(None, "contractile fibres")

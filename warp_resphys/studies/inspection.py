@@ -190,7 +190,9 @@ def _cavities(mesh: Mesh) -> str:
     places = [
         f"{1e4 * cavity.area:.1f} cm2 around ({_millimetres(cavity.centre)}) mm" for cavity in open_cavities(mesh)
     ]
-    return f"{'; '.join(places)}: pressure needs a closed chamber" if places else "none"
+    if not places:
+        return "none"
+    return f"{'; '.join(places)}: pressure needs a closed chamber, or faces with held edges (chambers.faces)"
 
 
 def _millimetres(point: FloatArray) -> str:

@@ -8,6 +8,7 @@ from .dynamics.simulator import Simulator as Simulator
 from .dynamics.tape import record_rollout as record_rollout
 from .dynamics.trajectory import Motion as Motion
 from .energies.catalogue import read_material as read_material
+from .energies.catalogue import silicone as silicone
 from .energies.contact.obstacle_contact import Contact as Contact
 from .energies.contact.surface_contact import SurfaceContact as SurfaceContact
 from .energies.fibres import Fibres as Fibres

@@ -89,7 +89,7 @@ def test_branches_from_a_hold():
 
 
 def test_law_of_another_source_is_a_prior_and_gives_its_branches():
-    """A vague prior changes nothing, a sharp one rules; the stress of known branches is not that of the elastic terms."""
+    """A vague prior changes nothing, a sharp one rules; the stress of known branches is left to them."""
     seconds = np.linspace(0.0, 1.0, len(STRAINS))
     columns = stress_columns("tension", STRAINS, ("c10", "prony_0.5"), seconds)
     test = MaterialTest("tension", STRAINS, 25e3 * columns["c10"] + 6e3 * columns["prony_0.5"], seconds)

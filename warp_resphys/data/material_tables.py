@@ -53,8 +53,8 @@ def read_test(path: Path, table: TableSettings | None = None) -> dict[str, Float
     for pair in _PAIRS:
         if (present := [name for name in pair if name in names.values()]) != present[:1] or not present:
             raise DataFileError(
-                f"{path} has {len(present)} of the columns {' and '.join(pair)}: a test has one of them. Write a header "
-                "such as 'time [s], strain, stress [kPa]', or name all columns in data.table."
+                f"{path} has {len(present)} of the columns {' and '.join(pair)}: a test has one of them. Write a "
+                "header such as 'time [s], strain, stress [kPa]', or name all columns in data.table."
             )
     values = [[number(row[column]) if column < len(row) else None for column in names] for row in rows[first:]]
     kept = np.array([one for one in values if None not in one], dtype=np.float64).reshape(-1, len(names))

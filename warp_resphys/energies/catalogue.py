@@ -13,6 +13,7 @@ from ..io.classes import imported
 from ..io.errors import DataFileError, InputError, listed
 from ..io.safe_files import read_json
 from ..mesh.volume_mesh import Mesh
+from ..settings.silicones import silicone_files, silicone_name
 from .convex_material import ConvexMaterial
 from .materials import MASS_DAMPING, Corotated, Gent, Material, MooneyRivlin, StableNeoHookean
 
@@ -20,7 +21,6 @@ MATERIALS: Final[dict[str, type[Material]]] = {
     kind.model: kind for kind in (Corotated, StableNeoHookean, MooneyRivlin, Gent, ConvexMaterial)
 }
 LAW_FORMAT: Final = 2
-_LAWS: Final = Path(__file__).parents[1] / "laws"
 _UNITS: Final = {
     "density": "kg/m^3",
     "mass": "1/s",
@@ -64,7 +64,7 @@ def law_path(name: str) -> Path:
     path = Path(name).expanduser()
     if path.is_file():
         return path
-    known = {shipped.stem: shipped for shipped in _LAWS.glob("*.json")}
+    known = silicone_files()
     if name not in known:
         raise DataFileError(f"there is no law {name}: give the law.json of a run, or one of {listed(sorted(known))}.")
     return known[name]
@@ -198,3 +198,21 @@ def read_material(name: str) -> Material:
     """
     law = read_law(name)
     return make_material(law["model"], **{key: x for key, x in law["parameters"].items() if key != MASS_DAMPING})
+
+
+def silicone(product: str) -> Material:
+    """Returns the material of a silicone, by its law that comes with the package (docs/results/silicones.md).
+
+    Batches differ, by mixing, cure and age, as do laboratories: identify the law of your own (`identify_from_tests`),
+    or the factor of the stiffness on your robot.
+
+    Args:
+        product: name, such as ``Ecoflex 00-30`` or ``ecoflex_00_30``.
+
+    Raises:
+        InputError: the package has no law of it.
+    """
+    try:
+        return read_material(silicone_name(product))
+    except ValueError as error:
+        raise InputError(f"silicone: {error}") from error

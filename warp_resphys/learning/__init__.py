@@ -5,8 +5,11 @@ from ..settings.learning import Prior as Prior
 from .evaluation import evaluate as evaluate
 from .identification.identification import identify as identify
 from .identification.law_search import identify_law as identify_law
+from .identification.material_tests import identify_from_tests as identify_from_tests
 from .identification.search import Identification as Identification
 from .identification.search import search_parameters as search_parameters
+from .identification.specimens import MaterialTest as MaterialTest
+from .identification.specimens import Specimen as Specimen
 from .observed_motions import ObservedMotions as ObservedMotions
 from .residuals.actuator_fit import fit_actuator as fit_actuator
 from .residuals.fitting import fit_force as fit_force

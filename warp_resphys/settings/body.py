@@ -10,6 +10,7 @@ from ..io.classes import ClassSettings, package_of
 from ..io.settings import Count, Many, Natural, NotNegative, Positive, Settings, Vector, Word, setting, without_null
 from .contact import ContactSettings, ObstacleSettings, SurfaceContactSettings
 from .mesh import BoxSettings, Curve, Direction, Divisions, MeshSettings, Place, SymmetrySettings
+from .silicones import silicone_values
 
 SolverName = Literal["quasi_newton", "newton", "projective_dynamics"]
 LinearSolverName = Literal["auto", "banded", "tiled", "dense", "sparse", "pardiso"]
@@ -38,9 +39,11 @@ class _Parameters(Settings):
     @model_validator(mode="before")
     @classmethod
     def _of_other_package(cls, values: Any) -> Any:
-        """Takes Hydra's ``_target_``, a class of another package, as the model."""
-        if not isinstance(values, dict) or values.get("_target_") is None:
+        """Takes Hydra's ``_target_``, a class of another package, as the model, and the law of a silicone by name."""
+        if not isinstance(values, dict):
             return values
+        if values.get("_target_") is None:
+            return silicone_values(values)
         if values.get("model") is not None:
             raise ValueError("model and _target_ are both given: set one of them to null.")
         return {key: value for key, value in values.items() if key != "_target_"} | {"model": values["_target_"]}
@@ -76,7 +79,8 @@ class MaterialSettings(_Parameters):
 
     model: Word = Field(
         "corotated",
-        description="constitutive model, corotated by default; _target_ instead: a class of another package",
+        description="constitutive model, corotated by default; silicone: the law of a silicone of the package by its "
+        "name; _target_ instead: a class of another package",
         json_schema_extra=_without_default,
     )
     regions: dict[str, RegionMaterialSettings] = setting({}, "materials of regions of the mesh, by name")

@@ -30,7 +30,6 @@ from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.folds import Fold, intervals_of_folds, run_folds, workers_for
 from .experiment.laboratory import run_laboratory
 from .experiment.learning_stages import evaluate, identify, identify_law, reconstruct, train, train_actuator
-from .experiment.material_tests import material_stages, print_material, table_files
 from .experiment.mesh_check import check_mesh
 from .experiment.recordings.importing import import_recordings, import_scaled
 from .experiment.report import collect_metrics, make_folds_report, make_report
@@ -282,6 +281,8 @@ def prepare(run: RunSettings) -> None:
     if run.device == "cpu" or not torch.cuda.is_available():
         torch.set_num_threads(1)  # The networks are too small for several threads (linalg/threads.py).
     if run.material_tests is not None:
+        from .experiment.material_stages import table_files
+
         table_files(run.material_tests)
     elif run.pictures is None:
         check_run(run)
@@ -315,8 +316,9 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
         print_pictures(run, folder)
         return
     if run.material_tests is not None:
-        paths = table_files(run.material_tests)
-        run_stages(material_stages(run, {str(path): digest(path) for path in paths}), folder)
+        from .experiment.material_stages import material_stages, print_material
+
+        run_stages(material_stages(run, run.material_tests), folder)
         print_material(run, folder)
         return
     if run.ablation is not None:

@@ -31,7 +31,7 @@ from warp_resphys.learning.identification import search
 from warp_resphys.mesh.volume_mesh import boundary_triangles
 from warp_resphys.pictures import ClosedSurface, Lens, Outline, PlacedCamera
 from warp_resphys.pictures.scene_files import read_tracked
-from warp_resphys.report.pictures_page import PictureResult, picture_verdict
+from warp_resphys.report.pages.pictures_page import PictureResult, picture_verdict
 from warp_resphys.settings.run import RunSettings
 
 SIZE = (640, 360)

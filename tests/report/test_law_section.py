@@ -15,7 +15,7 @@ from warp_resphys.io.safe_files import read_json, write_json
 from warp_resphys.report import law_section
 from warp_resphys.report.law_section import ACROSS, ALONG, uniaxial_stress
 from warp_resphys.report.page import Cell
-from warp_resphys.report.run_page import range_table
+from warp_resphys.report.pages.run_page import range_table
 from warp_resphys.report.wording import number_text
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.learning import LawSettings

@@ -18,10 +18,10 @@ from warp_resphys.experiment.report import RunReader, make_folds_report
 from warp_resphys.io.resuming import StageContext
 from warp_resphys.io.safe_files import read_json, write_json
 from warp_resphys.mesh.readers import write_mesh
-from warp_resphys.report import run_page
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.page import Canvas, Drawn
+from warp_resphys.report.pages import run_page
 from warp_resphys.report.wording import NONE, number_text
 
 ARM = arm_settings()

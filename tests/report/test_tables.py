@@ -22,7 +22,7 @@ from warp_resphys.report.control_section import control_section
 from warp_resphys.report.data import Driven, at_times
 from warp_resphys.report.identification_section import parameter_rows, placement_text, uncertainty_text
 from warp_resphys.report.page import Cell, PageTable, Row
-from warp_resphys.report.run_page import range_table
+from warp_resphys.report.pages.run_page import range_table
 from warp_resphys.report.wording import MINUS, NO_BREAK_SPACE, NONE
 from warp_resphys.settings.learning import IdentifySettings
 

@@ -26,7 +26,7 @@ KINDS: Final = ("tension", "compression", "biaxial", "planar", "shear")
 TERMS: Final = re.compile(r"c10|c20|c30|c01|c02|ogden_m?\d+")  # elastic coefficients with a column
 
 
-class Path(NamedTuple):
+class DeformationPath(NamedTuple):
     """A path of deformation at N strains x, with its derivatives by x."""
 
     stretches: FloatArray  # (N, 3)
@@ -36,7 +36,7 @@ class Path(NamedTuple):
     work: float  # number of directions that are loaded alike, over which the work is shared
 
 
-def path_of(kind: str, strain: FloatArray) -> Path:
+def path_of(kind: str, strain: FloatArray) -> DeformationPath:
     """Returns the path of a kind of test at strains (N,)."""
     x, one, zero = strain, np.ones_like(strain), np.zeros_like(strain)
     if kind == "shear":
@@ -49,14 +49,14 @@ def path_of(kind: str, strain: FloatArray) -> Path:
         green[:, 1, 1] = 0.5 * x**2
         by_x[:, 0, 1] = by_x[:, 1, 0] = 0.5
         by_x[:, 1, 1] = x
-        return Path(np.stack(stretches, 1), np.stack(slopes, 1), green, by_x, 1.0)
+        return DeformationPath(np.stack(stretches, 1), np.stack(slopes, 1), green, by_x, 1.0)
     along, sign = (1.0 - x, -1.0) if kind == "compression" else (1.0 + x, 1.0)
     powers = {"biaxial": (1.0, 1.0, -2.0), "planar": (1.0, 0.0, -1.0)}.get(kind, (1.0, -0.5, -0.5))
     s = np.stack([along**p for p in powers], 1)
     slope = sign * np.stack([p * along ** (p - 1.0) for p in powers], 1)
     axes = np.eye(3)
     green, by_x = 0.5 * (s**2 - 1.0)[..., None] * axes, (s * slope)[..., None] * axes
-    return Path(s, slope, green, by_x, 2.0 if kind == "biaxial" else 1.0)
+    return DeformationPath(s, slope, green, by_x, 2.0 if kind == "biaxial" else 1.0)
 
 
 def stress_columns(
@@ -102,7 +102,7 @@ def bulk_of(parameters: Mapping[str, float], poissons_ratio: float) -> float:
     return shear_modulus(parameters) * poissons_ratio / (1.0 - 2.0 * poissons_ratio)
 
 
-def _elastic(term: str, path: Path) -> FloatArray:
+def _elastic(term: str, path: DeformationPath) -> FloatArray:
     s, slope = path.stretches, path.stretch_slopes
     if ogden := re.fullmatch(r"ogden_(m?)(\d+)", term):
         n = int(ogden[2]) * (-1 if ogden[1] else 1)

@@ -29,7 +29,7 @@ from .folds import workers_for
 from .simulate import build_target, weights
 
 if TYPE_CHECKING:
-    from ..report.ablation_page import AblationMetrics
+    from ..report.pages.ablation_page import AblationMetrics
 
 MOTION = "motion.h5"
 DRAWS = "ablation.h5"
@@ -80,7 +80,7 @@ def print_ablation(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json and prints the errors."""
     metrics = _metrics(folder, run)
     write_json(folder / METRICS, metrics)
-    from ..report.ablation_page import MarkerErrors, ablation_table, verdict  # matplotlib
+    from ..report.pages.ablation_page import MarkerErrors, ablation_table, verdict  # matplotlib
 
     rows = [MarkerErrors(**row) for row in metrics["by_markers"]]
     show(run.heading, ablation_table(rows), verdict(rows, metrics["uncorrected_mm"]), f"Report: {folder / REPORT}")
@@ -194,7 +194,7 @@ def summarise_draws(count: int, errors_mm: NDArray[np.float64], misfits_mm: NDAr
 
 def report_ablation(context: StageContext) -> None:
     """Writes report.html and its figure."""
-    from ..report.ablation_page import write_ablation_report  # matplotlib
+    from ..report.pages.ablation_page import write_ablation_report  # matplotlib
 
     run: RunSettings = context.settings
     body = build_body(run)

@@ -67,7 +67,7 @@ def make_report(context: StageContext) -> None:
     Raises:
         DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
     """
-    from ..report import run_page  # matplotlib
+    from ..report.pages import run_page  # matplotlib
 
     run_page.write_report(context.run_dir / REPORT, RunReader(context.run_dir, context.settings).report())
 
@@ -78,7 +78,7 @@ def make_folds_report(context: StageContext) -> None:
     Raises:
         DataFileError: a file of an earlier stage is missing or damaged, or a file could not be written.
     """
-    from ..report import run_page  # matplotlib
+    from ..report.pages import run_page  # matplotlib
 
     folder, run = context.run_dir, context.settings
     metrics: Metrics = read_json(folder / METRICS)

@@ -23,12 +23,12 @@ from .learning import (
     TrainerSettings,
     TrainingSettings,
 )
-from .material_tests import MaterialTestData
 from .mesh import Place
 from .observed import BindingSettings, MarkerSettings
 from .performed import MotionSettings, by_file
 from .pictures import PictureData
 from .played import LaboratorySettings, ShapeSettings
+from .specimen import MaterialTestData
 
 Name = Annotated[
     str,

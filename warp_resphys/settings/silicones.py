@@ -1,4 +1,4 @@
-"""Laws of silicones that come with the package, by name: ``scripts/silicones.py`` writes most of them."""
+"""Laws of silicones that come with the package, by name: ``scripts/silicone_laws.py`` writes most of them."""
 
 import re
 from pathlib import Path

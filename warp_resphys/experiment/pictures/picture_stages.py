@@ -28,7 +28,7 @@ from ...pictures.picture_misfit import PictureMisfit, values_of
 from ...pictures.released_force import OF_RELEASE
 from ...pictures.seen import CLAMP_SHIFT, CLAMP_TURN, NEUTRAL, SeenPose, Shape, distance_of
 from ...report.identification_section import parameter_rows
-from ...report.pictures_page import (
+from ...report.pages.pictures_page import (
     PictureMetrics,
     PictureResult,
     distance_table,

@@ -1,24 +1,24 @@
 """The law of a material from tests of specimens: stages and results."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..data.material_tables import read_test
-from ..energies.catalogue import read_law
+from ..energies.catalogue import law_path, read_law
 from ..energies.isochoric import bulk_of
 from ..io.arrays import BoolArray, FloatArray
+from ..io.atomic import digest
 from ..io.errors import DataFileError, InputError, naming
 from ..io.progress import show
 from ..io.resuming import Stage, StageContext, package_versions, resources_used
 from ..io.safe_files import read_json, write_json
 from ..learning.identification.material_tests import MeasuredLaw, identify_from_tests
 from ..learning.identification.specimens import LEAST_SAMPLES, MaterialTest, Specimen
-from ..report.material_page import TestMetrics, TestResult, test_table, test_verdict, write_material_report
-from ..settings.material_tests import MaterialTestData, MaterialTestSettings, SimulatedTests
+from ..report.pages.material_page import TestMetrics, TestResult, test_table, test_verdict, write_material_report
 from ..settings.run import RunSettings
+from ..settings.specimen import MaterialTestData, MaterialTestSettings, SimulatedTests
 from ..settings.stage_keys import StageSettings
 from .files import LAW_FILE, METRICS, REPORT
 
@@ -26,13 +26,11 @@ RESULTS = "material_tests.json"
 _REACH = 2.0  # ratio of the largest strain that is predicted to the largest that the law is identified from
 
 
-def material_stages(run: RunSettings, files: Mapping[str, str]) -> list[Stage]:
-    """Returns the stages.
-
-    Args:
-        run: settings with ``data.kind: material_tests``.
-        files: SHA-256 of the files that are read, by path.
-    """
+def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
+    """Returns the stages of a run with some tests."""
+    files = {str(path): digest(path) for path in table_files(data)}
+    if run.law is not None and run.law.file is not None:
+        files[run.law.file] = digest(law_path(run.law.file))
     settings = StageSettings.reading(run, "simulation", "law", "data", "seed", "name", files=files)
     return [
         Stage("identify_law", identify_material, (LAW_FILE, RESULTS), settings),
@@ -132,7 +130,7 @@ def identify_material(context: StageContext) -> None:
     simplest = law if not law.groups else identify_from_tests(learned, terms=(), **options)
     results = {name: _result(name, test, learned[name], law, simplest, high) for name, test in tests.items()}
     content = law.content()
-    content["data"] = {"name": settings.name, "trials": [*tests]}
+    content["data"], content["versions"] = {"name": settings.name, "trials": [*tests]}, dict(package_versions())
     write_json(context.run_dir / LAW_FILE, content)
     write_json(context.run_dir / RESULTS, {"tests": results, "machines": law.machines, "rates": law.rates})
 

@@ -9,11 +9,11 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from ..io.arrays import FloatArray
-from ..settings.run import RunSettings
-from .figures import new_figure, use_logarithm
-from .page import Canvas, Cell, PageTable, Part, Row, Text, Usage, write_page
-from .wording import NO_BREAK_SPACE, TONES, number_text
+from ...io.arrays import FloatArray
+from ...settings.run import RunSettings
+from ..figures import new_figure, use_logarithm
+from ..page import Canvas, Cell, PageTable, Part, Row, Text, Usage, write_page
+from ..wording import NO_BREAK_SPACE, TONES, number_text
 
 _COLUMNS: Final[Mapping[str, str]] = {
     "median_mm": "Median [mm]",

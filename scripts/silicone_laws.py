@@ -1,6 +1,6 @@
 """Writes the laws of silicones, warp_resphys/laws/*.json, and the tables of docs/results/silicones.md from tests.
 
-    python scripts/silicones.py FOLDER
+    python scripts/silicone_laws.py FOLDER
 
 FOLDER has the tables of the Soft Robotics Materials Database (Marechal and others, Soft Robotics 8, 2021,
 doi 10.1089/soro.2019.0115; repository LucMarechal/Soft-Robotics-Materials-Database, Open Database License 1.0).
@@ -19,6 +19,7 @@ import numpy as np
 from warp_resphys.data.material_tables import read_test
 from warp_resphys.energies.catalogue import read_law
 from warp_resphys.energies.isochoric import shear_modulus, stress
+from warp_resphys.io.resuming import package_versions
 from warp_resphys.learning.identification.material_tests import MeasuredLaw, identify_from_tests
 from warp_resphys.learning.identification.specimens import MaterialTest
 from warp_resphys.settings.data_kinds import TableSettings
@@ -91,6 +92,7 @@ def main(arguments: Sequence[str]) -> None:
     for name, law in laws.items():
         content: dict[str, Any] = {**law.content()}
         del content["classes"]
+        content["versions"] = package_versions()
         content["data"] = {"material": LAWS[name][0], "source": SOURCE, "strains": [LOW, SHIPPED]}
         text = json.dumps(content, indent=1, ensure_ascii=False)
         (ROOT / "warp_resphys" / "laws" / f"{name}.json").write_text(text + "\n", encoding="utf-8")

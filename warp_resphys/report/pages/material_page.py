@@ -6,13 +6,13 @@ from typing import Any, Final, TypedDict
 
 import numpy as np
 
-from ..energies.catalogue import LawContent
-from ..settings.run import RunSettings
-from . import figures
-from .identification_section import identified_cell, within_sentence
-from .law_section import wording
-from .page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
-from .wording import NONE, TONES, in_a_row, number_text, share_text, significant, unbroken
+from ...energies.catalogue import LawContent
+from ...settings.run import RunSettings
+from .. import figures
+from ..identification_section import identified_cell, within_sentence
+from ..law_section import wording
+from ..page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
+from ..wording import NONE, TONES, in_a_row, number_text, share_text, significant, unbroken
 
 _MODELS: Final = {"law": "Law", "neo_hookean": "Neo-Hookean", "hooke": "Hooke"}
 _PARTS: Final = {"range": "in the range", "beyond": "beyond, up to twice"}

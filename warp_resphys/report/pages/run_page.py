@@ -6,17 +6,17 @@ from typing import Any, Final
 
 from markupsafe import Markup
 
-from ..io.errors import number_of
-from .actuator_section import actuator_section
-from .body_section import body_section, paths_section
-from .control_section import control_section
-from .data import Metrics, RunReport, folds_in, trial_errors
-from .error_section import error_section, training_section
-from .identification_section import identification_section
-from .law_section import law_section
-from .motion_section import motion_section
-from .page import Canvas, Cell, PageTable, Part, Row, Text, write_page
-from .sections import (
+from ...io.errors import number_of
+from ..actuator_section import actuator_section
+from ..body_section import body_section, paths_section
+from ..control_section import control_section
+from ..data import Metrics, RunReport, folds_in, trial_errors
+from ..error_section import error_section, training_section
+from ..identification_section import identification_section
+from ..law_section import law_section
+from ..motion_section import motion_section
+from ..page import Canvas, Cell, PageTable, Part, Row, Text, write_page
+from ..sections import (
     details_table,
     horizons_section,
     quality_section,
@@ -24,8 +24,8 @@ from .sections import (
     shapes_section,
     trials_section,
 )
-from .verdict import LEAST_TRIALS, results_table, verdict
-from .wording import MODELS, mm_text, unbroken
+from ..verdict import LEAST_TRIALS, results_table, verdict
+from ..wording import MODELS, mm_text, unbroken
 
 _WITHOUT_RECORDINGS: Final = Markup(
     "No recordings are configured (<code>data.folder</code>): the measurements are simulated, with noise on the "

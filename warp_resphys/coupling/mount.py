@@ -10,14 +10,14 @@ part of the reaction that the accelerations of this step and of the last K ones 
 
     m_n = sum_k (1 - k / (K + 1))^2 Z_k a_{n-k},        d_n = r_n - m_n,
 
-acts in this step, and the remainder d is that of the last one. The body feels the wrench w = -(m_{n+1} + d_n), which
+acts in this step, and the remainder is extrapolated: the body feels the wrench w = -(m_{n+1} + 2 d_n - d_{n-1}), which
 is solved with MuJoCo's step a(w) and its mobility A = da / dw (`MountingBody.place`) by a fixed number of iterations
 
-    w <- w - (1 + Z_0 A)^{-1} (w + m(a(w)) + d_n).
+    w <- w - (1 + Z_0 A)^{-1} (w + m(a(w)) + 2 d_n - d_{n-1}).
 
-Then the robot makes its step, one solve, with its base where the body is. Sums over w + r telescope to the last d less
-the first one: the programs exchange momentum except for one step's change of d. A rigid robot has Z_0 of a rigid body,
-Z_k = 0 and a constant d: the scheme is that of one rigid body. The weights are convex, so they keep the response
+Then the robot makes its step, one solve, with its base where the body is. The sum of w + r over steps telescopes to the
+last change of d less the first one: momentum is exchanged except for H times that. A rigid robot has the Z_0 of a rigid
+body, Z_k = 0 and a constant d: the scheme is that of one rigid body. The weights are convex, so they keep the response
 passive (Polya's criterion), while the last terms of a memory that ends abruptly add energy (docs/coupling.md).
 
 Verified by tests/coupling/test_mount.py.
@@ -54,8 +54,8 @@ class MountedState(Brief):
         pose: (E, 6) of the base [m, rad].
         velocity: (E, 6) mean twist of the base over the last step [m/s, rad/s].
         wrench: (E, 6) of the robot on the mounting body in the last step, about the origin of the base [N, N m].
-        remainder: (E, 6) d [N, N m].
-        accelerations: (E, K + 1, 6) a of the last steps, the last one first [m/s^2, rad/s^2].
+        remainder: (E, 2, 6) d of the last step and of the one before [N, N m].
+        accelerations: (E, K, 6) a of the last steps, the last one first [m/s^2, rad/s^2].
         response: (E, K + 1, 6, 6) weighted Z_k, in axes of the base [kg, kg m, kg m^2].
     """
 
@@ -137,9 +137,11 @@ class Mount:
             columns.append(change * self.time_step**2 / nudge.max())
         turn = _turns(pose)[:, None]
         response = _transposed(turn) @ np.stack(columns, axis=-1) @ turn * _WEIGHTS[:, None, None]
-        accelerations = np.zeros((len(arm), len(_WEIGHTS), 6))
+        accelerations = np.zeros((len(arm), len(_WEIGHTS) - 1, 6))
         first = still[:, 0]
-        return MountedState(arm, start, pose, np.zeros_like(pose), -first, first, accelerations, response)
+        return MountedState(
+            arm, start, pose, np.zeros_like(pose), -first, np.stack([first, first], axis=1), accelerations, response
+        )
 
     def _probe(self, state: State, pose: FloatArray, nudge: FloatArray, inputs: Mapping[str, Any]) -> FloatArray:
         """Returns the reactions (E, K + 1, 6) of steps in which the base moves by a nudge (6,) a step."""
@@ -168,27 +170,35 @@ class Mount:
         count, h = len(state.arm), self.time_step
         controls = self._controls(ctrl, count)
         before, mobility = (np.stack(x) for x in zip(*(self._body.place(row) for row in state.arm), strict=True))
-        turn = _turns(before)[:, None]
-        response, past = turn @ state.response @ _transposed(turn), state.accelerations[:, :-1]
-        known = np.einsum("ekij,ekj->ei", response[:, 1:], past) + state.remainder
+        turn, past = _turns(before)[:, None], state.accelerations
+        response = turn @ state.response @ _transposed(turn)
+        remainder = 2.0 * state.remainder[:, 0] - state.remainder[:, 1]
+        expected = np.einsum("ekij,ekj->ei", response[:, 1:], past) + remainder
         correction = np.linalg.inv(np.eye(6) + response[:, 0] @ mobility)
 
-        def moved(wrench: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Returns arms (E, S) and poses (E, 6) after the step, and the predicted reactions (E, 6)."""
+        def moved(wrench: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+            """Returns arms (E, S), poses (E, 6), twists (E, 6) and expected reactions (E, 6) after the step."""
             rows = zip(state.arm, controls, wrench, strict=True)
             arm, pose = (np.stack(x) for x in zip(*(self._body.advance(*row) for row in rows), strict=True))
-            acceleration = (twist(before, pose, h) - state.velocity) / h
-            return arm, pose, _times(response[:, 0], acceleration) + known
+            velocity = twist(before, pose, h)
+            return arm, pose, velocity, _times(response[:, 0], (velocity - state.velocity) / h) + expected
 
         wrench = state.wrench
         for _ in range(self._iterations - 1):
-            wrench = wrench - _times(correction, wrench + moved(wrench)[2])
-        arm, pose, predicted = moved(wrench)
-        robot, velocity = self._step(state.robot, pose, inputs), twist(before, pose, h)
-        remainder = state.remainder + self._reaction(robot, pose) - predicted
-        last = ((velocity - state.velocity) / h)[:, None]
-        accelerations = np.concatenate([last, past], axis=1)
-        return MountedState(arm, robot, pose, velocity, wrench, remainder, accelerations, state.response)
+            wrench = wrench - _times(correction, wrench + moved(wrench)[-1])
+        arm, pose, velocity, reaction = moved(wrench)
+        robot, acceleration = self._step(state.robot, pose, inputs), (velocity - state.velocity) / h
+        remainder = remainder + self._reaction(robot, pose) - reaction
+        return replace(
+            state,
+            arm=arm,
+            robot=robot,
+            pose=pose,
+            velocity=velocity,
+            wrench=wrench,
+            remainder=np.stack([remainder, state.remainder[:, 0]], axis=1),
+            accelerations=np.concatenate([acceleration[:, None], past[:, :-1]], axis=1),
+        )
 
     def _controls(self, ctrl: ArrayLike | None, count: int) -> Sequence[FloatArray | None]:
         """Returns the controls of each environment."""

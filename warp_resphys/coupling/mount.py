@@ -40,6 +40,7 @@ from ..robot.robot_scene import RobotScene
 from ..stepping.state import State
 from .mounting_body import _HERE, MountingBody, twist
 
+_INTEGRATOR: Final = "implicit_euler"  # whose acceleration of the base is a
 _NUDGE: Final = 1e-4  # displacement of the first step that measures the response, in sizes of the robot, and turn [rad]
 _WEIGHTS: Final = (1.0 - np.arange(9) / 9.0) ** 2  # (K + 1,) of the response after k steps
 
@@ -90,7 +91,7 @@ class Mount:
         iterations: number of MuJoCo's steps in a step, at least 2; more help where the arm is in contact itself.
 
     Raises:
-        InputError: a robot without a base, other errors of `MountingBody`, or fewer than two iterations.
+        InputError: a robot without a base or with another integrator than implicit Euler, other errors of `MountingBody`, or fewer than two iterations.
     """
 
     def __init__(
@@ -100,10 +101,21 @@ class Mount:
         loose = [name for name, one in self._robots.items() if BASE not in one.inputs]
         if loose:
             raise InputError(f"{listed(loose)} has no fixed vertices: mount a robot that is fixed at its base.")
+        used = {one.simulator.integrator for one in self._robots.values()}
+        if used != {_INTEGRATOR}:
+            raise InputError(
+                f"the integrator is {listed(sorted(used))}: mount robots of {_INTEGRATOR}, as of "
+                f"robot.integrated_by({_INTEGRATOR!r})."
+            )
         if iterations < 2:
             raise InputError(f"iterations is {iterations}: give 2 or more.")
         self.robot, self._iterations, self.time_step = robot, iterations, robot.simulator.time_step
         self._body = MountingBody(model, body, pose, self.time_step, robot.simulator.gravity)
+
+    @property
+    def model(self) -> Any:
+        """Returns the `mujoco.MjModel`."""
+        return self._body.model
 
     def data(self, state: MountedState, environment: int = 0) -> Any:
         """Returns a new `mujoco.MjData` of an environment after `mj_forward`, to read or to draw the arm."""

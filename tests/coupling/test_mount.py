@@ -286,7 +286,9 @@ def test_an_arm_from_urdf():
 
 def test_what_cannot_be_mounted_is_refused(monkeypatch):
     robot, arm = beam(), mujoco.MjModel.from_xml_string(ARM)
-    refuses(InputError, "no body 'flnge', did you mean 'flange'.*'world', 'upper', 'flange'", Mount, robot, arm, "flnge")
+    refuses(
+        InputError, "no body 'flnge', did you mean 'flange'.*'world', 'upper', 'flange'", Mount, robot, arm, "flnge"
+    )
     refuses(InputError, "the body 'world' cannot move", Mount, robot, arm, "world")
     refuses(InputError, "give six numbers", Mount, robot, arm, "flange", (0, 0))
     refuses(InputError, "the model is a str", Mount, robot, "arm.xml", "flange")

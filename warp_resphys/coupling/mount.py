@@ -91,7 +91,8 @@ class Mount:
         iterations: number of MuJoCo's steps in a step, at least 2; more help where the arm is in contact itself.
 
     Raises:
-        InputError: a robot without a base or with another integrator than implicit Euler, other errors of `MountingBody`, or fewer than two iterations.
+        InputError: a robot without a base, or with another integrator than implicit Euler; fewer than two iterations;
+            or an error of `MountingBody`.
     """
 
     def __init__(
@@ -139,7 +140,8 @@ class Mount:
         if any(np.any(arm.qvel) for arm in arms):
             raise InputError("the arm moves: begin with qvel = 0.")
         arm = np.stack([self._body.state_of(one) for one in arms])
-        pose = np.stack([self._body.place(row)[0] for row in arm])
+        frame = np.stack([self._body.place(row)[0] for row in arm])
+        pose = _poses(frame)
         start = self._begin(pose, inputs)
         rest = self.robot.simulator.rest_positions
         size = float((rest.amax(0) - rest.amin(0)).max())
@@ -147,7 +149,7 @@ class Mount:
         for nudge in _NUDGE * np.diag([size] * 3 + [1.0] * 3):
             change = self._probe(start, pose, nudge, inputs) - still
             columns.append(change * self.time_step**2 / nudge.max())
-        turn = _turns(pose)[:, None]
+        turn = _turns(frame)[:, None]
         response = _transposed(turn) @ np.stack(columns, axis=-1) @ turn * _WEIGHTS[:, None, None]
         accelerations = np.zeros((len(arm), len(_WEIGHTS) - 1, 6))
         first = still[:, 0]
@@ -189,16 +191,17 @@ class Mount:
         correction = np.linalg.inv(np.eye(6) + response[:, 0] @ mobility)
 
         def moved(wrench: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-            """Returns arms (E, S), poses (E, 6), twists (E, 6) and expected reactions (E, 6) after the step."""
+            """Returns arms (E, S), frames (E, 7), twists (E, 6) and expected reactions (E, 6) after the step."""
             rows = zip(state.arm, controls, wrench, strict=True)
-            arm, pose = (np.stack(x) for x in zip(*(self._body.advance(*row) for row in rows), strict=True))
-            velocity = twist(before, pose, h)
-            return arm, pose, velocity, _times(response[:, 0], (velocity - state.velocity) / h) + expected
+            arm, frame = (np.stack(x) for x in zip(*(self._body.advance(*row) for row in rows), strict=True))
+            velocity = twist(before, frame, h)
+            return arm, frame, velocity, _times(response[:, 0], (velocity - state.velocity) / h) + expected
 
         wrench = state.wrench
         for _ in range(self._iterations - 1):
             wrench = wrench - _times(correction, wrench + moved(wrench)[-1])
-        arm, pose, velocity, reaction = moved(wrench)
+        arm, frame, velocity, reaction = moved(wrench)
+        pose = _poses(frame)
         robot, acceleration = self._step(state.robot, pose, inputs), (velocity - state.velocity) / h
         remainder = remainder + self._reaction(robot, pose) - reaction
         return replace(
@@ -255,10 +258,16 @@ class Mount:
         return np.where(state.lost.cpu().numpy()[:, None], 0.0, whole)
 
 
-def _turns(pose: FloatArray) -> FloatArray:
-    """Matrices (E, 6, 6) from twists or wrenches in axes of the base to those in axes of the world."""
-    turns = np.zeros((len(pose), 6, 6))
-    turns[:, :3, :3] = turns[:, 3:, 3:] = Rotation.from_rotvec(pose[:, 3:]).as_matrix()
+def _poses(frames: FloatArray) -> FloatArray:
+    """Returns the poses (E, 6) of frames (E, 7)."""
+    turned = Rotation.from_quat(frames[:, 3:], scalar_first=True).as_rotvec()
+    return np.concatenate([frames[:, :3], turned], axis=1)
+
+
+def _turns(frames: FloatArray) -> FloatArray:
+    """Returns matrices (E, 6, 6) from twists or wrenches in axes of frames (E, 7) to those in axes of the world."""
+    turns = np.zeros((len(frames), 6, 6))
+    turns[:, :3, :3] = turns[:, 3:, 3:] = Rotation.from_quat(frames[:, 3:], scalar_first=True).as_matrix()
     return turns
 
 

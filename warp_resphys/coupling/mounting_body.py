@@ -54,19 +54,25 @@ def base_pose(model: Any, data: Any, body: str, pose: ArrayLike = _HERE) -> Floa
     Raises:
         InputError: no such body, or a pose that is none.
     """
-    return _placed(data, _number(model, body), *pose_of("the robot on its body", pose))
-
-
-def _placed(data: Any, body: int, rotation: FloatArray, shift: FloatArray) -> FloatArray:
-    """Returns the pose (6,) in the world of a frame in that of a body."""
-    turned = data.xmat[body].reshape(3, 3)
-    return np.concatenate([data.xpos[body] + turned @ shift, Rotation.from_matrix(turned @ rotation).as_rotvec()])
+    rotation, shift = pose_of("the robot on its body", pose)
+    placed = data.body(_number(model, body))
+    turned = placed.xmat.reshape(3, 3)
+    return np.concatenate([placed.xpos + turned @ shift, Rotation.from_matrix(turned @ rotation).as_rotvec()])
 
 
 def twist(before: FloatArray, after: FloatArray, time_step: float) -> FloatArray:
-    """Returns the mean twists (..., 6) over a step between poses (..., 6)."""
-    turned = Rotation.from_rotvec(after[..., 3:]) * Rotation.from_rotvec(before[..., 3:]).inv()
-    return np.concatenate([after[..., :3] - before[..., :3], turned.as_rotvec()], axis=-1) / time_step
+    """Returns the mean twists (E, 6) over a step between frames (E, 7), places [m] and quaternions, w first."""
+    (w, v), (a, b) = ((one[:, 3:4], one[:, 4:]) for one in (after, before))
+    cosine, turn = w * a + (v * b).sum(1, keepdims=True), a * v - w * b - _cross(v, b)  # of after times before^-1
+    sine = np.linalg.norm(turn, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(cosine)) * np.sign(cosine)
+    turned = turn * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0.0)
+    return np.concatenate([after[:, :3] - before[:, :3], turned], axis=1) / time_step
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Returns the cross products (..., 3) of vectors, ten times as fast as NumPy for a few of them."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 class MountingBody:
@@ -93,7 +99,8 @@ class MountingBody:
         self.model, self._body, self._time_step = model, _number(model, body), time_step
         if model.body_weldid[self._body] == 0:
             raise InputError(f"the body {body!r} cannot move: mount the robot on one with a joint above it.")
-        self._rotation, self._shift = pose_of("the robot on its body", pose)
+        rotation, self._shift = pose_of("the robot on its body", pose)
+        self._turn = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
         ratio = time_step / model.opt.timestep
         self._substeps = round(ratio)
         if self._substeps < 1 or abs(ratio - self._substeps) > _WHOLE * ratio:
@@ -127,7 +134,7 @@ class MountingBody:
         return data
 
     def place(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns the pose (6,) of the base in a state (S,), and the mobility A (6, 6) of the body there.
+        """Returns the frame (7,) of the base in a state (S,), see `twist`, and the mobility A (6, 6) of the body there.
 
         A is the change of the mean acceleration of the base over a step per unit of wrench, J M^-1 J^T with the
         Jacobian J of the body at the base and the mass matrix M of the model; without contacts, limits and damping.
@@ -135,23 +142,36 @@ class MountingBody:
         model, data = self.model, self._data
         self._mujoco.mj_setState(model, data, state, self._kind)
         self._mujoco.mj_fwdPosition(model, data)
-        pose, jacobian = self._ahead()
+        jacobian = self._jacobian()
         solved = np.zeros_like(jacobian)
         self._mujoco.mj_solveM(model, data, solved, jacobian)
-        return pose, jacobian @ solved.T
+        return self._ahead(), jacobian @ solved.T
 
-    def _ahead(self) -> tuple[FloatArray, FloatArray]:
-        """Returns the pose (6,) of the base, tau ahead of the positions in the data, and its Jacobian (6, nv)."""
-        pose, jacobian = _placed(self._data, self._body, self._rotation, self._shift), np.zeros((6, self.model.nv))
-        self._mujoco.mj_jac(self.model, self._data, jacobian[:3], jacobian[3:], pose[:3], self._body)
+    def _origin(self) -> FloatArray:
+        """Returns the place (3,) of the base's origin for the positions in the data [m]."""
+        data, body = self._data, self._body
+        return np.asarray(data.xpos[body] + data.xmat[body].reshape(3, 3) @ self._shift)
+
+    def _jacobian(self) -> FloatArray:
+        """Returns the Jacobian (6, nv) of the base."""
+        jacobian = np.zeros((6, self.model.nv))
+        self._mujoco.mj_jac(self.model, self._data, jacobian[:3], jacobian[3:], self._origin(), self._body)
+        return jacobian
+
+    def _ahead(self) -> FloatArray:
+        """Returns the frame (7,) of the base, tau ahead of the positions in the data."""
+        origin, turn, swing = self._origin(), np.empty(4), np.empty(4)
+        self._mujoco.mju_mulQuat(turn, self._data.xquat[self._body], self._turn)
         if self._substeps > 1:
-            moved = 0.5 * (self._substeps - 1) * self.model.opt.timestep * jacobian @ self._data.qvel
-            turned = Rotation.from_rotvec(moved[3:]) * Rotation.from_rotvec(pose[3:])
-            pose = np.concatenate([pose[:3] + moved[:3], turned.as_rotvec()])
-        return pose, jacobian
+            moved = 0.5 * (self._substeps - 1) * self.model.opt.timestep * self._jacobian() @ self._data.qvel
+            angle = float(np.linalg.norm(moved[3:]))
+            self._mujoco.mju_axisAngle2Quat(swing, moved[3:] / max(angle, 1e-300), angle)
+            origin, turned = origin + moved[:3], turn.copy()
+            self._mujoco.mju_mulQuat(turn, swing, turned)
+        return np.concatenate([origin, turn])
 
     def advance(self, state: FloatArray, ctrl: FloatArray | None, wrench: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Returns the state (S,) and the pose (6,) of the base after a step of the robot under a constant wrench (6,).
+        """Returns the state (S,) and the frame (7,) of the base after a step of the robot under a constant wrench (6,).
 
         Args:
             state: (S,) at its start.
@@ -165,8 +185,8 @@ class MountingBody:
         self._mujoco.mj_setState(model, data, state, self._kind)
         self._mujoco.mj_kinematics(model, data)
         self._mujoco.mj_comPos(model, data)
-        arm = _placed(data, self._body, self._rotation, self._shift)[:3] - data.xipos[self._body]
-        data.xfrc_applied[self._body] = np.concatenate([wrench[:3], wrench[3:] + np.cross(arm, wrench[:3])])
+        arm = self._origin() - data.xipos[self._body]
+        data.xfrc_applied[self._body] = np.concatenate([wrench[:3], wrench[3:] + _cross(arm, wrench[:3])])
         if ctrl is not None:
             data.ctrl[:] = ctrl
         data.warning.number[:] = 0
@@ -180,4 +200,4 @@ class MountingBody:
         after = self.state_of(data)
         self._mujoco.mj_kinematics(model, data)
         self._mujoco.mj_comPos(model, data)
-        return after, self._ahead()[0]
+        return after, self._ahead()

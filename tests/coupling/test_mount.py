@@ -1,11 +1,15 @@
 """Robots on bodies of MuJoCo models: rigid bodies, heavy robots, momentum, statics, batches, scenes, refusals."""
 
+import re
 from functools import cache
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import warp_resphys
 from support.configured import settings
 from support.refusals import refuses
 from warp_resphys import RobotScene, box_hexahedra
@@ -17,6 +21,7 @@ from warp_resphys.settings.body import MaterialSettings, SimulatorSettings
 mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
 from warp_resphys.coupling import Mount, base_pose  # noqa: E402
+from warp_resphys.coupling.mount import _WEIGHTS  # noqa: E402
 
 SIZE, DIVISIONS, MASS = (0.1, 0.02, 0.02), (3, 1, 1), 0.04  # m, cells, kg
 STIFF, SOFT = 1e8, 2e5  # Pa
@@ -303,3 +308,50 @@ def test_what_cannot_be_mounted_is_refused(monkeypatch):
     refuses(InputError, "the arm moves", mount.begin, moving)
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     refuses(InputError, r"pip install 'warp-resphys\[mujoco\]'", Mount, robot, arm, "flange")
+
+
+def test_the_code_of_the_page_runs(monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "coupling.md").read_text(encoding="utf-8")
+    monkeypatch.setattr(warp_resphys, "load", lambda run: beam(gravity=-9.80709))
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        exec(block, names)
+    assert names["state"].wrench[0, 2] < 0.0
+
+
+def growth(masses, stiffness, ratio, weights):
+    """Spectral radius of the scheme for a chain of masses, of one unit together, on a body of 1 / ratio; H = 1."""
+    count, memory = masses + 1, len(weights) - 1
+    mass = np.diag([0.5, *[1.0] * (masses - 1), 0.5]) / masses
+    spring = 2.0 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1)
+    spring[0, 0] = spring[-1, -1] = 1.0
+    hessian = mass + masses * stiffness * spring
+    inverse = np.linalg.inv(hessian[1:, 1:])
+
+    def follow(q, v, base):
+        load = mass @ (q + v)
+        new = np.concatenate([[base], inverse @ (load[1:] - hessian[1:, 0] * base)])
+        return new, new - q, (hessian @ new - load)[0]
+
+    q, v, response = np.zeros(count), np.zeros(count), []
+    for number in range(memory + 1):
+        q, v, reaction = follow(q, v, number + 1.0)
+        response.append(reaction)
+    response = weights * np.array(response)
+
+    def step(state):
+        (q, v), (last, before), past = state[: 2 * count].reshape(2, -1), state[2 * count :][:2], state[2 * count + 2 :]
+        explained = response[1:] @ past
+        a = -(explained + 2.0 * last - before) / (1.0 / ratio + response[0])
+        q, v, reaction = follow(q, v, q[0] + v[0] + a)
+        remainder = reaction - response[0] * a - explained
+        return np.concatenate([q, v, [remainder, last], np.concatenate([[a], past])[:memory]])
+
+    return np.abs(np.linalg.eigvals(np.transpose([step(row) for row in np.eye(2 * count + 2 + memory)]))).max()
+
+
+def test_the_scheme_is_stable_for_chains_of_masses_with_a_memory_that_fades():
+    cases = list(product((1, 8, 40), 10.0 ** np.arange(-4, 5), (0.1, 10.0, 100.0)))
+    assert max(growth(*case, _WEIGHTS) for case in cases) < 1.0 + 1e-4  # a triple eigenvalue 1
+    assert max(growth(*case, np.ones_like(_WEIGHTS)) for case in cases) > 1.02
+    assert max(growth(*case, _WEIGHTS[:1]) for case in cases) > 1.02

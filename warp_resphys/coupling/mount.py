@@ -96,7 +96,7 @@ class Mount:
     """
 
     def __init__(
-        self, robot: Robot | RobotScene, model: Any, body: str, pose: ArrayLike = _HERE, iterations: int = 3
+        self, robot: Robot | RobotScene, model: Any, body: str, pose: ArrayLike = _HERE, iterations: int = 2
     ) -> None:
         self._robots = robot.robots if isinstance(robot, RobotScene) else {"the robot": robot}
         loose = [name for name, one in self._robots.items() if BASE not in one.inputs]

@@ -136,16 +136,16 @@ class MountingBody:
     def place(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Returns the frame (7,) of the base in a state (S,), see `twist`, and the mobility A (6, 6) of the body there.
 
-        A is the change of the mean acceleration of the base over a step per unit of wrench, J M^-1 J^T with the
-        Jacobian J of the body at the base and the mass matrix M of the model; without contacts, limits and damping.
+        A is the change of the mean acceleration of the base over a step per unit of wrench, J (M + h D)^-1 J^T with the
+        Jacobian J of the body at the base, the mass matrix M and the joints' damping D; without contacts and limits.
         """
         model, data = self.model, self._data
         self._mujoco.mj_setState(model, data, state, self._kind)
         self._mujoco.mj_fwdPosition(model, data)
-        jacobian = self._jacobian()
-        solved = np.zeros_like(jacobian)
-        self._mujoco.mj_solveM(model, data, solved, jacobian)
-        return self._ahead(), jacobian @ solved.T
+        jacobian, inertia = self._jacobian(), np.zeros((model.nv, model.nv))
+        self._mujoco.mj_fullM(model, data, inertia)
+        inertia += model.opt.timestep * np.diag(model.dof_damping)
+        return self._ahead(), jacobian @ np.linalg.solve(inertia, jacobian.T)
 
     def _origin(self) -> FloatArray:
         """Returns the place (3,) of the base's origin for the positions in the data [m]."""

@@ -13,6 +13,7 @@ import warp_resphys
 from support.configured import settings
 from support.refusals import refuses
 from warp_resphys import RobotScene, box_hexahedra
+from warp_resphys.experiment.build import build_mesh
 from warp_resphys.io.errors import InputError
 from warp_resphys.robot.description import Description
 from warp_resphys.robot.robot import Robot
@@ -272,6 +273,29 @@ def test_robots_of_a_scene_move_together():
     moved = state.robot.q[0, ours].numpy()[fixed]
     assert np.linalg.norm(moved - wanted, axis=1) == pytest.approx(0.01, rel=1e-6)  # the shift of its pose
     refuses(InputError, "there is no robot 'top' in the scene", scene.step, state, top={})
+
+
+@pytest.mark.slow
+def test_an_arm_feels_the_ball_that_its_gripper_lifts():
+    """Two fingers close on a ball on a table, and the arm lifts it; then its torques are those of statics to 0.5 %."""
+    run = settings("experiment=finger", "integrator=implicit_euler")
+    finger = Robot(Description("finger", "simulation", SimulatorSettings.of(run), run.simulation, build_mesh(run.mesh)))
+    gripper = pytest.importorskip("warp_resphys.environments.making", exc_type=ImportError).gripper
+    scene, arm = gripper(finger), mujoco.MjModel.from_xml_string(ARM)
+    arm.opt.timestep = 0.002  # a fifth of the gripper's
+    arm.body("upper").pos[:] = -0.3, 0.0, 0.2
+    mount = Mount(scene, arm, "flange", (0.0, 0.0, -0.2, 0.0, 0.0, 0.0))
+    state = mount.begin(at(arm))
+    fingers = -state.wrench[0, 2]
+    for number in range(110):
+        pull, lift = min(number / 25, 1.0) * 2.0, min(max(number - 30, 0) / 50, 1.0) * 0.0667
+        state = mount.step(state, [-lift, lift], **{name: {"tendon_tension": pull} for name in scene.robots})
+    q, data = state.robot.q[0].numpy(), mount.data(state)
+    ball, weights = scene.scene.vertex_slice("ball"), scene.constants.load_mass[0].numpy() * 9.80709
+    assert q[ball, 2].mean() > scene.simulator.rest_positions[ball, 2].mean() + 0.018
+    assert -state.wrench[0, 2] == pytest.approx(fingers + weights[ball].sum(), rel=5e-3)
+    wanted = data.qfrc_bias - weights @ (q[:, :1] - data.xanchor[:, 0])
+    np.testing.assert_allclose(data.actuator_force, wanted, rtol=5e-3, atol=2e-3)
 
 
 URDF = (

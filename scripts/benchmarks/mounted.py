@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from warp_resphys.coupling.mount import Mount, MountedState
+from warp_resphys.coupling.mounting_body import mujoco_package
 from warp_resphys.experiment.build import build_mesh, choose_device
 from warp_resphys.io.settings import parse
 from warp_resphys.overrides import composed
@@ -47,7 +48,7 @@ def measure_mounts(arguments: argparse.Namespace) -> dict[str, Any]:
         their ratio, and the time of `Mount.begin`; and the time of the yardstick.
 
     Raises:
-        InputError: an unknown setting.
+        InputError: an unknown setting, or MuJoCo is not installed.
     """
     overrides = ["time_step=0.005", "integrator=implicit_euler", f"device={choose_device(arguments.device)}"]
     settings = parse(RunSettings, composed("config", [*overrides, *arguments.settings]))
@@ -68,8 +69,7 @@ def measure_mounts(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _cases(robot: Robot, batch: int, substeps: int) -> tuple[list[Callable[[], dict[str, float]]], float]:
     """Returns tasks with and without the arm, and the time of `Mount.begin` [ms]."""
-    import mujoco
-
+    mujoco = mujoco_package()
     mount = Mount(robot, mujoco.MjModel.from_xml_string(arm(robot.time_step / substeps)), "flange")
     device = robot.simulator.rest_positions.device
     starts = [mujoco.MjData(mount.model) for _ in range(batch)]

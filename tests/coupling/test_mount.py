@@ -34,11 +34,11 @@ TURNED = (0.03, -0.02, 0.05, 0.4, -0.3, 0.2)
 
 
 @cache
-def beam(time_step=0.005, youngs_modulus=SOFT, gravity=-9.81, damping=0.0, integrator="implicit_euler"):
+def beam(time_step=0.005, youngs_modulus=SOFT, gravity=-9.81, damping=0.0, on_failure="raise"):
     """A beam of 40 g along x, clamped at x = 0."""
     run = settings(
         f"mesh={{kind:box_hexahedra,size:{[*SIZE]},divisions:{[*DIVISIONS]}}}",
-        f"integrator={integrator}",
+        "integrator=implicit_euler",
         f"time_step={time_step}",
         f"gravity=[0,0,{gravity}]",
         f"simulation.youngs_modulus={youngs_modulus}",
@@ -47,7 +47,8 @@ def beam(time_step=0.005, youngs_modulus=SOFT, gravity=-9.81, damping=0.0, integ
         "simulation.mass_damping=0",
     )
     own = MaterialSettings.model_validate({**run.simulation.plain(), "model": "corotated"})
-    return Robot(Description("beam", "sysid", SimulatorSettings.of(run), own, box_hexahedra(SIZE, DIVISIONS)))
+    made = Description("beam", "sysid", SimulatorSettings.of(run), own, box_hexahedra(SIZE, DIVISIONS))
+    return Robot(made, on_failure=on_failure)
 
 
 def model(joint, time_step=0.005, mass=0.04, gravity=-9.81, inside="", outside=""):
@@ -231,6 +232,21 @@ def test_a_batch_moves_as_its_arms_do_alone():
     mixed = start.where(np.array([True, False]), both)
     np.testing.assert_array_equal(mixed.arm, [start.arm[0], both.arm[1]])
     torch.testing.assert_close(mixed.robot.q, torch.stack([start.robot.q[0], both.robot.q[1]]))
+
+
+def test_an_arm_goes_on_without_a_robot_that_is_lost():
+    robot = beam(on_failure="count")
+    mount = Mount(robot, model(HINGE, gravity=-9.81), "box")
+    state, thrown = mount.begin([at(mount.model, 0.3)] * 2), np.zeros((2, *robot.simulator.rest_positions.shape))
+    thrown[1, -1] = 1e9
+    state = mount.step(state, external_force=thrown)
+    speed = state.velocity[1, 4]
+    for _ in range(3):
+        state = mount.step(state)
+    assert state.robot.lost.tolist() == [False, True]
+    assert np.abs(state.wrench[0]).max() > 0.1
+    assert np.abs(state.wrench[1]).max() == 0.0
+    assert state.velocity[1, 4] == pytest.approx(speed)  # of a ball about its middle
 
 
 def test_one_way_a_robot_follows_the_arm_in_one_line():

@@ -38,7 +38,7 @@ from ..robot.actuation import BASE
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
 from ..stepping.state import State
-from .mounting_body import _HERE, MountingBody, twist
+from .mounting_body import HERE, MountingBody, twist
 
 _INTEGRATOR: Final = "implicit_euler"  # whose acceleration of the base is a
 _NUDGE: Final = 1e-4  # displacement of the first step that measures the response, in sizes of the robot, and turn [rad]
@@ -96,7 +96,7 @@ class Mount:
     """
 
     def __init__(
-        self, robot: Robot | RobotScene, model: Any, body: str, pose: ArrayLike = _HERE, iterations: int = 2
+        self, robot: Robot | RobotScene, model: Any, body: str, pose: ArrayLike = HERE, iterations: int = 2
     ) -> None:
         self._robots = robot.robots if isinstance(robot, RobotScene) else {"the robot": robot}
         loose = [name for name, one in self._robots.items() if BASE not in one.inputs]
@@ -203,7 +203,8 @@ class Mount:
         arm, frame, velocity, reaction = moved(wrench)
         pose = _poses(frame)
         robot, acceleration = self._step(state.robot, pose, inputs), (velocity - state.velocity) / h
-        remainder = remainder + self._reaction(robot, pose) - reaction
+        remainder = np.stack([remainder + self._reaction(robot, pose) - reaction, state.remainder[:, 0]], axis=1)
+        lost = robot.lost.cpu().numpy()[:, None, None]  # their arms go on alone
         return replace(
             state,
             arm=arm,
@@ -211,8 +212,9 @@ class Mount:
             pose=pose,
             velocity=velocity,
             wrench=wrench,
-            remainder=np.stack([remainder, state.remainder[:, 0]], axis=1),
+            remainder=np.where(lost, 0.0, remainder),
             accelerations=np.concatenate([acceleration[:, None], past[:, :-1]], axis=1),
+            response=np.where(lost[..., None], 0.0, state.response),
         )
 
     def _controls(self, ctrl: ArrayLike | None, count: int) -> Sequence[FloatArray | None]:
@@ -248,14 +250,14 @@ class Mount:
         return {name: {**inputs.get(name, {}), BASE: base} for name, base in self.robot.bases(pose).items()}
 
     def _reaction(self, state: State, pose: FloatArray) -> FloatArray:
-        """Returns the wrench (E, 6) that holds the robot about its base; zero for environments that are lost."""
+        """Returns the wrench (E, 6) that holds the robot about its base; NaN for environments that are lost."""
         whole, simulator = np.zeros_like(pose), self.robot.simulator
         scene = isinstance(self.robot, RobotScene)
         for name in self._robots:
             reaction = simulator.reaction(state, name if scene else None)
             wrench = torch.cat([reaction.force, reaction.moment(pose[:, :3])], -1).double().cpu().numpy()
             whole += wrench
-        return np.where(state.lost.cpu().numpy()[:, None], 0.0, whole)
+        return whole
 
 
 def _poses(frames: FloatArray) -> FloatArray:

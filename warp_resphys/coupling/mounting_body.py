@@ -22,10 +22,10 @@ from ..robot.robot_scene import pose_of
 
 _WHOLE: Final = 1e-6  # deviation of the ratio of the time steps from a whole number
 _GRAVITY: Final = 0.01  # difference of gravity between model and robot [m/s^2]
-_HERE: Final = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+HERE: Final = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # the pose (6,) of the frame itself
 
 
-def _mujoco() -> Any:
+def mujoco_package() -> Any:
     """Returns the package `mujoco`, or raises InputError where it is not installed."""
     try:
         import mujoco
@@ -42,7 +42,7 @@ def _number(model: Any, body: str) -> int:
     return names.index(body)
 
 
-def base_pose(model: Any, data: Any, body: str, pose: ArrayLike = _HERE) -> FloatArray:
+def base_pose(model: Any, data: Any, body: str, pose: ArrayLike = HERE) -> FloatArray:
     """Returns the pose (6,) of a robot's base on a body, translation [m] and rotation vector [rad], for `Robot.step`.
 
     Args:
@@ -93,7 +93,7 @@ class MountingBody:
     def __init__(
         self, model: Any, body: str, pose: ArrayLike, time_step: float, gravity: Sequence[float] | FloatArray
     ) -> None:
-        self._mujoco = mujoco = _mujoco()
+        self._mujoco = mujoco = mujoco_package()
         if not isinstance(model, mujoco.MjModel):
             raise InputError(f"the model is a {type(model).__name__}: give a mujoco.MjModel, as from `from_xml_path`.")
         self.model, self._body, self._time_step = model, _number(model, body), time_step

@@ -8,6 +8,7 @@ r"""Times the simulator on this machine: medians over repeats that take turns, b
     python scripts/benchmark.py sizes mesh=beam_tetrahedra --linear-solvers sparse pardiso
     python scripts/benchmark.py twin RUN engine=reduced              a twin on the trials of a run
     python scripts/benchmark.py gripper
+    python scripts/benchmark.py mounts --substeps 1 5               robots on arms, over robots alone
     python scripts/benchmark.py peers --programs newton mujoco        a block in contact, at equal error
 
 Results are printed as tables, and added to a JSON file of the machine, where they replace those of the same subcommand.
@@ -26,7 +27,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
-from benchmarks import gripper, peers, steps, twin_rate
+from benchmarks import gripper, mounted, peers, steps, twin_rate
 
 from warp_resphys.commands import USER_ERROR
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
@@ -114,6 +115,10 @@ def command_line() -> argparse.ArgumentParser:
     grasp.add_argument("--batches", nargs="+", type=int, help="numbers of grippers")
     grasp.add_argument("--fingers", nargs=3, type=int, default=[2, 2, 10], help="bricks of a finger")
     grasp.add_argument("--factors", choices=["double", "single"], default="double")
+    arms = parts.add_parser("mounts", parents=[shared], help="robots on arms of MuJoCo, over robots alone")
+    arms.set_defaults(measure=mounted.measure_mounts)
+    arms.add_argument("--batches", nargs="+", type=int, default=[1], help="numbers of arms (default: 1)")
+    arms.add_argument("--substeps", nargs="+", type=int, default=[1, 5], help="of MuJoCo in a step (default: 1 5)")
     other = parts.add_parser("peers", parents=[shared], help="beside Newton and MuJoCo, at equal error")
     other.set_defaults(measure=peers.measure_peers)
     other.add_argument("--programs", nargs="*", choices=["newton", "mujoco"], default=["newton", "mujoco"])

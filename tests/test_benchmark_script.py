@@ -102,6 +102,15 @@ def test_all_grippers_hold_the_ball_and_nothing_crosses(measured):
     assert row["without_contact_ms"] < row["grasp_ms"]
 
 
+@pytest.mark.slow
+def test_an_arm_costs_little_beside_its_robot(measured):
+    pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    result = measured("mounts", "mesh.divisions=[2,1,1]", "--repeats=1", "--substeps", "1", "2")
+    rows = result["a step of all robots on arms"]
+    assert [(row["arms"], row["substeps"], row["vertices"]) for row in rows] == [(1, 1, 12), (1, 2, 12)]
+    assert all(row["ratio"] == pytest.approx(row["coupled_ms"] / row["alone_ms"]) for row in rows)
+
+
 class TestPeers:
     @pytest.mark.parametrize(("error", "said"), [(1e-1, "1"), (1e-3, "2"), (6e-5, "2"), (1e-6, "-")])
     def test_the_least_time_with_no_more_error(self, error, said):

@@ -163,3 +163,12 @@ def test_its_law_moves_another_body_as_a_simulator_of_it_does(of_a_law):
     assert (kept.learned, kept.markers, kept.intervals) == (None, None, None)
     refuses(InputError, "no_such_key", of_a_law.on, LONG, no_such_key=1)
     refuses(MeshError, "no vertex", of_a_law.on, LONG, fixed={"x": 5.0})
+
+
+def test_a_robot_begins_with_its_base_turned_by_any_angle():
+    """About the vertical, its equilibrium turns with it; upside down, it is that of its rest shape there."""
+    robot = beam()
+    turn = torch.tensor([[np.cos(3.0), -np.sin(3.0), 0], [np.sin(3.0), np.cos(3.0), 0], [0, 0, 1]])
+    torch.testing.assert_close(robot.begin(base=[0.0, 0, 0, 0, 0, 3.0]).q, robot.begin().q @ turn.mT, rtol=0, atol=1e-9)
+    over = robot.begin(base=[0.0, 0.02, 0.02, np.pi, 0, 0])  # the beam is in the same place, its top below
+    torch.testing.assert_close(over.q[0].mean(0), robot.begin().q[0].mean(0), rtol=0, atol=1e-9)

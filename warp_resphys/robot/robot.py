@@ -31,8 +31,9 @@ from ..mesh.volume_mesh import Mesh
 from ..stepping.adjoints import refuse_transforms
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import rollout, states
+from ..stepping.rotations import rotations
 from ..stepping.state import State
-from .actuation import Acting, Commands, Given, InputReader, inputs_of, moved_actuators
+from .actuation import BASE, Acting, Commands, Given, InputReader, inputs_of, moved_actuators
 from .description import Description
 
 
@@ -215,7 +216,10 @@ class Robot:
         acting = self._commands.act(state, values).inputs
         if not self.simulator.is_held(state, acting, self.constants):
             return state
-        body = self.simulator.static_equilibrium(acting, self.constants, batch=batch)
+        base, start = values.get(BASE), None
+        if base is not None:
+            start = self.simulator.rest_positions @ rotations(base[:, 3:]).mT + base[:, None, :3]
+        body = self.simulator.static_equilibrium(acting, self.constants, start, batch)
         return body.with_memory(state.memory_of())
 
     def settle(self, batch: int = 1, **inputs: Given) -> State:

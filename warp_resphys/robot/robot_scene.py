@@ -9,6 +9,8 @@ import torch
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from ..data.base_motion import in_frame
+from ..data.registration import RigidTransform
 from ..dynamics.simulator import Simulator
 from ..energies.contact.surface_contact import SurfaceContact
 from ..energies.materials import Material
@@ -62,7 +64,7 @@ class RobotScene:
         for name, placed in robots.items():
             if not (isinstance(placed, tuple) and len(placed) == 2 and isinstance(placed[0], Robot)):
                 raise InputError(f"{name} is {placed!r}: give a robot and its pose, as in (robot, (x, y, z, 0, 0, 0)).")
-            self.robots[name], self._poses[name] = placed[0], _pose(name, placed[1])
+            self.robots[name], self._poses[name] = placed[0], pose_of(name, placed[1])
             if placed[0].is_data_driven:
                 raise InputError(f"{name} has no simulator, only a network for its mesh: load another model.")
             if name in (objects or {}):
@@ -189,6 +191,15 @@ class RobotScene:
             name: self._placed(name, robot.observe(self.state_of(state, name))) for name, robot in self.robots.items()
         }
 
+    def bases(self, pose: ArrayLike) -> dict[str, FloatArray]:
+        """Returns the input ``base`` of every robot by name, if one body that carries all of them moves.
+
+        Args:
+            pose: (B, 6) of that body, which was at the origin of the scene [m, rad].
+        """
+        moved = np.atleast_2d(np.asarray(pose, dtype=np.float64))
+        return {name: in_frame(moved, RigidTransform(r.T, -r.T @ t)) for name, (r, t) in self._poses.items()}
+
     def _checked(self, inputs: Mapping[str, Mapping[str, Given]] | None) -> Mapping[str, Mapping[str, Given]]:
         by_robot = inputs or {}
         for name in by_robot:
@@ -223,8 +234,8 @@ class RobotScene:
         return inputs.replace(**fields)
 
 
-def _pose(name: str, pose: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Rotation (3, 3) and translation (3,) of a pose (6,)."""
+def pose_of(name: str, pose: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Returns rotation (3, 3) and translation (3,) [m] of a pose (6,), or raises InputError for one that is none."""
     try:
         values = np.asarray(pose, dtype=np.float64)
     except (TypeError, ValueError):

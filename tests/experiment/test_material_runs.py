@@ -1,0 +1,157 @@
+"""Laws of silicones from tables of testing machines, through the command line, and the silicones of the package."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warp_resphys
+from support.command_line import outcome, refusal
+from support.configured import composed
+from support.refusals import refuses
+from warp_resphys.data.material_tables import read_test
+from warp_resphys.energies.isochoric import stress
+from warp_resphys.io.errors import DataFileError, InputError
+from warp_resphys.io.safe_files import read_json
+from warp_resphys.io.settings import parse
+from warp_resphys.learning import MaterialTest, identify_from_tests
+from warp_resphys.settings.body import MaterialSettings
+from warp_resphys.settings.data_kinds import TableSettings
+from warp_resphys.settings.run import RunSettings
+
+SILICONE = {"c10": 10e3, "ogden_3": 25e3}
+BAR = "specimen: {length: 0.033, width: 0.006, thickness: 0.003, ends: free}"
+PUBLIC = Path(__file__).parents[2].parent / "shared" / "data" / "silicone_tensile"
+
+
+def written(folder, header="time [s], displacement [mm], force [N]", noise=0.005):
+    """A table of a tensile test up to 200 %, with repeated times, as machines write them."""
+    strain = np.linspace(0.01, 2.0, 200)
+    force = stress("tension", strain, SILICONE) * 18e-6
+    force *= 1.0 + noise * np.random.default_rng(0).standard_normal(200)
+    rows = [f"{0.1 * k:.1f}, {33.0 * e:.4f}, {f:.5f}" for k, (e, f) in enumerate(zip(strain, force, strict=True))]
+    path = folder / "tension.csv"
+    path.write_text("\n".join([header, *rows[:150], rows[149], *rows[150:]]), encoding="utf-8")
+    return path
+
+
+def arguments(folder, *more):
+    tests = f"data.tests={{tension: {{kind: tension, file: tension.csv, {BAR}}}}}"
+    common = ("experiment=material_test", "data.simulated=null", f"data.folder={folder}", tests)
+    return [*common, "data.range=[0.05, 1.0]", f"hydra.run.dir={folder}/run", *more]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tests")
+    written(folder)
+    result = outcome(*arguments(folder))
+    return folder / "run", result
+
+
+def test_a_table_gives_a_law(run):
+    folder, result = run
+    law, metrics = read_json(folder / "law.json"), read_json(folder / "metrics.json")
+    assert law["groups"] == ["ogden_3"]
+    for name, true in SILICONE.items():
+        assert law["parameters"][name] == pytest.approx(true, abs=3.0 * law["deviation"][name])
+    assert law["stretches"] == pytest.approx([2.0**-0.5, 2.0], rel=0.01)
+    errors = metrics["tests"]["tension"]["errors"]
+    assert errors["range"]["law"] < 0.01 < errors["range"]["neo_hookean"]
+    assert errors["beyond"]["law"] < 0.1 * errors["beyond"]["neo_hookean"]
+    assert metrics["tests"]["tension"]["covered"] == 1.0
+    assert metrics["rates"] == pytest.approx([0.1, 0.1], rel=0.01)
+    assert "Stress over strain" in (folder / "report.html").read_text(encoding="utf-8")
+    assert (folder / "figures" / "curves.png").stat().st_size > 10_000
+    assert "neo-Hookean term and Ogden's term of exponent 3" in result.out
+    assert np.isclose(warp_resphys.read_material(str(folder / "law.json")).values["c10"], law["parameters"]["c10"])
+
+
+def test_tables_of_other_machines(tmp_path):
+    path = tmp_path / "other.csv"
+    path.write_text("Material;Ecoflex\n\nZeit (s);Dehnung;Spannung (MPa)\n0,1;0,1;0,002\n0,2;0,2;0,004\n;;\n", "utf-8")
+    described = read_test(path, TableSettings(columns=("time [s]", "strain [%]", "stress [MPa]"), header_lines=3))
+    np.testing.assert_allclose(described["strain"], [0.001, 0.002])
+    named = read_test(
+        path, TableSettings(names={"Dehnung": "strain", "Spannung (MPa)": "stress [MPa]"}, header_lines=2)
+    )
+    np.testing.assert_allclose(named["stress"], [2e3, 4e3])
+    assert [*named] == ["strain", "stress"]
+    path.write_text("Strain,Stress (kPa)\n0.1,2\n0.2,4\n", "utf-8")
+    np.testing.assert_allclose(read_test(path)["stress"], [2e3, 4e3])
+
+
+def test_refused_tables(tmp_path):
+    def read(text, table=None):
+        path = tmp_path / "test.csv"
+        path.write_text(text, "utf-8")
+        return read_test(path, table)
+
+    refuses(DataFileError, r"the column 'stress' has no unit: write 'stress \[", read, "strain,stress\n0.1,2\n0.2,4")
+    refuses(DataFileError, "has the unit 'bananas'", read, "strain,stress [bananas]\n0.1,2\n0.2,4")
+    refuses(DataFileError, "has 0 of the columns stress and force", read, "strain,time [s]\n0.1,2\n0.2,4")
+    refuses(DataFileError, "has 2 of the columns strain and disp", read, "strain,displacement [mm],force [N]\n1,2,3\n")
+    refuses(DataFileError, "no line of numbers below a header", read, "strain,stress [kPa]\n")
+    names = TableSettings(names={"Kraft": "force [N]"})
+    refuses(DataFileError, "no single column is named 'Kraft'", read, "Weg,Kraf\n1,2\n", names)
+    columns = TableSettings(columns=("strain", "pressure [kPa]"))
+    refuses(DataFileError, r"data\.table has the column 'pressure \[kPa\]'", read, "1,2\n", columns)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("data.tests.tension.file=other.csv", "there is no file"),
+        ("data.range=[1.9, 1.92]", "data.range leaves 3 samples of tension"),
+        ("law=null", "law is null, but data.kind is material_tests"),
+        ("~simulation.density", "simulation lacks density"),
+        ("data.tests.tension.specimen.diameter=0.01", "diameter, or width and thickness"),
+        ("data.tests.tension.kind=indentation", "kind is indentation if, and only if"),
+        ("data.tests.tension.specimen.length=0", "length"),
+        ("law.file=foo", "there is no law foo"),
+    ],
+)
+def test_refused_configurations(tmp_path, change, said):
+    written(tmp_path)
+    assert said in refusal(*arguments(tmp_path, change))
+
+
+def test_silicones_by_name():
+    material = warp_resphys.silicone("Ecoflex 00-30")
+    assert (
+        material.values["c10"]
+        == read_json(Path(warp_resphys.__file__).parent / "laws/ecoflex_00_30.json")["parameters"]["c10"]
+    )
+    settings = MaterialSettings.model_validate({"model": "silicone", "name": "ecoflex_00_30", "density": 1100.0})
+    assert settings.model == "law"
+    assert settings.values == {**settings.values, "c10": material.values["c10"], "density": 1100.0}
+    refuses(InputError, "choose from .*ecoflex_00_30", warp_resphys.silicone, "Ecoflex 00-31")
+    values = composed("experiment=tendon_rod")
+    values["simulation"] = {"model": "silicone", "name": "foo"}
+    refuses(InputError, "simulation.*name is 'foo': choose from dragon_skin_10", parse, RunSettings, values)
+
+
+@pytest.mark.skipif(not PUBLIC.is_dir(), reason="without the tables of the Soft Robotics Materials Database")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Dragon Skin 10 MEDIUM",
+        "Dragon Skin 20",
+        "Dragon Skin 30",
+        "Ecoflex 00-30",
+        "Ecoflex 00-50",
+        "Mold Star 16 FAST",
+    ],
+)
+def test_public_silicones_beyond_their_tests(name):
+    """Identified from 5 to 100 % of strain: 3 % there (5 % Ecoflex), 12 % up to 200 %, within the 90 % interval."""
+    columns = TableSettings(columns=("time [s]", None, None, "strain", "stress [MPa]"), header_lines=18)
+    read = read_test(PUBLIC / f"{name}.csv", columns)
+    inside, beyond = ((read["strain"] >= low) & (read["strain"] <= 2.0 * low + 0.9 * (low < 1)) for low in (0.05, 1.0))
+    test = MaterialTest("tension", read["strain"][inside], read["stress"][inside], zero=5e3)
+    law = identify_from_tests({"tension": test}, density=1070.0)
+    assert law.errors["tension"] < (0.05 if "Ecoflex" in name else 0.03)
+    further = MaterialTest("tension", read["strain"][beyond], read["stress"][beyond])
+    assert np.sqrt(np.square(law.away("tension", further)).mean()) < 0.12
+    value, half = law.interval("tension", further.strain)
+    assert np.mean(np.abs(value + law.machines["tension"]["zero"] - further.stress) <= half) > 0.9

@@ -61,7 +61,7 @@ def test_a_table_gives_a_law(run):
     assert errors["beyond"]["law"] < 0.1 * errors["beyond"]["neo_hookean"]
     assert metrics["tests"]["tension"]["covered"] == 1.0
     assert metrics["rates"] == pytest.approx([0.1, 0.1], rel=0.01)
-    assert "nominal stress" in (folder / "report.html").read_text(encoding="utf-8")
+    assert "Predicted rest" in (folder / "report.html").read_text(encoding="utf-8")
     assert (folder / "figures" / "curves.png").stat().st_size > 10_000
     assert "neo-Hookean term and Ogden's term of exponent 3" in result.out
     assert np.isclose(warp_resphys.read_material(str(folder / "law.json")).values["c10"], law["parameters"]["c10"])

@@ -31,24 +31,25 @@ SOURCE: Final = (
     "Uniaxial tension, ASTM D412 die C, 450 mm/min, strain from the crosshead; Soft Robotics Materials Database, doi "
     "10.1089/soro.2019.0115, Open Database License 1.0"
 )
+PSI: Final = 6.894757  # kPa
 LOW: Final = 0.05  # strain below which the tests are uncertain
 SHIPPED: Final = 2.0  # largest strain that the laws of the package are identified from
 RANGES: Final = (0.5, 1.0, 1.5, 2.0)  # largest strains by which the intervals are tested
 ASKED: Final = 1.0  # largest strain that the predictions are made from
-# File and nominal density [kg/m^3] of the laws of the package, by name.
-LAWS: Final[dict[str, tuple[str, float]]] = {
-    "ecoflex_00_10": ("Ecoflex 00-10", 1040.0),
-    "ecoflex_00_30": ("Ecoflex 00-30", 1070.0),
-    "ecoflex_00_35_fast": ("Ecoflex 00-35 FAST", 1070.0),
-    "ecoflex_00_50": ("Ecoflex 00-50", 1070.0),
-    "dragon_skin_10_tensile": ("Dragon Skin 10 MEDIUM", 1070.0),
-    "dragon_skin_20": ("Dragon Skin 20", 1080.0),
-    "dragon_skin_30": ("Dragon Skin 30", 1080.0),
-    "dragon_skin_fx_pro": ("Dragon Skin FX Pro", 1060.0),
-    "mold_star_16_fast": ("Mold Star 16 FAST", 1180.0),
-    "mold_star_20t": ("Mold Star 20T", 1080.0),
-    "rebound_25": ("Rebound 25", 1140.0),
-    "sortaclear_40": ("SortaClear 40", 1080.0),
+# File, nominal density [kg/m^3] and 100 % modulus [psi] by the data sheets of Smooth-On, of the laws of the package.
+LAWS: Final[dict[str, tuple[str, float, float]]] = {
+    "ecoflex_00_10": ("Ecoflex 00-10", 1040.0, 8.0),
+    "ecoflex_00_30": ("Ecoflex 00-30", 1070.0, 10.0),
+    "ecoflex_00_35_fast": ("Ecoflex 00-35 FAST", 1070.0, 10.0),
+    "ecoflex_00_50": ("Ecoflex 00-50", 1070.0, 12.0),
+    "dragon_skin_10_tensile": ("Dragon Skin 10 MEDIUM", 1070.0, 22.0),
+    "dragon_skin_20": ("Dragon Skin 20", 1080.0, 49.0),
+    "dragon_skin_30": ("Dragon Skin 30", 1080.0, 86.0),
+    "dragon_skin_fx_pro": ("Dragon Skin FX Pro", 1060.0, 38.0),
+    "mold_star_16_fast": ("Mold Star 16 FAST", 1180.0, 55.0),
+    "mold_star_20t": ("Mold Star 20T", 1080.0, 47.0),
+    "rebound_25": ("Rebound 25", 1140.0, 100.0),
+    "sortaclear_40": ("SortaClear 40", 1080.0, 90.0),
 }
 
 
@@ -88,7 +89,7 @@ def main(arguments: Sequence[str]) -> None:
     if len(arguments) != 1 or not (files := sorted(Path(arguments[0]).glob("*.csv"))):
         raise SystemExit("give the folder with the tables of the Soft Robotics Materials Database.")
     tests = {path.stem: Tension.read(path) for path in files}
-    laws = {name: tests[file].law(SHIPPED, density) for name, (file, density) in LAWS.items()}
+    laws = {name: tests[file].law(SHIPPED, density) for name, (file, density, _) in LAWS.items()}
     for name, law in laws.items():
         content: dict[str, Any] = {**law.content()}
         del content["classes"]
@@ -104,12 +105,17 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _laws(laws: dict[str, MeasuredLaw]) -> list[str]:
-    rows = ["| name | $c_{10}$ | $c_{01}$ | $\\mu_3$ | shear modulus at rest | error |", "|---|---|---|---|---|---|"]
+    rows = [
+        "| name | $c_{10}$ | $c_{01}$ | $\\mu_3$ | shear modulus at rest | error | stress at 100 % | by data sheet |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for name, law in laws.items():
         values = [law.parameters.get(term, 0.0) for term in ("c10", "c01", "ogden_3")]
         cells = [f"{1e-3 * value:.2f}" if value else "" for value in values]
         modulus, error = 1e-3 * shear_modulus(law.parameters), 100.0 * law.errors["tension"]
-        rows.append(f"| `{name}` | {' | '.join(cells)} | {modulus:.1f} | {error:.1f} % |")
+        (at_100,) = 1e-3 * stress("tension", np.array([1.0]), law.parameters)
+        cells += [f"{modulus:.1f}", f"{error:.1f} %", f"{at_100:.0f}", f"{PSI * LAWS[name][2]:.0f}"]
+        rows.append(f"| `{name}` | {' | '.join(cells)} |")
     return rows
 
 

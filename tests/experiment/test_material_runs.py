@@ -62,7 +62,7 @@ def test_a_table_gives_a_law(run):
     assert metrics["tests"]["tension"]["covered"] == 1.0
     assert metrics["rates"] == pytest.approx([0.1, 0.1], rel=0.01)
     assert "Predicted rest" in (folder / "report.html").read_text(encoding="utf-8")
-    assert (folder / "figures" / "curves.png").stat().st_size > 10_000
+    assert (folder / "figures" / "curves.png").stat().st_size > 1_000
     assert "neo-Hookean term and Ogden's term of exponent 3" in result.out
     assert np.isclose(warp_resphys.read_material(str(folder / "law.json")).values["c10"], law["parameters"]["c10"])
 
@@ -77,6 +77,12 @@ def test_tables_of_other_machines(tmp_path):
     )
     np.testing.assert_allclose(named["stress"], [2e3, 4e3])
     assert [*named] == ["strain", "stress"]
+    path.write_text("Time,Extension,Displacement,Force\n[sec],,(mm),(N)\n0,0,1,2\n1,0,2,3\n2,0,3,4\n", "utf-8")
+    units_below = read_test(path)
+    np.testing.assert_allclose(units_below["displacement"], [1e-3, 2e-3, 3e-3])
+    assert [*units_below] == ["time", "displacement", "force"]
+    path.write_text("Force (N),strain (mm/mm)\n2,0.1\n4,0.2\n", "utf-8")
+    np.testing.assert_allclose(read_test(path)["strain"], [0.1, 0.2])
     path.write_text("Strain,Stress (kPa)\n0.1,2\n0.2,4\n", "utf-8")
     np.testing.assert_allclose(read_test(path)["stress"], [2e3, 4e3])
 
@@ -87,9 +93,19 @@ def test_refused_tables(tmp_path):
         path.write_text(text, "utf-8")
         return read_test(path, table)
 
-    refuses(DataFileError, r"the column 'stress' has no unit: write 'stress \[", read, "strain,stress\n0.1,2\n0.2,4")
+    refuses(
+        DataFileError,
+        r"the column 'stress' has no unit: write it as in 'stress \[Pa\]",
+        read,
+        "strain,stress\n0.1,2\n0.2,4",
+    )
     refuses(DataFileError, "has the unit 'bananas'", read, "strain,stress [bananas]\n0.1,2\n0.2,4")
-    refuses(DataFileError, "has 0 of the columns stress and force", read, "strain,time [s]\n0.1,2\n0.2,4")
+    refuses(
+        DataFileError,
+        "has 0 of the columns stress and force, of which a test has one. It has 'strain', 'time",
+        read,
+        "strain,time [s]\n0.1,2\n0.2,4",
+    )
     refuses(DataFileError, "has 2 of the columns strain and disp", read, "strain,displacement [mm],force [N]\n1,2,3\n")
     refuses(DataFileError, "no line of numbers below a header", read, "strain,stress [kPa]\n")
     names = TableSettings(names={"Kraft": "force [N]"})
@@ -122,13 +138,33 @@ def test_silicones_by_name():
         material.values["c10"]
         == read_json(Path(warp_resphys.__file__).parent / "laws/ecoflex_00_30.json")["parameters"]["c10"]
     )
+    assert warp_resphys.silicone("DragonSkin 30").values == warp_resphys.silicone("dragon_skin_30").values
     settings = MaterialSettings.model_validate({"model": "silicone", "name": "ecoflex_00_30", "density": 1100.0})
     assert settings.model == "law"
     assert settings.values == {**settings.values, "c10": material.values["c10"], "density": 1100.0}
-    refuses(InputError, "choose from .*ecoflex_00_30", warp_resphys.silicone, "Ecoflex 00-31")
+    refuses(InputError, "did you mean .*ecoflex_00_30", warp_resphys.silicone, "Ecoflex 00-31")
     values = composed("experiment=tendon_rod")
     values["simulation"] = {"model": "silicone", "name": "foo"}
-    refuses(InputError, "simulation.*name is 'foo': choose from dragon_skin_10", parse, RunSettings, values)
+    refuses(
+        InputError,
+        "simulation.*name is 'foo', which has no law here: choose from dragon_skin_10",
+        parse,
+        RunSettings,
+        values,
+    )
+
+
+@pytest.mark.slow
+def test_simulated_tensile_test(tmp_path):
+    """The experiment as it is: 1 % of noise and glued ends, a finer true mesh; and a machine that yields by 0.2 mm."""
+    yielding = ("data.simulated.compliance=4.2e-5", "data.tests.tension.compliance=4e-5")
+    for bound, change in ((0.01, ()), (0.02, yielding)):
+        folder = tmp_path / str(bound)
+        assert outcome("experiment=material_test", f"hydra.run.dir={folder}", *change).code == 0
+        law = read_json(folder / "law.json")
+        assert law["groups"] == []
+        assert law["parameters"]["c10"] == pytest.approx(30e3, rel=bound)
+        assert law["stretches"] == pytest.approx([1.6**-0.5, 1.6], rel=0.02)
 
 
 @pytest.mark.skipif(not PUBLIC.is_dir(), reason="without the tables of the Soft Robotics Materials Database")

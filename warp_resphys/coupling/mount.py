@@ -233,13 +233,20 @@ class Mount:
         """Returns the robot's equilibrium with its base at poses (E, 6)."""
         if isinstance(self.robot, RobotScene):
             return self.robot.begin(len(pose), self._by_robot(pose, inputs))
-        return self.robot.begin(len(pose), **{**inputs, BASE: pose})
+        return self.robot.begin(len(pose), **{**self._checked(inputs), BASE: pose})
 
     def _step(self, state: State, pose: FloatArray, inputs: Mapping[str, Any]) -> State:
         """Returns the robot's state after a step that brings its base to poses (E, 6)."""
         if isinstance(self.robot, RobotScene):
             return self.robot.step(state, self._by_robot(pose, inputs))
-        return self.robot.step(state, **{**inputs, BASE: pose})
+        return self.robot.step(state, **{**self._checked(inputs), BASE: pose})
+
+    @staticmethod
+    def _checked(inputs: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Returns the inputs of a robot; refuses a pose of its base, which the arm determines."""
+        if BASE in inputs:
+            raise InputError("base is given, but a mounted robot is where its body is: leave it out.")
+        return inputs
 
     def _by_robot(self, pose: FloatArray, inputs: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """Returns the inputs of the robots of a scene, with the poses (E, 6) of their bases."""
@@ -247,7 +254,9 @@ class Mount:
         unknown = [name for name in inputs if name not in self._robots]
         if unknown:
             raise InputError(f"there is no robot {unknown[0]!r} in the scene: it has {listed([*self._robots])}.")
-        return {name: {**inputs.get(name, {}), BASE: base} for name, base in self.robot.bases(pose).items()}
+        return {
+            name: {**self._checked(inputs.get(name, {})), BASE: base} for name, base in self.robot.bases(pose).items()
+        }
 
     def _reaction(self, state: State, pose: FloatArray) -> FloatArray:
         """Returns the wrench (E, 6) that holds the robot about its base; NaN for environments that are lost."""

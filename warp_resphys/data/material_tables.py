@@ -1,5 +1,6 @@
 """Tables of material tests: columns of time, strain or displacement, and stress or force, as text."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -11,16 +12,18 @@ from ..io.errors import DataFileError, did_you_mean, listed
 from ..io.text import Rows, number, read_rows
 from ..settings.data_kinds import TableSettings
 from .recordings.recording import METRES_PER_UNIT
-from .recordings.text_exports import name_and_unit
 
-_PRESSURES: Final = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "N/mm^2": 1e6, "psi": 6894.757}
+_PRESSURES: Final = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "psi": 6894.757}
 _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "min": 60.0, "ms": 1e-3},
-    "strain": {"": 1.0, "1": 1.0, "mm/mm": 1.0, "%": 0.01},
-    "displacement": METRES_PER_UNIT,
+    "strain": {"": 1.0, "%": 0.01},
+    "displacement": {**METRES_PER_UNIT, "in": 0.0254},
     "stress": _PRESSURES,
     "force": {"N": 1.0, "kN": 1e3, "mN": 1e-3, "lbf": 4.448222, "kgf": 9.80665, "gf": 9.80665e-3},
 }
+_SPELLED: Final = {"sec": "s", "seconds": "s", "N/mm²": "MPa", "N/mm2": "MPa", "mm/mm": "", "1": "", "inch": "in"}
+_CELL: Final = re.compile(r"(.*?)[\s_]*(?:[\[(](.*)[\])])?")
+_ALL_UNITS: Final = {*_SPELLED, *(unit for units in _UNITS.values() for unit in units)}
 _PAIRS: Final = (("strain", "displacement"), ("stress", "force"))
 
 
@@ -39,26 +42,35 @@ def read_test(path: Path, table: TableSettings | None = None) -> dict[str, Float
     first, named = _header(rows, path) if table is None else _described(rows, table, path)
     factors, names = dict[int, float](), dict[int, str]()
     for column, cell in named.items():
-        name, unit = name_and_unit(cell)
-        if (known := _UNITS.get(name.lower())) is None:
+        name, unit = _name_and_unit(cell)
+        if (known := _UNITS.get(name)) is None:
             if table is None:
                 continue
             raise DataFileError(f"{path}: data.table has the column {cell!r}: choose from {', '.join(_UNITS)}.")
-        if (unit or "") not in known:
+        if unit not in known:
             missing = f"the column {cell!r} has {'the unit ' + repr(unit) if unit else 'no unit'}"
-            raise DataFileError(f"{path}: {missing}: write '{name} [{listed([*filter(None, known)])}]', one of these.")
-        if name.lower() in names.values():
+            raise DataFileError(f"{path}: {missing}: write it as in '{name} [{'], ['.join(filter(None, known))}]'.")
+        if name in names.values():
             raise DataFileError(f"{path} has two columns of {name}: leave one of them out in data.table.")
-        names[column], factors[column] = name.lower(), known[unit or ""]
+        names[column], factors[column] = name, known[unit]
     for pair in _PAIRS:
         if (present := [name for name in pair if name in names.values()]) != present[:1] or not present:
             raise DataFileError(
-                f"{path} has {len(present)} of the columns {' and '.join(pair)}: a test has one of them. Write a "
-                "header such as 'time [s], strain, stress [kPa]', or name all columns in data.table."
+                f"{path} has {len(present)} of the columns {' and '.join(pair)}, of which a test has one. It has "
+                f"{listed([*named.values()])}: name them in its header, as in 'time [s], strain, stress [kPa]', or in "
+                "data.table."
             )
     values = [[number(row[column]) if column < len(row) else None for column in names] for row in rows[first:]]
     kept = np.array([one for one in values if None not in one], dtype=np.float64).reshape(-1, len(names))
     return {name: kept[:, k] * factors[column] for k, (column, name) in enumerate(names.items())}
+
+
+def _name_and_unit(cell: str) -> tuple[str, str]:
+    """Returns name, in small letters, and unit of a column such as `Force (N)`; the unit may be empty."""
+    match = _CELL.fullmatch(cell.strip())
+    assert match is not None
+    unit = (match[2] or "").strip()
+    return match[1].lower(), _SPELLED.get(unit, unit)
 
 
 def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
@@ -66,7 +78,11 @@ def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
     for line, row in enumerate(rows):
         filled = [cell for cell in row if cell]
         if line and len(filled) > 1 and all(number(cell) is not None for cell in filled):
-            return line, {column: cell for column, cell in enumerate(rows[line - 1]) if cell}
+            head, units = rows[line - 1], [""] * len(row)
+            if line > 1 and all(cell.strip("[]()") in _ALL_UNITS for cell in head if cell):
+                head, units = rows[line - 2], [cell.strip("[]()") for cell in head]  # units have a line of their own
+            beside = {column: f" [{unit}]" if unit else "" for column, unit in enumerate(units)}
+            return line, {column: cell + beside.get(column, "") for column, cell in enumerate(head) if cell}
     raise DataFileError(f"{path} has no line of numbers below a header: export it as CSV, with names of its columns.")
 
 

@@ -98,6 +98,7 @@ class LawContent(TypedDict):
     accepted: NotRequired[bool]  # whether it helps on the trials that it was tested on
     others: NotRequired[dict[str, float]]  # parameters identified beside it
     deviation: NotRequired[dict[str, float]]  # standard deviations of both
+    shear_deviation: NotRequired[float]  # that of the shear modulus at small strains [Pa]
     at_bounds: NotRequired[list[str]]
     validation: NotRequired[LawTest]
     groups: NotRequired[list[str]]  # of terms, besides the modulus

@@ -8,7 +8,7 @@ import numpy as np
 from ..data.material_tables import read_test
 from ..energies.catalogue import law_path, read_law
 from ..energies.isochoric import bulk_of
-from ..io.arrays import BoolArray, FloatArray
+from ..io.arrays import FloatArray
 from ..io.atomic import digest
 from ..io.errors import DataFileError, InputError, naming
 from ..io.progress import show
@@ -18,11 +18,12 @@ from ..learning.identification.material_tests import MeasuredLaw, identify_from_
 from ..learning.identification.specimens import LEAST_SAMPLES, MaterialTest, Specimen
 from ..report.pages.material_page import TestMetrics, TestResult, test_table, test_verdict, write_material_report
 from ..settings.run import RunSettings
-from ..settings.specimen import MaterialTestData, MaterialTestSettings, SimulatedTests
+from ..settings.specimen import MaterialTestData, SimulatedTests
 from ..settings.stage_keys import StageSettings
 from .files import LAW_FILE, METRICS, REPORT
 
 RESULTS = "material_tests.json"
+_CURVE, _DOTS = 81, 400  # points of a curve, and of the measured samples, in figures
 _REACH = 2.0  # ratio of the largest strain that is predicted to the largest that the law is identified from
 
 
@@ -53,135 +54,143 @@ def table_files(data: MaterialTestData) -> list[Path]:
 
 
 def tests_of(data: MaterialTestData, poissons_ratio: float, seed: int) -> dict[str, MaterialTest]:
-    """Returns all samples of the tests, read or simulated.
+    """Returns the tests, read or simulated, of which the samples in ``data.range`` count.
 
     Raises:
         DataFileError: a table cannot be read.
-        InputError: samples that are no test.
+        InputError: samples that are no test, or none in the range.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
     found, paths = {}, table_files(data)
     for number, (name, wanted) in enumerate(data.tests.items()):
         size = wanted.specimen
         specimen = Specimen(size.length, size.section, poissons_ratio, size.indenter, size.cells)
+        simulated = specimen if size.is_simulated else None
         if data.simulated is None:
-            read = read_test(paths[number], data.table)
-            strain = read["strain"] if "strain" in read else read["displacement"] / size.length
-            stress = read["stress"] if "stress" in read else read["force"] / specimen.area
-            seconds = read.get("time")
-            if seconds is not None and len(seconds):  # Logs of machines repeat some times.
-                later = np.append(True, seconds[1:] > np.maximum.accumulate(seconds)[:-1])
-                strain, stress, seconds = strain[later], stress[later], seconds[later]
+            strain, stress, seconds = _recorded(paths[number], data, specimen)
         else:
-            strain, stress = _simulated(wanted, specimen, data.simulated, np.random.default_rng((seed, number)))
-            seconds = None
+            random = np.random.default_rng((seed, number))
+            (strain, stress), seconds = _played(wanted.kind, specimen, simulated, data.simulated, random), None
+        low, high = data.range or (0.0, np.inf)
+        counted = (np.abs(strain) >= low) & (np.abs(strain) <= high)
+        if counted.sum() < LEAST_SAMPLES:
+            raise InputError(f"data.range leaves {counted.sum()} samples of {name}: give strains that its table has.")
         with naming(f"data.tests.{name}: "):
             found[name] = MaterialTest(
                 *(wanted.kind, strain, stress, seconds),
-                zero=wanted.zero * float(np.abs(stress).max(initial=0.0)),
+                zero=wanted.zero * float(np.abs(stress[counted]).max()),
                 toe=wanted.toe,
                 compliance=wanted.compliance * specimen.area / size.length,
-                specimen=specimen if size.ends == "glued" or size.indenter is not None else None,
+                specimen=simulated,
+                counted=counted,
             )
     return found
 
 
-def _simulated(
-    wanted: MaterialTestSettings, specimen: Specimen, played: SimulatedTests, random: np.random.Generator
+def _recorded(
+    path: Path, data: MaterialTestData, specimen: Specimen
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Returns strains, stresses [Pa] and times [s] (N,) of a table, without times that repeat one."""
+    read = read_test(path, data.table)
+    strain = read["strain"] if "strain" in read else read["displacement"] / specimen.length
+    stress = read["stress"] if "stress" in read else read["force"] / specimen.area
+    if (seconds := read.get("time")) is None or not len(seconds):
+        return strain, stress, None
+    later = np.append(True, seconds[1:] > np.maximum.accumulate(seconds)[:-1])
+    return strain[later], stress[later], seconds[later]
+
+
+def _played(
+    kind: str, specimen: Specimen, simulated: Specimen | None, played: SimulatedTests, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Returns strains (N,) that a machine with some compliance shows, and stresses (N,) with noise."""
-    simulated = specimen if wanted.specimen.ends == "glued" or specimen.indenter is not None else None
     finer = None if simulated is None else replace(simulated, cells=played.cells)
     strain = np.linspace(0.0, played.strain, played.samples + 1)[1:]
-    exact = MaterialTest(wanted.kind, strain, strain, specimen=finer)
     parameters = {"bulk_1": bulk_of(played.material, specimen.poissons_ratio), **played.material}
-    stress = exact.response(strain, parameters)[0]
+    stress = MaterialTest(kind, strain, strain, specimen=finer).response(strain, parameters)[0]
     shown = strain + played.compliance * stress * specimen.area / specimen.length
     return shown, stress * (1.0 + played.noise * random.standard_normal(len(stress)))
-
-
-def _within(test: MaterialTest, low: float, high: float) -> BoolArray:
-    """Marks the samples (N,) between two strains."""
-    size = np.abs(test.strain)
-    return np.asarray((size >= low) & (size <= high))
 
 
 def identify_material(context: StageContext) -> None:
     """Writes law.json, and material_tests.json with the errors and the curves.
 
     Raises:
-        InputError: see `tests_of`, or a range without samples.
+        InputError: see `tests_of`.
         ConvergenceError: a specimen has no equilibrium.
     """
     settings: StageSettings = context.settings
     data, wanted, material = settings.data, settings.law, settings.simulation.values
     ratio, density = material["poissons_ratio"], material["density"]
     tests = tests_of(data, ratio, settings.seed)
-    low, high = data.range or (0.0, max(float(np.abs(test.strain).max()) for test in tests.values()))
-    learned = {}
-    for name, test in tests.items():
-        if (rows := _within(test, low, high)).sum() < LEAST_SAMPLES:
-            raise InputError(f"data.range leaves {rows.sum()} samples of {name}: give strains that its table has.")
-        learned[name] = test.chosen(rows)
     times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
     known = None if wanted.file is None else read_law(wanted.file)
     options = {"density": density, "poissons_ratio": ratio, "times": times, "known": known}
-    law = identify_from_tests(learned, terms=wanted.terms, **options)
-    simplest = law if not law.groups else identify_from_tests(learned, terms=(), **options)
-    results = {name: _result(name, test, learned[name], law, simplest, high) for name, test in tests.items()}
+    law = identify_from_tests(tests, terms=wanted.terms, **options)
+    simplest = law if not law.groups else identify_from_tests(tests, terms=(), **options)
+    results = {name: _result(name, test, law, simplest) for name, test in tests.items()}
     content = law.content()
     content["data"], content["versions"] = {"name": settings.name, "trials": [*tests]}, dict(package_versions())
     write_json(context.run_dir / LAW_FILE, content)
     write_json(context.run_dir / RESULTS, {"tests": results, "machines": law.machines, "rates": law.rates})
 
 
-def _result(
-    name: str, test: MaterialTest, learned: MaterialTest, law: MeasuredLaw, simplest: MeasuredLaw, high: float
-) -> TestResult:
-    """Returns errors and curves of a test."""
-    reach = high * (_REACH if test.specimen is None else 1.0)  # a specimen is simulated in the range alone
-    rows = _within(test, high, reach) & (np.abs(test.strain) > high)
-    beyond = test.chosen(rows) if rows.sum() >= LEAST_SAMPLES else None
-    parts = {"range": learned, "beyond": beyond}
-    machine = law.machines[name]
-    hooke = _hooke(learned)
-    errors: dict[str, dict[str, float | None]] = {}
-    for part, samples in parts.items():
-        models = {
-            "law": None if samples is None else law.away(name, samples),
-            "neo_hookean": None if samples is None else simplest.away(name, samples),
-            "hooke": None
-            if samples is None
-            else (hooke[0] * samples.strain + hooke[1] - samples.stress) * samples.weights,
-        }
-        errors[part] = {key: None if x is None else float(np.sqrt(np.square(x).mean())) for key, x in models.items()}
-    shown = np.linspace(0.0, min(reach, float(np.abs(test.strain).max())), 81)
-    zero, covered = machine.get("zero", 0.0), None
-    value, half = (law.interval(test.kind, shown)) if test.specimen is None else (None, None)
-    if test.specimen is None and beyond is not None:
-        at, width = law.interval(test.kind, beyond.taut(machine))
-        covered = float(np.mean(np.abs(at + zero - beyond.stress) <= width))
-    measured = test.chosen(_within(test, 0.0, reach))
-    every = max(1, len(measured.strain) // 400)
+def _result(name: str, test: MaterialTest, law: MeasuredLaw, simplest: MeasuredLaw) -> TestResult:
+    """Returns errors and curves of a test: in the range, and beyond it where the specimen is not simulated."""
+    size, machine = np.abs(test.strain), law.machines[name]
+    high = float(size[test.used].max())
+    reach = high * (_REACH if test.specimen is None else 1.0)
+    beyond = (size > high) & (size <= reach)
+    slope, offset = hooke = _hooke(test)
+    away = {
+        "law": law.away(name, test),
+        "neo_hookean": simplest.away(name, test),
+        "hooke": (slope * test.strain + offset - test.stress) * test.weights,
+    }
+    parts = {"range": test.used, "beyond": beyond}
+    errors = {part: {model: _error(x[rows]) for model, x in away.items()} for part, rows in parts.items()}
+    zero, taut, seen = machine.get("zero", 0.0), test.taut(machine), size <= reach
+    slow = test.specimen is None and not law.is_viscous
+    covered, half = None, None
+    if slow and beyond.sum() >= LEAST_SAMPLES:
+        at, width = law.interval(test.kind, taut[beyond])
+        covered = float(np.mean(np.abs(at + zero - test.stress[beyond]) <= width))
+    if law.is_viscous and test.specimen is None:  # at the times of the test
+        shown, curve, simple = taut[seen], law.curve(test, taut)[seen], simplest.curve(test, taut)[seen]
+    else:
+        shown = np.linspace(0.0, float(taut[seen].max()), _CURVE)
+        curve, simple = (
+            law.curve(replace(test, seconds=None), shown),
+            simplest.curve(replace(test, seconds=None), shown),
+        )
+    if slow:
+        half = law.interval(test.kind, shown)[1].tolist()
+    every = max(1, int(seen.sum()) // _DOTS)
     return TestResult(
         kind=test.kind,
         errors=errors,
         covered=covered,
-        strain=measured.taut(machine)[::every].tolist(),
-        stress=(measured.stress - zero)[::every].tolist(),
+        strain=taut[seen][::every].tolist(),
+        stress=(test.stress - zero)[seen][::every].tolist(),
         shown=shown.tolist(),
-        law=value.tolist() if value is not None else law.curve(test, shown).tolist(),
-        half_width=None if half is None else half.tolist(),
-        neo_hookean=simplest.curve(test, shown).tolist(),
-        hooke=(hooke[0] * shown).tolist(),
-        range=[float(np.abs(learned.strain).min()), high],
+        law=curve.tolist(),
+        half_width=half,
+        neo_hookean=simple.tolist(),
+        hooke=(hooke[0] * shown + hooke[1] - zero).tolist(),
+        range=[float(size[test.used].min()), high],
     )
 
 
+def _error(away: FloatArray) -> float | None:
+    """Returns the root mean square of relative errors; None of too few samples."""
+    return float(np.sqrt(np.square(away).mean())) if len(away) >= LEAST_SAMPLES else None
+
+
 def _hooke(test: MaterialTest) -> tuple[float, float]:
-    """Returns slope and zero [Pa] of a straight line with the least relative errors."""
-    columns = np.stack([test.strain, np.ones_like(test.strain)], 1)[:, : 2 if test.zero else 1]
-    found = np.linalg.lstsq(columns * test.weights[:, None], test.stress * test.weights)[0]
+    """Returns slope and zero [Pa] of a straight line with the least relative errors in the samples that count."""
+    strain, stress, weights = test.strain[test.used], test.stress[test.used], test.weights[test.used]
+    columns = np.stack([strain, np.ones_like(strain)], 1)[:, : 2 if test.zero else 1]
+    found = np.linalg.lstsq(columns * weights[:, None], stress * weights)[0]
     return float(found[0]), float(found[1]) if len(found) > 1 else 0.0
 
 

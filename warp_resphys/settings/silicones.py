@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
+from ..io.errors import did_you_mean
 from ..io.safe_files import read_json
 
 SILICONE: Final = "silicone"  # model of a material that has the law of a silicone by its name
@@ -22,10 +23,15 @@ def silicone_name(product: str) -> str:
     Raises:
         ValueError: it has no law here.
     """
-    name = re.sub(r"[^a-z0-9]+", "_", product.lower()).strip("_")
-    if name not in (known := silicone_files()):
-        raise ValueError(f"name is {product!r}: choose from {', '.join(known)}, or identify the law of a tensile test.")
-    return name
+    known = {_letters(name): name for name in silicone_files()}
+    if (wanted := _letters(product)) not in known:
+        near = did_you_mean(product, [*known.values()]) or f": choose from {', '.join(known.values())}."
+        raise ValueError(f"name is {product!r}, which has no law here{near}")
+    return known[wanted]
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "", name.lower())
 
 
 def silicone_values(values: dict[str, Any]) -> dict[str, Any]:

@@ -30,6 +30,11 @@ class SpecimenSettings(Settings):
         return self
 
     @property
+    def is_simulated(self) -> bool:
+        """Whether the specimen does not deform homogeneously."""
+        return self.ends == "glued" or self.indenter is not None
+
+    @property
     def section(self) -> tuple[float, ...]:
         """Width and thickness, or the diameter alone [m]."""
         return (self.diameter,) if self.diameter is not None else (self.width or 0.0, self.thickness or 0.0)
@@ -43,7 +48,9 @@ class MaterialTestSettings(Settings):
     )
     file: Word | None = setting(None, "table in data.folder; null: simulated")
     specimen: SpecimenSettings = setting(description="its dimensions")
-    zero: NotNegative = setting(0.05, "standard deviation of the zero of the load cell, over the largest force")
+    zero: NotNegative = setting(
+        0.05, "standard deviation of the zero of the load cell, over the largest force in data.range"
+    )
     toe: NotNegative = setting(0.0, "standard deviation of the strain at which the specimen becomes taut")
     compliance: NotNegative = setting(0.0, "standard deviation of the compliance of the machine", "m/N")
 
@@ -52,7 +59,7 @@ class MaterialTestSettings(Settings):
         if (self.kind == "indentation") != (self.specimen.indenter is not None):
             raise ValueError("kind is indentation if, and only if, specimen.indenter has a radius: change one of them.")
         if self.specimen.ends == "glued" and self.kind not in ("tension", "compression", "shear"):
-            raise ValueError(f"specimen.ends is glued, which a {self.kind} test has not: set it to free.")
+            raise ValueError(f"a {self.kind} test has no glued ends: set specimen.ends to free.")
         return self
 
 

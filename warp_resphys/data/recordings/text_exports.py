@@ -78,7 +78,7 @@ def _read_named(rows: Rows, path: Path) -> Recording:
     units: list[str] = []
     if len(head) > 1 and all(_unit(cell.strip("[]()")) in {"", *_SPELLED.values()} for cell in head[-1]):
         units = [cell.strip("[]()") for cell in head.pop()]
-    named = {column: name_and_unit(cell) for column, cell in enumerate(head[-1]) if cell}
+    named = {column: _name_and_unit(cell) for column, cell in enumerate(head[-1]) if cell}
     labels = _filled(head[-2], len(head[-1])) if len(head) > 1 else [""] * len(head[-1])
     columns = dict[int, tuple[str, str | None]]()
     for column, (name, unit) in named.items():
@@ -117,7 +117,7 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
                     f"{path}, line {first + 1}: data.table.names has {name!r}, which {header.count(name)} columns are "
                     f"named{known} data.table.header_lines is the number of lines before the header."
                 )
-        columns = {header.index(name): name_and_unit(cell) for name, cell in table.names.items()}
+        columns = {header.index(name): _name_and_unit(cell) for name, cell in table.names.items()}
         first, width = first + 1, max(column for column, cell in enumerate(header) if cell) + 1
     else:
         if len(header) < width or any(header[width:]):
@@ -125,7 +125,7 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
                 f"{path}, line {first + 1}: {len(header)} cells, but data.table.columns names {width}: name each "
                 "column of the file, null for one that is not read."
             )
-        columns = {column: name_and_unit(cell) for column, cell in enumerate(table.columns) if cell}
+        columns = {column: _name_and_unit(cell) for column, cell in enumerate(table.columns) if cell}
     clocks = [column for column, (name, _) in columns.items() if name.lower() in (*_TIMES, *_FRAMES)]
     if len(clocks) > 1:
         raise DataFileError(f"{path}: columns {clocks[0] + 1} and {clocks[1] + 1} both tell the time: read one only.")
@@ -212,7 +212,7 @@ def _unit(text: str) -> str:
     return _SPELLED.get(unit.lower(), unit)
 
 
-def name_and_unit(cell: str) -> tuple[str, str | None]:
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
     """Splits `name [unit]`, and `name (unit)` or `name_unit` with a known unit; None where there is no unit."""
     for opening, closing in (("[", "]"), ("(", ")"), ("_", ""), (" ", "")):
         name, bracket, unit = cell.removesuffix(closing).rpartition(opening)

@@ -2,12 +2,12 @@
 
 The coefficients of the law, not negative, and unknown constants of each machine minimise
 
-    sum_t K / N_t sum_n ((P(x_n) + z - p_n) / (noise w_n))^2 + priors,     x = e - toe - compliance p
+    sum_t K_t / N_t sum_n ((P(x_n) + z - p_n) / (noise w_n))^2 + priors,     x = e - toe - compliance p
 
 over the N_t samples of test t, with the nominal stress P of the law, the measured stress p and strain e, the zero z of
 the load cell, the strain at which the specimen becomes taut, and the compliance of the machine, which a crosshead shows
 as strain of the specimen. Errors are relative: w is p, but at least a fiftieth of its largest value. As a curve is
-smooth, its samples count as K = 20 independent ones.
+smooth, its samples count as K_t = 20 independent ones at most.
 
 Terms are chosen by what they predict: every class of laws is fitted to the lower part of the strains, and the smallest
 that predicts the upper part about as well as the best is fitted to all of them.
@@ -24,7 +24,7 @@ import scipy.optimize
 
 from ...energies.catalogue import LawContent, LawTest, TriedClass, law_content
 from ...energies.convex_material import ConvexMaterial
-from ...energies.isochoric import bulk_of, path_of, shear_modulus, stress, stress_columns
+from ...energies.isochoric import KINDS, TERMS, bulk_of, path_of, shear_modulus, stress, stress_columns
 from ...io.arrays import BoolArray, Brief, FloatArray
 from ...io.errors import InputError, listed
 from .law import branches_of
@@ -34,10 +34,12 @@ BEYOND: Final = 0.25  # see `MeasuredLaw.interval`
 _SAMPLES: Final = 20  # independent samples of a curve
 _NOISE: Final = 0.01  # relative error that has the weight of one standard deviation of a prior
 _CLOSE: Final = 1.25  # ratio to the smallest error beyond that range that a smaller class may have
+_EXACT: Final = 0.1 * _NOISE  # error beyond the range that no larger class needs to lower
 _NEEDLESS: Final = 1e-3  # coefficient over the shear modulus that is left out
 _LARGEST_CLASS: Final = 2  # elastic terms beside c10
 _MOST: Final = 5.0  # standard deviations of a machine's constants
 _STEPS: Final = 30  # of Gauss-Newton
+_HALVINGS: Final = 8  # of a step that does not lower the residuals
 _QUANTILE: Final = 1.645  # of the normal distribution, for 90 %
 _RELATIVE_DEVIATION: Final = 0.05  # of the shear modulus of a known law that states none
 
@@ -54,8 +56,8 @@ class MeasuredLaw(Brief):
         classes: classes that were tried; ``residual`` is their error in the lower part of the strains, ``validation``
             that in the upper part.
         groups: terms of the chosen one, besides c10.
-        stretches: least and largest principal stretch.
-        largest: largest strain of a homogeneous test, or 0.
+        stretches: least and largest principal stretch, of simulated specimens as if they deformed homogeneously.
+        largest: largest strain of the tests.
         rates: least and largest rate of strain [1/s]; None without times.
         columns: coefficients by the names of `energies.isochoric.stress_columns`.
         covariance: (P, P) of the coefficients in ``deviation``.
@@ -77,9 +79,14 @@ class MeasuredLaw(Brief):
         """Returns the relative errors (N,) in a test, with the constants of the machine of the test of a name."""
         return test.away(self.columns, self.machines[name])
 
+    @property
+    def is_viscous(self) -> bool:
+        """Whether stresses depend on the rate."""
+        return any(name.startswith(("prony", "shear_visc")) and value for name, value in self.columns.items())
+
     def curve(self, test: MaterialTest, strain: FloatArray) -> FloatArray:
-        """Returns the nominal stress (N,) [Pa] at strains (N,) of the specimen of a test, in slow loading."""
-        if test.specimen is None:
+        """Returns the stress (N,) [Pa] at strains (N,) of a test's specimen: at its times, or in slow loading."""
+        if test.specimen is None and test.seconds is None:
             return stress(test.kind, strain, self.parameters)
         return test.response(strain, self.columns)[0]
 
@@ -94,10 +101,16 @@ class MeasuredLaw(Brief):
         columns = stress_columns(kind, strain, tuple(self.deviation))
         slopes = np.stack([*columns.values()], 1)
         value = stress(kind, strain, self.parameters)
-        ratio = np.maximum(np.abs(strain) / self.largest if self.largest else 1.0, 1.0)
+        ratio = np.maximum(np.abs(strain) / self.largest, 1.0)
         known = np.einsum("np,pq,nq->n", slopes, self.covariance, slopes)
         misfit = _QUANTILE * max(self.errors.values()) * value
         return value, np.sqrt(_QUANTILE**2 * known + misfit**2 + (BEYOND * np.log2(ratio) * value) ** 2)
+
+    @property
+    def shear_deviation(self) -> float:
+        """Standard deviation of the shear modulus at small strains [Pa]."""
+        shares = np.array([shear_modulus({name: 1.0}) for name in self.deviation])
+        return math.sqrt(float(shares @ self.covariance @ shares))
 
     def content(self) -> LawContent:
         """Returns the content of law.json."""
@@ -110,6 +123,7 @@ class MeasuredLaw(Brief):
             "accepted": True,
             "groups": self.groups,
             "deviation": self.deviation,
+            "shear_deviation": self.shear_deviation,
             "validation": tested,
             "classes": self.classes,
             "stretches": [*self.stretches],
@@ -134,7 +148,7 @@ def identify_from_tests(
         terms: elastic terms that are tried beside c10, two at most in a law, named as in `ConvexMaterial`.
         times: relaxation times of the branches that are tried [s]; none for slow tests.
         known: law of the same material from another source. Its shear modulus at small strains is a prior, with its
-            standard deviation, and its viscosity and branches are part of the law.
+            standard deviation (``shear_deviation``, or 5 %), and its viscosity and branches are part of the law.
 
     Raises:
         InputError: no test, or branches without times.
@@ -143,18 +157,26 @@ def identify_from_tests(
     if not tests:
         raise InputError("tests is empty: give one test or more.")
     search = _Search(tests, density, poissons_ratio, tuple(f"prony_{float(time)!r}" for time in times), known)
+    if unknown := [term for term in terms if not TERMS.fullmatch(term) or term == "c10"]:
+        raise InputError(f"terms has {unknown[0]!r}: choose from c20, c30, c01, c02, and ogden_3, ogden_m3 and so on.")
+    if not 0.0 < poissons_ratio < 0.5:
+        raise InputError(f"poissons_ratio is {poissons_ratio:g}: give one between 0 and 0.5, such as 0.4995.")
     late = [name for name, test in tests.items() if test.seconds is None and test.specimen is None]
-    if late and (times or search.viscous):
-        raise InputError(f"{listed(late)}: times are missing, which relaxing branches need: give them, or no branches.")
+    if (times or search.viscous) and (late or all(test.specimen is not None for test in tests.values())):
+        raise InputError(
+            f"{listed(late or [*tests])}: times of a homogeneous test are missing, which relaxing branches need: give "
+            "them, or no branches."
+        )
     groups = [chosen for size in range(_LARGEST_CLASS + 1) for chosen in combinations(terms, size)]
     lower = [test.lower for test in tests.values()]
     tried, classes = [search.fit(chosen, lower) for chosen in groups], list[TriedClass]()
     for chosen, fit in zip(groups, tried, strict=True):
-        errors = [fit.error(lower), fit.error([~rows for rows in lower])]
+        upper = [test.used & ~rows for test, rows in zip(tests.values(), lower, strict=True)]
+        errors = [fit.error(lower), fit.error(upper)]
         parameters = search.parameters(fit)
         classes.append(TriedClass(groups=[*chosen], parameters=parameters, residual=errors[0], validation=errors[1]))
     errors_beyond = [float(one["validation"] or 0.0) for one in classes]
-    best = next(k for k, error in enumerate(errors_beyond) if error <= _CLOSE * min(errors_beyond))
+    best = next(k for k, error in enumerate(errors_beyond) if error <= max(_CLOSE * min(errors_beyond), _EXACT))
     return search.law(search.fit(groups[best]), classes, best)
 
 
@@ -171,7 +193,8 @@ class _Fit:
     def error(self, rows: Sequence[BoolArray] | None = None) -> float:
         """Root mean square of the relative errors in some samples of the tests."""
         away = [test.away(self.law, machine) for test, machine in zip(self.tests, self.machines, strict=True)]
-        chosen = away if rows is None else [one[of] for one, of in zip(away, rows, strict=True) if of.any()]
+        counted = [test.used for test in self.tests] if rows is None else rows
+        chosen = [one[of] for one, of in zip(away, counted, strict=True) if of.any()]
         return math.sqrt(float(np.mean([np.square(one).mean() for one in chosen])))
 
 
@@ -203,7 +226,7 @@ class _Search:
             rows: samples of each test; all if None.
         """
         tests, names = [*self.tests.values()], ("c10", *terms, *self.branches)
-        unit = max(float(np.abs(test.stress).max() / np.abs(test.strain).max()) for test in tests)
+        unit = max(float(np.abs(test.stress[test.used]).max() / np.abs(test.strain[test.used]).max()) for test in tests)
         of_machines = [(number, name) for number, test in enumerate(tests) for name in test.deviations]
         scales = np.array([unit] * len(names) + [tests[number].deviations[name] for number, name in of_machines])
         system = _System(self, tests, names, of_machines, scales, rows)
@@ -215,11 +238,11 @@ class _Search:
         for _ in range(_STEPS):
             goal = scipy.optimize.lsq_linear(slopes, slopes @ x - residual, ends, method="bvls").x
             step, before = np.clip(goal, *ends) - x, float(residual @ residual)
-            for _halved in range(8):
+            for halved in range(_HALVINGS):
+                step = step if halved == 0 else 0.5 * step
                 residual, slopes = system.linear(x + step)
                 if float(residual @ residual) <= before * (1.0 + 1e-9):
                     break
-                step = 0.5 * step
             x = np.clip(x + step, *ends)
             if np.abs(step).max() < 1e-6 * np.abs(x).max():
                 break
@@ -242,14 +265,22 @@ class _Search:
         }
 
     def law(self, fit: _Fit, classes: list[TriedClass], best: int) -> MeasuredLaw:
-        """Returns the law of a fit to all samples."""
+        """Returns the law of a fit to all samples that count.
+
+        Raises:
+            InputError: no elastic term resists.
+        """
+        elastic = {name: value for name, value in fit.coefficients.items() if not name.startswith("prony")}
+        if not shear_modulus(elastic) > 0.0:
+            raise InputError("no elastic term explains these stresses: check the signs and the columns of the tests.")
         parameters, tests = self.parameters(fit), [*self.tests.values()]
         kept = [k for k, name in enumerate(fit.coefficients) if name in parameters]
         names = [name for name in fit.coefficients if name in parameters]
         covariance = fit.covariance[np.ix_(kept, kept)]
-        away = [test.away(fit.law, machine) for test, machine in zip(tests, fit.machines, strict=True)]
-        free = [test for test in tests if test.specimen is None]
-        stretches = [path_of(test.kind, np.append(test.strain, 0.0)).stretches for test in free] or [np.ones(1)]
+        away = [test.away(fit.law, machine)[test.used] for test, machine in zip(tests, fit.machines, strict=True)]
+        strains = [np.append(test.strain[test.used], 0.0) for test in tests]
+        kinds = [test.kind if test.kind in KINDS else "compression" for test in tests]
+        stretches = [path_of(kind, strain).stretches for kind, strain in zip(kinds, strains, strict=True)]
         rates = [np.abs(np.diff(test.strain) / np.diff(test.seconds)) for test in tests if test.seconds is not None]
         return MeasuredLaw(
             parameters=parameters,
@@ -259,7 +290,7 @@ class _Search:
             classes=classes,
             groups=classes[best]["groups"],
             stretches=(float(min(map(np.min, stretches))), float(max(map(np.max, stretches)))),
-            largest=max((float(np.abs(test.strain).max()) for test in free), default=0.0),
+            largest=max(float(np.abs(strain).max()) for strain in strains),
             rates=(float(min(map(np.median, rates))), float(max(map(np.median, rates)))) if rates else None,
             columns=fit.law,
             covariance=covariance,
@@ -300,8 +331,8 @@ class _System:
             by_machine = {"zero": zero + 1.0, "toe": -by_strain, "compliance": -by_strain * test.stress}
             columns = [by_law[name] for name in self.names]
             columns += [by_machine[name] if at == number else zero for at, name in self.of_machines]
-            chosen = np.ones(len(value), bool) if self.rows is None else self.rows[number]
-            weights = (test.weights * math.sqrt(_SAMPLES / chosen.sum()) / _NOISE)[chosen]
+            chosen = test.used if self.rows is None else self.rows[number]
+            weights = (test.weights * math.sqrt(min(_SAMPLES / chosen.sum(), 1.0)) / _NOISE)[chosen]
             residuals.append((value + machine.get("zero", 0.0) - test.stress)[chosen] * weights)
             slopes.append(np.stack(columns, 1)[chosen] * weights[:, None] * self.scales)
         residuals.append(x[len(self.names) :])
@@ -309,7 +340,7 @@ class _System:
         if (known := self.search.known) is not None:
             shares = np.array([shear_modulus({name: 1.0}) for name in self.names] + [0.0] * len(self.of_machines))
             modulus = shear_modulus(known["parameters"])
-            deviation = 2.0 * known.get("deviation", {}).get("c10", 0.5 * _RELATIVE_DEVIATION * modulus)
+            deviation = known.get("shear_deviation") or _RELATIVE_DEVIATION * modulus
             row = shares * self.scales / deviation
             residuals.append(np.array([row @ x - modulus / deviation]))
             slopes.append(row[None])
@@ -320,7 +351,7 @@ class _System:
         count, free = len(self.names), x > 1e-12
         free[len(self.names) :] = True
         curvature = slopes[:, free].T @ slopes[:, free]
-        samples = _SAMPLES * len(self.tests)
+        samples = sum(min(_SAMPLES, int(test.used.sum())) for test in self.tests)
         variance = max(float(residual @ residual) / max(samples - free.sum(), 1), 1.0)
         whole = np.zeros((len(x), len(x)))
         whole[np.ix_(free, free)] = variance * np.linalg.pinv(curvature)

@@ -8,7 +8,7 @@ parameters are those of the reactions at the end that moves.
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
@@ -20,7 +20,7 @@ from ...dynamics.simulator import Simulator
 from ...energies.base import Energy
 from ...energies.catalogue import make_material
 from ...energies.contact.obstacle_contact import Contact
-from ...energies.isochoric import TERMS, stress_columns
+from ...energies.isochoric import KINDS, TERMS, stress_columns
 from ...fem.bodies import Body
 from ...io.arrays import BoolArray, Brief, FloatArray, IntArray
 from ...io.errors import ConvergenceError, InputError, ResphysWarning
@@ -32,6 +32,7 @@ from ...settings.contact import Sphere
 from ...stepping.inputs import Inputs
 
 LEAST_SAMPLES: Final = 5  # of a test
+LARGEST_STRAIN: Final = 20.0  # of a silicone; larger ones are in per cent
 NUISANCES: Final = ("zero", "toe", "compliance")
 _LEAST: Final = 0.02  # of the largest stress, below which errors are not relative to the stress
 _LOWER: Final = 0.6  # share of the range of strains from which classes are fitted to predict the rest
@@ -81,6 +82,8 @@ class Specimen(Brief):
 
     def __post_init__(self) -> None:
         """Checks the sizes."""
+        if not isinstance(self.section, Sequence) or len(self.section) not in (1, 2):
+            raise InputError(f"section is {self.section}: give width and thickness, or the diameter, in a list [m].")
         sizes = {"length": self.length, "section": min(self.section), "indenter": self.indenter or 1.0}
         for name, size in sizes.items():
             if not (math.isfinite(size) and size > 0.0):
@@ -132,7 +135,9 @@ class Specimen(Brief):
     def response(
         self, kind: str, strain: FloatArray, parameters: Mapping[str, float]
     ) -> tuple[FloatArray, dict[str, FloatArray], FloatArray]:
-        """Returns the stress (N,) of a law at strains (N,), and its derivatives by the parameters and the strain.
+        """Returns the stress (N,) of a law in slow loading at strains (N,), and its derivatives.
+
+        The derivatives are by the parameters, of which viscosity and branches have none, and by the strain.
 
         Raises:
             InputError: a kind of test that has no such specimen.
@@ -218,16 +223,17 @@ class MaterialTest(Brief):
     Args:
         kind: ``tension``, ``compression``, ``biaxial``, ``planar``, ``shear``, or ``indentation`` of a `Specimen`.
         strain: (N,) nominal strains, angles of shear, or depths over the thickness; positive in compression, too.
-        stress: (N,) force over the undeformed cross-section [Pa].
+        stress: (N,) force over the undeformed cross-section [Pa], positive in compression, too.
         seconds: (N,) rising times [s], which relaxing branches need; the specimen is relaxed at the first.
         zero: standard deviation of the zero of the stress [Pa]; 0 if it is known.
         toe: that of the strain at which the specimen becomes taut.
         compliance: that of the machine's displacement over the length of the specimen, by stress [1/Pa].
         specimen: simulated where the deformation is not homogeneous, as between glued ends or under an indenter.
+        counted: (N,) samples that a law is identified from; None: all. The others are its history.
 
     Raises:
-        InputError: arrays that do not fit, are not finite, or have less than five samples; times that do not rise; or
-            strains or stresses that are all the same.
+        InputError: an unknown kind; arrays that do not fit, are not finite, or have less than five samples that count;
+            times that do not rise; negative or impossible strains, or negative stresses.
     """
 
     kind: str
@@ -238,25 +244,53 @@ class MaterialTest(Brief):
     toe: float = 0.0
     compliance: float = 0.0
     specimen: Specimen | None = None
+    counted: BoolArray | None = None
 
     def __post_init__(self) -> None:
         """Checks the samples."""
-        arrays = {"strain": self.strain, "stress": self.stress, "seconds": self.seconds}
-        for name, values in arrays.items():
-            if values is not None and (np.shape(values) != (len(self.strain),) or not np.isfinite(values).all()):
-                raise InputError(f"{name} has the shape {np.shape(values)}: give a finite number for every sample.")
-        if len(self.strain) < LEAST_SAMPLES or not np.any(self.stress) or not np.ptp(np.append(self.strain, 0.0)) > 0.0:
+        indented = self.specimen is not None and self.specimen.indenter is not None
+        if self.kind not in (*KINDS, "indentation") or (self.kind == "indentation") != indented:
             raise InputError(
-                f"the test has {len(self.strain)} samples: give {LEAST_SAMPLES} or more, of a specimen under load."
+                f"kind is {self.kind!r}: choose from {', '.join(KINDS)}, or indentation of a specimen with an indenter."
+            )
+        for name in ("strain", "stress", "seconds"):
+            if (given := getattr(self, name)) is not None:
+                values = np.asarray(given, dtype=np.float64)
+                object.__setattr__(self, name, values)
+                if values.shape != np.shape(self.strain) or values.ndim != 1 or not np.isfinite(values).all():
+                    raise InputError(f"{name} has the shape {values.shape}: give a finite number for every sample.")
+        if self.used.sum() < LEAST_SAMPLES or not np.any(self.stress[self.used]) or not np.any(self.strain[self.used]):
+            raise InputError(
+                f"{self.used.sum()} samples count: give {LEAST_SAMPLES} or more, of a specimen under load."
             )
         if self.seconds is not None and not (np.diff(self.seconds) > 0.0).all():
             raise InputError("seconds do not rise: sort the samples by time, and leave out those that repeat one.")
+        self._check_signs()
+
+    def _check_signs(self) -> None:
+        """Refuses strains and stresses with the signs or units of another convention."""
+        low, high = float(self.strain.min()), float(self.strain.max())
+        if self.strain.sum() < 0.0 or self.stress.sum() < 0.0:
+            raise InputError(
+                f"{self.kind} has mostly negative strains or stresses: both count as positive, also in compression; "
+                "change the signs of the table."
+            )
+        if low <= -1.0 or high > LARGEST_STRAIN or (self.kind in ("compression", "indentation") and high >= 1.0):
+            raise InputError(
+                f"{self.kind} has strains from {low:.3g} to {high:.3g}: give fractions of the length, not per cent, "
+                "and the right length of the specimen."
+            )
+
+    @property
+    def used(self) -> BoolArray:
+        """(N,) samples that a law is identified from."""
+        return np.ones(len(self.strain), bool) if self.counted is None else np.asarray(self.counted)
 
     @property
     def weights(self) -> FloatArray:
         """(N,) reciprocals of the stresses that errors are relative to [1/Pa]."""
         size = np.abs(self.stress)
-        return np.asarray(1.0 / np.maximum(size, _LEAST * size.max()))
+        return np.asarray(1.0 / np.maximum(size, _LEAST * size[self.used].max()))
 
     @property
     def deviations(self) -> dict[str, float]:
@@ -265,18 +299,13 @@ class MaterialTest(Brief):
 
     @property
     def lower(self) -> BoolArray:
-        """(N,) whether classes are fitted to a sample: the lower part of the strains, or the first part of a hold."""
+        """(N,) samples that classes are fitted to: the lower part of the strains, or the first part of a hold."""
         size = np.abs(self.strain)
-        low, high = float(size.min()), float(size.max())
-        if self.seconds is not None and np.quantile(size, 0.25) > low + 0.9 * (high - low):
-            first, last = self.seconds[0], self.seconds[-1]
-            return np.asarray(self.seconds <= first + _LOWER * (last - first))
-        return np.asarray(size <= low + _LOWER * (high - low))
-
-    def chosen(self, rows: BoolArray) -> "MaterialTest":
-        """Returns the test with some of its samples (N,)."""
-        seconds = None if self.seconds is None else self.seconds[rows]
-        return replace(self, strain=self.strain[rows], stress=self.stress[rows], seconds=seconds)
+        low, high = float(size[self.used].min()), float(size[self.used].max())
+        if self.seconds is not None and np.quantile(size[self.used], 0.25) > low + 0.9 * (high - low):
+            first, last = self.seconds[self.used][[0, -1]]
+            return np.asarray(self.used & (self.seconds <= first + _LOWER * (last - first)))
+        return np.asarray(self.used & (size <= low + _LOWER * (high - low)))
 
     def taut(self, machine: Machine) -> FloatArray:
         """Returns the strains (N,) of the specimen, by the constants of the machine."""

@@ -61,9 +61,10 @@ def test_table(metrics: TestMetrics) -> PageTable:
 
 def test_verdict(metrics: TestMetrics, law: LawContent, run: RunSettings) -> list[str]:
     """Returns how accurate the law is, beside the simplest ones, and advice."""
-    words = in_a_row(
-        [within_sentence(wording(name)[0][0]) for name in law["parameters"] if name not in ("density", "bulk_1")]
-    )
+    names = [name for name in law["parameters"] if not name.startswith(("density", "bulk_1", "prony"))]
+    branches = sum(name.startswith("prony_time") for name in law["parameters"])
+    terms = [within_sentence(wording(name)[0][0]) for name in names]
+    words = in_a_row([*terms, *([f"{branches} relaxing branch{'es' * (branches > 1)}"] if branches else [])])
     shown = {part: _mean(metrics, part) for part in _PARTS}
     part = "beyond" if shown["beyond"]["law"] is not None else "range"
     errors = {model: value for model, value in shown[part].items() if value is not None}
@@ -73,7 +74,7 @@ def test_verdict(metrics: TestMetrics, law: LawContent, run: RunSettings) -> lis
     if errors["law"] < _CLOSER * errors[simplest]:
         text += f"; {_MODELS[simplest]} has {_percent(errors[simplest])} %"
     elif law.get("groups"):
-        text += f", no less than {_MODELS[simplest]} ({_percent(errors[simplest])} %)"
+        text += f"; {_MODELS[simplest]} is closer ({_percent(errors[simplest])} %)"
     said = [f"{text}."]
     if run.material_tests is not None and (played := run.material_tests.simulated) is not None:
         true, found = played.material, law["parameters"]
@@ -109,8 +110,8 @@ def write_material_report(path: Path, metrics: TestMetrics, run: RunSettings, la
 
 
 _NOTE: Final = (
-    "Relative root mean squares of the stress. Hooke is a straight line; both simple models are fitted to the same "
-    "samples, with the same unknown zero of the load cell."
+    "Relative root mean squares of the stress. Hooke is a straight line with a free zero of the load cell; Neo-Hookean "
+    "has c10 alone, with the same unknown constants of the machine, and branches if there are any."
 )
 _HOW: Final = (
     "Every class of laws is fitted to the lower 60 % of the strains, and predicts the rest. The smallest class whose "
@@ -143,7 +144,7 @@ def draw_curves(tests: Mapping[str, TestResult], canvas: Canvas) -> Drawn:
         end = 100.0 * result["range"][1]
         if end < shown[-1]:
             axis.axvline(end, color=TONES["rule"].light, linewidth=1.2)
-            axis.text(end, 0.97, "learned up to here ", transform=axis.get_xaxis_transform(), **_LEARNED)
+            axis.text(end, 0.97, "identified up to here ", transform=axis.get_xaxis_transform(), **_LEARNED)
         axis.set(xlabel="strain [%]", ylabel="nominal stress [kPa]", title=name, xlim=(0.0, shown[-1]))
         axis.set_ylim(bottom=0.0)
     for axis in axes[len(tests) :]:

@@ -95,7 +95,7 @@ def test_the_wheel_holds_every_module_and_configuration(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     for folder, package in (("warp_resphys", ""), ("kernels", "kernels/"), ("conf", "conf/")):
-        for suffix in (".py", ".yaml", ".html", ".js", ".md", ".msh", "py.typed"):
+        for suffix in (".py", ".yaml", ".html", ".js", ".md", ".msh", ".xml", "py.typed"):
             for path in (REPOSITORY / folder).rglob(f"*{suffix}"):
                 assert f"warp_resphys/{package}{path.relative_to(REPOSITORY / folder).as_posix()}" in names
     metadata = {name for name in names if ".dist-info/" in name}

@@ -16,7 +16,7 @@ from warp_resphys.energies.contact.surface_contact import SurfaceContact
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.materials import Corotated
 from warp_resphys.energies.tendons import Tendons
-from warp_resphys.environments.making import ball_mesh
+from warp_resphys.environments.grippers import ball_mesh
 from warp_resphys.experiment.build import choose_device
 from warp_resphys.fem.bodies import Body
 from warp_resphys.fem.scene import Scene

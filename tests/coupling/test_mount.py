@@ -296,7 +296,7 @@ def test_an_arm_feels_the_ball_that_its_gripper_lifts():
     """Two fingers close on a ball on a table, and the arm lifts it; then its torques are those of statics to 0.5 %."""
     run = settings("experiment=finger", "integrator=implicit_euler")
     finger = Robot(Description("finger", "simulation", SimulatorSettings.of(run), run.simulation, build_mesh(run.mesh)))
-    gripper = pytest.importorskip("warp_resphys.environments.making", exc_type=ImportError).gripper
+    gripper = pytest.importorskip("warp_resphys.environments.grippers", exc_type=ImportError).gripper
     scene, arm = gripper(finger), mujoco.MjModel.from_xml_string(ARM)
     arm.opt.timestep = 0.002  # a fifth of the gripper's
     arm.body("upper").pos[:] = -0.3, 0.0, 0.2

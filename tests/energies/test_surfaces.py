@@ -15,7 +15,7 @@ from warp_resphys import Corotated, Inputs, Scene, Simulator, SolverSettings, St
 from warp_resphys.energies import FrictionPair
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher, warp_view
-from warp_resphys.environments.making import ball_mesh
+from warp_resphys.environments.grippers import ball_mesh
 from warp_resphys.fem.bodies import Body
 from warp_resphys.io.errors import InputError
 from warp_resphys.kernels.contact import nearest_points

@@ -1,4 +1,4 @@
-"""One small run with a laboratory, for all tests of environments."""
+"""Small runs with a laboratory, for all tests of environments."""
 
 import pytest
 
@@ -7,12 +7,21 @@ from warp_resphys.control.reduction import fingerprint
 from warp_resphys.environments import making
 
 RUN = ["experiment=tendon_rod", *ROD, *DRIVEN, "data.steps=30"]
+BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
+MESHES = ["mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"]
+FINGER = ["experiment=finger", *MESHES, *DRIVEN, "data.steps=30"]
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     making.register()
     return run_without_report(tmp_path_factory.mktemp("environments"), *RUN)
+
+
+@pytest.fixture(scope="session")
+def fingers(tmp_path_factory):
+    making.register()
+    return run_without_report(tmp_path_factory.mktemp("grasps"), *FINGER)
 
 
 @pytest.fixture(scope="session", autouse=True)

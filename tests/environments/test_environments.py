@@ -10,13 +10,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import warp_resphys
-from support.main_job import DRIVEN, run_without_report
 from support.refusals import refuses
 from warp_resphys import InputError, Robot, State
 from warp_resphys.control.worlds import World
 from warp_resphys.data.registration import kabsch
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
-from warp_resphys.environments.making import TASKS, make_vector, register
+from warp_resphys.environments.making import TASKS, make_vector
 from warp_resphys.environments.policies import ScriptedGrasp, errors_mm
 from warp_resphys.environments.tasks import FollowTask, Reach, ReachTask
 from warp_resphys.environments.vector import ActionMapping, Camera, RobotVectorEnv
@@ -41,7 +40,7 @@ def played(environment, steps=6, seed=3):
 @pytest.mark.slow
 class TestGymnasium:
     @pytest.mark.usefixtures("can_draw")
-    @pytest.mark.parametrize("task", [task for task in TASKS if task != "grasp"])  # by two fingers: test_grasps.py
+    @pytest.mark.parametrize("task", [task for task in TASKS if task not in ("grasp", "pick_and_place")])
     def test_its_checker_passes(self, folder, task):
         name = "".join(word.capitalize() for word in task.split("_"))
         environment = gym.make(f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK)
@@ -285,17 +284,6 @@ def test_markers_observed_in_their_own_frame_are_shown_on_the_body(robot):
     assert np.abs(observed - plain.markers).max() > 1e-4
     np.testing.assert_allclose(turned.markers, plain.markers, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose(kabsch(observed, plain.markers).apply(observed), plain.markers, atol=1e-8)
-
-
-BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
-MESHES = ["mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"]
-RUN = ["experiment=finger", *MESHES, *DRIVEN, "data.steps=30"]
-
-
-@pytest.fixture(scope="module")
-def fingers(tmp_path_factory):
-    register()
-    return run_without_report(tmp_path_factory.mktemp("grasps"), *RUN)
 
 
 @pytest.mark.slow

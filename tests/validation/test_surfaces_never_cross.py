@@ -30,7 +30,7 @@ from warp_resphys import Contact, Corotated, Inputs, Scene, Simulator, SolverSet
 from warp_resphys.energies.contact.pairs import PairList, Surface
 from warp_resphys.energies.launcher import Launcher
 from warp_resphys.energies.tendons import Tendons
-from warp_resphys.environments.making import ball_mesh
+from warp_resphys.environments.grippers import ball_mesh
 from warp_resphys.fem.bodies import Body
 from warp_resphys.mesh.boxes import box_hexahedra, box_tetrahedra
 from warp_resphys.mesh.rod import rod

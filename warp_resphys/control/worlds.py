@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
+from ..coupling.mount import MountedState
 from ..data.registration import kabsch
 from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..experiment.build import build_body, simulation_device
@@ -37,7 +38,7 @@ _BEFORE: Final = 1_000_000  # number of the first of the frames taken before the
 _LABORATORY: Final = "laboratory"
 
 
-S = TypeVar("S", State, ReducedState)
+S = TypeVar("S", State, ReducedState, MountedState)
 
 
 class World(ABC, Generic[S]):
@@ -64,7 +65,8 @@ class World(ABC, Generic[S]):
 
     def lost(self, state: S) -> BoolArray:
         """Which bodies (B,) have failed since they began."""
-        return np.asarray(torch.as_tensor(state.lost).cpu().numpy())
+        moving = state.robot if isinstance(state, MountedState) else state
+        return np.asarray(torch.as_tensor(moving.lost).cpu().numpy())
 
     def vary(self, random: Sequence[np.random.Generator]) -> None:
         """Draws new parameters, by a generator for each body; all bodies begin again afterwards."""
@@ -72,6 +74,11 @@ class World(ABC, Generic[S]):
 
     def bodies(self, state: S) -> tuple[IntArray, FloatArray]:
         """Surface triangles (S, 3) and vertices (B, N, 3) [m]; empty if the body is known by its markers only."""
+        return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
+
+    def rigid(self, state: S) -> tuple[IntArray, FloatArray]:
+        """Surface triangles (S, 3) and vertices (B, N, 3) of rigid bodies that carry the others [m]; empty if none."""
+        del state
         return np.zeros((0, 3), dtype=np.int64), np.zeros((self.count, 0, 3))
 
     def obstacles(self) -> ObstacleSurface:

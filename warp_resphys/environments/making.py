@@ -1,7 +1,6 @@
-"""Makes environments of a run by the name of a task, and registers the tasks in Gymnasium; the world of grippers."""
+"""Makes environments of a run by the name of a task, and registers the tasks in Gymnasium."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,26 +14,17 @@ from ..control.plan import tracked_of
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
-from ..energies.contact.obstacle_contact import Contact
-from ..energies.contact.obstacle_surface import ObstacleSurface
-from ..energies.contact.surface_contact import SurfaceContact
-from ..fem.bodies import Body
-from ..io.arrays import FloatArray, IntArray
+from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from ..mesh.boxes import box_hexahedra
-from ..mesh.volume_mesh import Mesh, boundary_triangles
-from ..robot.actuation import BASE, Given
+from ..robot.actuation import BASE
 from ..robot.loading import load
 from ..robot.robot import Robot
-from ..robot.robot_scene import RobotScene
-from ..settings.body import Rigid
-from ..settings.contact import HalfSpace
-from ..stepping.rollout import states
-from ..stepping.state import State
-from .tasks import FollowTask, Reach, ReachTask, RobotTask, SwingTask
+from .arm_world import JOINT_SPEED, ArmWorld
+from .grippers import RISE, SPEED, GraspWorld
+from .tasks import FollowTask, PlaceTask, Reach, ReachTask, RobotTask, SwingTask
 from .vector import ActionMapping, RobotVectorEnv
 
-TASKS: Final = ("reach", "follow", "swing_up", "grasp")
+TASKS: Final = ("reach", "follow", "swing_up", "grasp", "pick_and_place")
 WORLDS: Final = ("simulator", "reduced", "laboratory")
 _PLACES: Final = 64  # number of equilibria that sample the reachable places
 _RISE: Final = 0.1  # time in which an input can go from its least to its greatest value [s]
@@ -42,89 +32,6 @@ _NEAR_TIP: Final = 0.9  # distance of tip markers from the fixed vertices, relat
 _SHOWN: Final = 4  # number of observed vertices of a robot without markers
 _BASE: Final = 0.01  # travel of a base to either side [m]
 _BASE_SPEED: Final = 0.2  # largest speed of a base [m/s]
-RISE: Final = 0.02  # of the gripper [m], which lifts a ball
-SPEED: Final = 0.02  # of the gripper [m/s]: it rises while it closes
-FINGERS: Final = {"left": 0.0, "right": np.pi}  # angles about z [rad]
-BALL: Final = "ball"
-_GRIPPER: Final = "gripper"  # owner of the memory variable of the height
-_RADIUS, _MASS, _YOUNGS_MODULUS = 0.01, 0.01, 1e7  # of the ball [m, kg, Pa]
-_GAP, _BELOW = 1.5e-3, 1.5e-3  # between fingers and ball at rest, and from the fingers down to the table [m]
-_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED = 5e4, 0.8, 5e-4, 5e-3  # of all contact [Pa, 1, m, m/s]
-_TOLERANCE: Final = 1e-6  # of the solver, relative
-
-
-def gripper(robot: Robot) -> RobotScene:
-    """Returns two copies of a finger, which bends towards x and hangs along -z, on both sides of a rigid ball."""
-    mesh = robot.simulator.body.mesh
-    at, table = _RADIUS + _GAP + float(mesh.vertices[:, 0].max()), float(mesh.vertices[:, 2].min()) - _BELOW
-    robots = {name: (robot, (-at * np.cos(angle), 0, 0, 0, 0, angle)) for name, angle in FINGERS.items()}
-    ball = ball_mesh(_RADIUS, 2, mesh.cells.shape[1])
-    ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, table + _RADIUS + 0.9 * _DISTANCE])
-    below = Contact({"table": HalfSpace(position=(0.0, 0.0, table))}, _STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
-    density = _MASS / float(Body(ball).discretisation.element_volumes.sum())
-    things = {BALL: Body.rigid_body(ball, Rigid(density=density, stiffness=_YOUNGS_MODULUS), energies=[below])}
-    contact = SurfaceContact(_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
-    return RobotScene(robots, things, contact, _TOLERANCE)
-
-
-def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
-    """Returns a mesh of bricks with its middle at the origin."""
-    cube = box_hexahedra((2.0, 2.0, 2.0), (divisions,) * 3, nodes=nodes)
-    x = cube.vertices - 1.0
-    y2, z2 = np.roll(x, 1, axis=1) ** 2, np.roll(x, 2, axis=1) ** 2
-    return Mesh(radius * x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0), cube.cells)
-
-
-class GraspWorld(World[State]):
-    """B grippers, which take the command of both fingers, and their own height.
-
-    The last marker is the middle of the ball.
-
-    Args:
-        robot: a finger, loaded with ``on_failure="count"``.
-        driven: name of its input, which has one value.
-        count: B.
-        time_step: h [s], a multiple of the robot's.
-    """
-
-    parts, travel = 2, (0.0, 0.0, RISE)
-
-    def __init__(self, robot: Robot, driven: str, count: int, time_step: float) -> None:
-        self._scene = gripper(robot)
-        self.count, self.time_step, self.input = count, time_step, driven
-        self._substeps = round(time_step / robot.time_step)
-        with torch.no_grad():
-            rest = self._scene.begin(count)
-            self.rest = rest.with_memory({"height": rest.q.new_zeros(count)}, _GRIPPER)
-
-    @override
-    @torch.no_grad()
-    def step(self, state: State, commands: FloatArray) -> State:
-        height = torch.as_tensor(commands[:, 1]).to(state.q)
-        poses = state.q.new_zeros(self._substeps, self.count, 6)  # of the base, alike in the frames of both fingers
-        for part, pose in enumerate(poses, 1):
-            pose[:, 2] = torch.lerp(state.memory_of(_GRIPPER)["height"], height, part / self._substeps)
-
-        def step(before: State, pose: torch.Tensor) -> State:
-            inputs: dict[str, Given] = {self.input: commands[:, :1], BASE: pose}
-            return self._scene.step(before, dict.fromkeys(FINGERS, inputs))
-
-        *_, after = states(step, state, poses)
-        return after.with_memory({"height": height}, _GRIPPER)
-
-    @override
-    def markers(self, state: State) -> FloatArray:
-        fingers = torch.cat(list(self._scene.observe(state).values()), 1)
-        ball = state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
-        return np.asarray(torch.cat([fingers, ball], 1).double().cpu().numpy())
-
-    @override
-    def bodies(self, state: State) -> tuple[IntArray, FloatArray]:
-        return boundary_triangles(self._scene.scene.mesh), state.q.double().cpu().numpy()
-
-    @override
-    def obstacles(self) -> ObstacleSurface:
-        return ObstacleSurface.of(self._scene.scene)
 
 
 def make_vector(
@@ -134,7 +41,7 @@ def make_vector(
     model: str | None = None,
     world: str = "simulator",
     spread: float = 1.0,
-    seconds: float = 2.0,
+    seconds: float | None = None,
     action_time: float = 0.05,
     noise: float = 5e-5,
     tracked: Sequence[str] | None = None,
@@ -148,14 +55,15 @@ def make_vector(
     """Makes a vector environment of robots of a run, or of a file, with a task.
 
     Args:
-        task: ``reach``, ``follow``, ``swing_up``, which moves the base, or ``grasp``, by two fingers (`GraspWorld`).
+        task: ``reach``, ``follow``, ``swing_up``, which moves the base, ``grasp``, by two fingers (`GraspWorld`), or
+            ``pick_and_place``, by two fingers on an arm (`ArmWorld`).
         run: the run folder, or a file of `Robot.save`.
         num_envs: B.
         model: of the run; ``resphys`` if omitted.
         world: ``simulator``; ``reduced``, the reduced model, which is fast and has fixed parameters (computing it takes
             minutes if the run has none); or ``laboratory``, the simulation that stands in for the real robot.
         spread: variation of the parameters between robots, in standard deviations of their identification.
-        seconds: duration of an episode.
+        seconds: duration of an episode; 2 s if omitted, or 5 s for ``pick_and_place``.
         action_time: duration of an action [s], a multiple of the time step.
         noise: standard deviation of the observed markers' coordinates [m]; a laboratory has its own.
         tracked: the markers whose mean is the point of the task; those of the tip if omitted.
@@ -172,13 +80,18 @@ def make_vector(
         DataFileError: the run is missing, unfinished or changed.
     """
     robot, frames = _loaded(task, run, model, world, device, action_time)
+    arms = task == "pick_and_place"
+    seconds = (5.0 if arms else 2.0) if seconds is None else seconds
     actions, up = max(round(seconds / action_time), 1), _up(robot)
     shown = None if robot.labels else _spread_vertices(robot)
     bodies, mapping = _bodies(task, robot, Path(run).expanduser(), num_envs, world, spread, axis, shown, seed, frames)
     rest = bodies.markers(bodies.rest)[0]
-    point = np.eye(3, rest.size, rest.size - 3) if task == "grasp" else _tip(robot, rest, tracked, shown)
+    last = {"grasp": 3, "pick_and_place": 6}.get(task)  # coordinates of the task among those of the markers
+    point = _tip(robot, rest, tracked, shown) if last is None else np.eye(last, rest.size, rest.size - last)
     goals: RobotTask
-    if task in ("grasp", "swing_up"):
+    if arms:
+        goals = PlaceTask(num_envs, rest[-1])
+    elif task in ("grasp", "swing_up"):
         goals = _lift(robot, num_envs, up, point @ rest.ravel(), task == "grasp")
     else:
         reach = _reach(robot, mapping, point, shown, seed) if reach is None else reach
@@ -228,8 +141,8 @@ def _bodies(
     Worlds begin without inputs.
     """
     bodies: World[Any]
-    if task == "grasp":
-        return _grippers(robot, run, count, world, frames)
+    if task in ("grasp", "pick_and_place"):
+        return _grippers(task, robot, run, count, world, frames)
     if task == "swing_up":
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
         bodies = RobotWorld(robot, BASE, count, spread, along, shown)
@@ -246,8 +159,10 @@ def _bodies(
     return bodies, ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
 
 
-def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> tuple[World[Any], ActionMapping]:
-    """Grippers of two fingers each, and the map from actions to their input and height."""
+def _grippers(
+    task: str, robot: Robot, run: Path, count: int, world: str, frames: int
+) -> tuple[World[Any], ActionMapping]:
+    """Grippers of two fingers each, and the map from actions to their input and height, or the angles of their arms."""
     driven = driven_input(robot)
     if world == "reduced":
         raise InputError("a grasp needs contact, which reduced models lack: choose world simulator or laboratory.")
@@ -259,9 +174,17 @@ def _grippers(robot: Robot, run: Path, count: int, world: str, frames: int) -> t
     time_step = robot.time_step
     if world == "laboratory":
         robot = laboratory_robot(laboratory_settings(run), upright=True, on_failure="count")
-    low, high = np.append(np.array(driven.low), 0.0), np.append(np.array(driven.high), RISE)
-    rate = np.array([(high[0] - low[0]) / _RISE, SPEED])
-    return GraspWorld(robot, driven.name, count, time_step), ActionMapping(low, high, rate, np.zeros(2), frames)
+    low, high = np.array(driven.low), np.array(driven.high)
+    rate = (high - low) / _RISE
+    bodies: World[Any]
+    if task == "grasp":
+        bodies = GraspWorld(robot, driven.name, count, time_step)
+        low, high, rate = np.append(low, 0.0), np.append(high, RISE), np.append(rate, SPEED)
+    else:
+        bodies = arms = ArmWorld(robot, driven.name, count, time_step)
+        low, high = np.append(low, arms.low), np.append(high, arms.high)
+        rate = np.append(rate, np.full(len(arms.low), JOINT_SPEED))
+    return bodies, ActionMapping(low, high, rate, np.zeros(len(low)), frames)
 
 
 def _reach(robot: Robot, mapping: ActionMapping, point: FloatArray, shown: list[int] | None, seed: int) -> Reach:

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.polynomials import Polynomial, around
+from ..coupling.mounting_body import base_pose, mujoco_package
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..linalg.threads import threads_for
-from .tasks import GoalTask, Reach
+from .arm_world import FLANGE, PALM, ArmWorld
+from .tasks import LIFT, GoalTask, Reach
 from .vector import Observation, RobotVectorEnv
 
 Policy = Callable[[Observation], NDArray[np.float32]]
@@ -25,6 +27,12 @@ _ORDER: Final = 2  # of the polynomial from actions to equilibria
 _EFFORT: Final = 3e-3  # weight of squared actions beside the squared distance, for places of size one
 _CHANGE = 1e-6  # of actions for derivatives
 _STILL = 0.1  # observed change of positions in an action
+_ARM_SPEED: Final = 0.15  # largest speed of a gripper on an arm [m/s]
+_GAIN: Final = 0.3  # share of the way to its next place in an action
+_NEAR: Final = 1.2e-3  # distance from a place that is reached [m]
+_UNMOVED: Final = 0.02  # observed change of positions of an arm in an action
+_RISEN: Final = 0.03  # share of the height to lift a ball at which it is in the air
+_END: Final = 1e-3  # distance of the fingers' command from the end of its range
 _ITERATIONS, _STRIDE = 16, 0.25  # Gauss-Newton iterations, and the largest change of an action in one
 
 
@@ -86,6 +94,69 @@ class ScriptedGrasp:
         still = np.abs(seen[:, displacements:-3]).max(axis=1) < _STILL
         lifts = (height > -1.0) | (still & (command > self._action - 1e-3))
         return np.stack([np.full(len(seen), self._action), np.where(lifts, 1.0, -1.0)], 1).astype(np.float32)
+
+
+class ScriptedPlace:
+    """Picks a ball and places it: above the ball, down, close, up, above the goal, down, open, up.
+
+    The observation tells which of these is next. The angles of the joints follow from one Newton step with MuJoCo's
+    Jacobian towards the next place of the gripper, which stays upright.
+
+    Args:
+        environment: with the task ``pick_and_place``.
+
+    Raises:
+        InputError: another task.
+    """
+
+    def __init__(self, environment: RobotVectorEnv) -> None:
+        world = environment.world
+        if not isinstance(world, ArmWorld):
+            raise InputError("this policy moves arms: choose pick_and_place.")
+        self._world, self._size = world, environment.task.size
+        self._longest = _ARM_SPEED * world.time_step * environment.frames
+
+    def __call__(self, seen: Observation) -> NDArray[np.float32]:
+        """Returns actions (B, 7) for observations (B, width)."""
+        return np.stack([self._act(row) for row in seen.astype(np.float64)]).astype(np.float32)
+
+    def _act(self, seen: FloatArray) -> FloatArray:
+        """Returns the action (7,) for an observation (width,)."""
+        fingers, angles, lifted = seen[-14], seen[-13:-7], seen[-1]
+        to_ball, to_goal = self._size * seen[-7:-1].reshape(2, 3)
+        still = float(np.abs(seen[len(seen) // 2 - 7 : -14]).max()) < _UNMOVED
+        is_open, is_closed = fingers < _END - 1.0, fingers > 1.0 - _END
+        closes, move, up = not is_open, np.zeros(3), np.array([0.0, 0.0, 1.1 * LIFT])
+
+        def down(way: FloatArray) -> tuple[FloatArray, bool]:
+            """Returns the move along a way (3,), first above its end, and whether the end is reached."""
+            above = float(np.linalg.norm(way[:2])) > _NEAR
+            return way + above * up, still and not above and abs(float(way[2])) < _NEAR
+
+        if lifted < 1.0 and is_open:
+            move, closes = down(to_ball)
+        elif lifted < 1.0 and is_closed and (still or lifted > _RISEN):
+            move = up
+        elif lifted == 1.0 and is_closed:
+            aside = (to_ball + to_goal)[:2]  # from the gripper, as a ball sways
+            move, arrived = down(np.append(aside, to_goal[2]))
+            closes = not arrived
+        elif lifted == 1.0:
+            closes, move = False, to_ball + up if is_open else move
+        return np.append(1.0 if closes else -1.0, self._turned(angles, move))
+
+    def _turned(self, angles: FloatArray, move: FloatArray) -> FloatArray:
+        """Returns commands (6,) of joints, now at angles (6,), for a part of a move (3,) of the gripper [m]."""
+        world, mujoco = self._world, mujoco_package()
+        half, model = 0.5 * (world.high - world.low), world.mount.model
+        data, jacobian = mujoco.MjData(model), np.empty((6, model.nv))
+        data.qpos[:] = world.low + half * (angles + 1.0)
+        mujoco.mj_fwdPosition(model, data)
+        pose = base_pose(model, data, FLANGE, PALM)
+        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], pose[:3] + world.held, model.body(FLANGE).id)
+        move = _GAIN * move
+        move *= min(1.0, self._longest / max(float(np.linalg.norm(move)), 1e-12))
+        return np.asarray(angles + np.linalg.solve(jacobian, np.append(move, -pose[3:])) / half)
 
 
 def errors_mm(

@@ -1,4 +1,4 @@
-"""Tasks: reach a place, follow a figure, swing a body up. The largest reward of a step is one."""
+"""Tasks: reach a place, follow a figure, swing up, pick and place. The largest reward of a step is one."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,6 +15,9 @@ PREVIEW: Final = (0, 2, 5)  # actions ahead of the goals that are observed
 _FIGURES: Final = ("circle", "eight", "R", "E", "S")
 _LAPS_S: Final = (2.0, 5.0)  # range of the durations of a figure [s]
 _OF_REACH: Final = 0.6  # size of a figure, as a share of the reach
+LIFT: Final = 0.03  # height by which a ball is lifted before it is put down [m]
+_FROM_BALL: Final = 0.15  # size of the task to pick and place, about the first distance of the gripper [m]
+_AHEAD, _ASIDE = (-0.04, 0.04), (0.06, 0.12)  # ranges of goals from the ball, along and across the arm [m]
 
 
 @dataclass(frozen=True)
@@ -173,3 +176,51 @@ class SwingTask(RobotTask):
     @override
     def wanted(self, row: int, number: int) -> FloatArray:
         return np.asarray(self._rest + self.size * self._up)[None]
+
+
+class PlaceTask(RobotTask):
+    """Lift a ball from a table, and put it down on a place to one side of where it was.
+
+    Points (B, 6) are the middle of the gripper and that of the ball. With the greatest height g of the ball since the
+    episode began, over the height to lift it, and distances d over the size of the task, all from 0 to 1, the reward is
+    (max(1 - d(gripper, ball), g) + g + g (1 - d(ball, goal))) / 3. The vectors from gripper to ball and from ball to
+    goal, and g, are observed.
+
+    Args:
+        count: B.
+        rest: (3,) where the balls begin [m].
+    """
+
+    size, width = _FROM_BALL, 7
+
+    def __init__(self, count: int, rest: FloatArray) -> None:
+        self._rest, self._lifted, self.goals = rest, np.zeros(count), np.tile(rest, (count, 1))
+
+    @override
+    def begin(self, row: int, random: np.random.Generator) -> None:
+        side = random.choice([-1.0, 1.0])
+        self.goals[row] = self._rest + [random.uniform(*_AHEAD), side * random.uniform(*_ASIDE), 0.0]
+        self._lifted[row] = 0.0
+
+    @override
+    def observed(self, points: FloatArray, number: IntArray) -> FloatArray:
+        gripper, ball = points[:, :3], points[:, 3:]
+        to_ball, to_goal = (ball - gripper) / self.size, (self.goals - ball) / self.size
+        return np.concatenate([to_ball, to_goal, self._lifted[:, None]], axis=1)
+
+    @override
+    def reward(self, points: FloatArray, number: IntArray) -> FloatArray:
+        gripper, ball = points[:, :3], points[:, 3:]
+        self._lifted = np.clip((ball[:, 2] - self._rest[2]) / LIFT, self._lifted, 1.0)
+        near, placed = (
+            np.clip(1.0 - np.linalg.norm(ball - other, axis=1) / self.size, 0.0, 1.0) for other in (gripper, self.goals)
+        )
+        return np.asarray((np.maximum(near, self._lifted) + self._lifted + self._lifted * placed) / 3.0)
+
+    @override
+    def errors_mm(self, points: FloatArray, number: IntArray) -> FloatArray:
+        return np.asarray(1e3 * np.linalg.norm(points[:, 3:] - self.goals, axis=1))
+
+    @override
+    def wanted(self, row: int, number: int) -> FloatArray:
+        return self.goals[row : row + 1]

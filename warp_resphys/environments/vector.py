@@ -29,6 +29,7 @@ _SIZE: Final = (480, 480)  # px
 _TURN, _TILT = np.radians(-35.0), np.radians(20.0)  # azimuth and elevation of the camera
 _MARGIN: Final = 0.12  # around the scene, relative to its longer side
 _GOAL: Final = "#d1495b"
+CARRIER: Final = "#d9dde2"  # of rigid bodies that carry robots
 _RADII: Final = {"marker": 0.015, "goal": 0.022}  # relative to half the height of the picture
 _BEFORE: Final = {"goals": 4.0, "markers": 5.0}  # shift towards the camera, in the same units
 
@@ -55,7 +56,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         world: the simulated bodies.
         task: of the robots.
         mapping: from actions to the input of the world.
-        tracked: (3, 3 M) from the markers to the point of the task.
+        tracked: (3, 3 M) from the markers to the point of the task, or (6, 3 M) to its two points.
         actions: number A of actions of an episode.
         noise: standard deviation of observed coordinates [m], if the world has none.
         autoreset_mode: when episodes are reset, as in Gymnasium.
@@ -66,8 +67,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         actions: A.
         frames: number of simulation steps of an action.
         task: of the robots.
-        tracked: (3, 3 M).
+        tracked: (3, 3 M) or (6, 3 M).
         world: the simulated bodies.
+        state: of the world.
         rests: (B, M, 3) markers at the beginning of the episodes [m].
 
     Raises:
@@ -98,8 +100,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._up = np.asarray(up, dtype=np.float64)
         self._camera: Camera | None = None
         self._mode = mode
-        self._state = world.rest
-        self.rests = world.markers(self._state)
+        self.state = world.rest
+        self.rests = world.markers(self.state)
         width = 2 * self.rests[0].size + world.parts + task.width
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)
@@ -140,20 +142,20 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     def _begin(self, chosen: BoolArray) -> None:
         assert self._random is not None
-        self._state = self.world.rest.where(chosen, self._state)
+        self.state = self.world.rest.where(chosen, self.state)
         for row in np.flatnonzero(chosen):
             self.task.begin(int(row), self._random[row])
         self._commands[chosen] = self._mapping.start
         self._number[chosen], self._over[chosen] = 0, False
         rows = chosen[:, None, None]
-        self.rests = np.where(rows, self.world.markers(self._state), self.rests)
+        self.rests = np.where(rows, self.world.markers(self.state), self.rests)
         seen = self._cameras(chosen)
         self._seen, self._before = np.where(rows, seen, self._seen), np.where(rows, seen, self._before)
 
     def _cameras(self, chosen: BoolArray) -> FloatArray:
         """Observed markers (B, M, 3) [m], with noise for the chosen robots."""
         assert self._random is not None
-        markers = self.world.markers(self._state).copy()
+        markers = self.world.markers(self.state).copy()
         if self._noise:
             for row in np.flatnonzero(chosen):
                 markers[row] += self._noise * self._random[row].standard_normal(markers[row].shape)
@@ -161,8 +163,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     @property
     def _points(self) -> FloatArray:
-        """Points (B, 3) of the task, without noise [m]."""
-        return np.asarray(self.world.markers(self._state).reshape(self.num_envs, -1) @ self.tracked.T)
+        """Points (B, 3) or (B, 6) of the task, without noise [m]."""
+        return np.asarray(self.world.markers(self.state).reshape(self.num_envs, -1) @ self.tracked.T)
 
     def _errors(self) -> FloatArray:
         """Distances (B,) of the points from their current goals [mm]."""
@@ -180,20 +182,21 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             return None
         if self._random is None:
             raise InputError("the environment was not reset: call env.reset(seed=...) before env.render().")
-        triangles, vertices = self.world.bodies(self._state)
-        markers, number = self.world.markers(self._state), self._number
+        triangles, vertices = self.world.bodies(self.state)
+        rigid = self.world.rigid(self.state)
+        markers, number = self.world.markers(self.state), self._number
         wanted = [self.task.wanted(row, int(number[row])) for row in range(self.num_envs)]
         if self._camera is None:
             # The frame of the first robot, with the size of the task to all sides.
             middle = np.concatenate([self.rests[0], vertices[0]]).mean(axis=0)
             around = np.concatenate([-np.eye(3), np.eye(3)]) * self.task.size
             ways = np.stack([np.zeros(3), self.world.travel])[:, None]
-            seen = np.concatenate([self.rests[0], *(vertices[0] + ways), *wanted, middle + around])
+            seen = np.concatenate([self.rests[0], *(vertices[0] + ways), rigid[1][0], *wanted, middle + around])
             self._camera = Camera(self._up, seen, self.world.obstacles())
         errors = self._errors()
         seconds = number * self.world.time_step * self._mapping.frames
         texts = [f"{at:.2f} s, {error:.1f} mm" for at, error in zip(seconds, errors, strict=True)]
-        return tuple(self._camera.pictures(triangles, vertices, markers, wanted, texts))
+        return tuple(self._camera.pictures(triangles, vertices, markers, wanted, texts, rigid))
 
     @override
     def close_extras(self, **kwargs: Any) -> None:
@@ -236,9 +239,9 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         last, frames = self._commands.copy(), np.arange(1, mapping.frames + 1)[:, None, None]
         most = mapping.rate * self.world.time_step * frames
         commands = last + np.clip(wanted - last, -most, most)  # (F, B, n)
-        *_, self._state = states(self.world.step, self._state, commands)
+        *_, self.state = states(self.world.step, self.state, commands)
         self._commands = commands[-1]
-        lost = self.world.lost(self._state)
+        lost = self.world.lost(self.state)
         self._number += 1
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         changed = (self._commands - last) / (mapping.high - mapping.low)
@@ -289,6 +292,7 @@ class Camera:
         markers: FloatArray,
         goals: Sequence[FloatArray],
         texts: Sequence[str],
+        rigid: tuple[IntArray, FloatArray] | None = None,
     ) -> list[Pixels]:
         """Returns pictures (H, W, 3) of B robots.
 
@@ -298,6 +302,7 @@ class Camera:
             markers: (B, M, 3) [m].
             goals: B paths or places (K, 3) of their tasks [m].
             texts: B captions.
+            rigid: triangles (R, 3) and vertices (B, N, 3) [m] of rigid bodies that carry the robots.
 
         Raises:
             DrawingError: this machine cannot render.
@@ -315,6 +320,8 @@ class Camera:
             layers.append(Layer("lines", paths, chain(most), _GOAL, size=2.0, shift=before["goals"]))
         if len(triangles):
             layers += body_layers(vertices, triangles, self._half, width=1.5)
+        if rigid is not None:
+            layers += obstacle_layers(rigid[1], rigid[0], colour=CARRIER)
         view = View(layers, self._axes, self._focus, self._half)
         return list(self._renderer.frames(RenderScene([view], _SIZE, background="white", texts=texts)))
 

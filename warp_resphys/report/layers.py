@@ -99,12 +99,12 @@ def ghost_layers(points: FloatArray, triangles: IntArray, half: float, sharp: In
     return [surface, Layer("lines", points, sharp, BEHIND, size=2.0, shift=_BEFORE * half)]
 
 
-def obstacle_layers(points: FloatArray, triangles: IntArray, width: float = 1.5) -> list[Layer]:
+def obstacle_layers(points: FloatArray, triangles: IntArray, width: float = 1.5, colour: str = OBSTACLE) -> list[Layer]:
     """Returns layers of obstacles, with lines [px wide] along their sharp edges; none without triangles."""
     if not len(triangles):
         return []
     edges = sharp_edges(points if points.ndim == 2 else points[0], triangles)
-    surface = Layer("surface", points, triangles, OBSTACLE, light=_OBSTACLE_LIGHT)
+    surface = Layer("surface", points, triangles, colour, light=_OBSTACLE_LIGHT)
     return [surface, *([Layer("lines", points, edges, OUTLINE, size=width)] if len(edges) else [])]
 
 

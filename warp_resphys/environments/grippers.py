@@ -1,0 +1,114 @@
+"""Grippers of two fingers on both sides of a ball, and their world."""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from ..control.worlds import World
+from ..energies.contact.obstacle_contact import Contact
+from ..energies.contact.obstacle_surface import ObstacleSurface
+from ..energies.contact.surface_contact import SurfaceContact
+from ..fem.bodies import Body
+from ..io.arrays import FloatArray, IntArray
+from ..mesh.boxes import box_hexahedra
+from ..mesh.volume_mesh import Mesh, boundary_triangles
+from ..robot.actuation import BASE, Given
+from ..robot.robot import Robot
+from ..robot.robot_scene import RobotScene
+from ..settings.body import Rigid
+from ..settings.contact import HalfSpace
+from ..stepping.rollout import states
+from ..stepping.state import State
+
+RISE: Final = 0.02  # of the gripper [m], which lifts a ball
+SPEED: Final = 0.02  # of the gripper [m/s]: it rises while it closes
+FINGERS: Final = {"left": 0.0, "right": np.pi}  # angles about z [rad]
+BALL: Final = "ball"
+_GRIPPER: Final = "gripper"  # owner of the memory variable of the height
+_RADIUS, _MASS, _YOUNGS_MODULUS = 0.01, 0.01, 1e7  # of the ball [m, kg, Pa]
+_GAP, _BELOW = 1.5e-3, 1.5e-3  # between fingers and ball at rest, and from the fingers down to the table [m]
+_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED = 5e4, 0.8, 5e-4, 5e-3  # of all contact [Pa, 1, m, m/s]
+_TOLERANCE: Final = 1e-6  # of the solver, relative
+
+
+def gripper(robot: Robot, divisions: int = 2) -> RobotScene:
+    """Returns two copies of a finger, which bends towards x and hangs along -z, on both sides of a rigid ball.
+
+    Args:
+        robot: the finger.
+        divisions: of the ball; with an odd number it stands on a face, and does not roll.
+    """
+    mesh = robot.simulator.body.mesh
+    at, table = _RADIUS + _GAP + float(mesh.vertices[:, 0].max()), float(mesh.vertices[:, 2].min()) - _BELOW
+    robots = {name: (robot, (-at * np.cos(angle), 0, 0, 0, 0, angle)) for name, angle in FINGERS.items()}
+    ball = ball_mesh(_RADIUS, divisions, mesh.cells.shape[1])
+    lift = table + 0.9 * _DISTANCE - float(ball.vertices[:, 2].min())
+    ball = replace(ball, vertices=ball.vertices + [0.0, 0.0, lift])
+    below = Contact({"table": HalfSpace(position=(0.0, 0.0, table))}, _STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
+    density = _MASS / float(Body(ball).discretisation.element_volumes.sum())
+    things = {BALL: Body.rigid_body(ball, Rigid(density=density, stiffness=_YOUNGS_MODULUS), energies=[below])}
+    contact = SurfaceContact(_STIFFNESS, _FRICTION, _DISTANCE, _SLIP_SPEED)
+    return RobotScene(robots, things, contact, _TOLERANCE)
+
+
+def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
+    """Returns a mesh of bricks with its middle at the origin."""
+    cube = box_hexahedra((2.0, 2.0, 2.0), (divisions,) * 3, nodes=nodes)
+    x = cube.vertices - 1.0
+    y2, z2 = np.roll(x, 1, axis=1) ** 2, np.roll(x, 2, axis=1) ** 2
+    return Mesh(radius * x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0), cube.cells)
+
+
+class GraspWorld(World[State]):
+    """B grippers, which take the command of both fingers, and their own height.
+
+    The last marker is the middle of the ball.
+
+    Args:
+        robot: a finger, loaded with ``on_failure="count"``.
+        driven: name of its input, which has one value.
+        count: B.
+        time_step: h [s], a multiple of the robot's.
+    """
+
+    parts, travel = 2, (0.0, 0.0, RISE)
+
+    def __init__(self, robot: Robot, driven: str, count: int, time_step: float) -> None:
+        self._scene = gripper(robot)
+        self.count, self.time_step, self.input = count, time_step, driven
+        self._substeps = round(time_step / robot.time_step)
+        with torch.no_grad():
+            rest = self._scene.begin(count)
+            self.rest = rest.with_memory({"height": rest.q.new_zeros(count)}, _GRIPPER)
+
+    @override
+    @torch.no_grad()
+    def step(self, state: State, commands: FloatArray) -> State:
+        height = torch.as_tensor(commands[:, 1]).to(state.q)
+        poses = state.q.new_zeros(self._substeps, self.count, 6)  # of the base, alike in the frames of both fingers
+        for part, pose in enumerate(poses, 1):
+            pose[:, 2] = torch.lerp(state.memory_of(_GRIPPER)["height"], height, part / self._substeps)
+
+        def step(before: State, pose: torch.Tensor) -> State:
+            inputs: dict[str, Given] = {self.input: commands[:, :1], BASE: pose}
+            return self._scene.step(before, dict.fromkeys(FINGERS, inputs))
+
+        *_, after = states(step, state, poses)
+        return after.with_memory({"height": height}, _GRIPPER)
+
+    @override
+    def markers(self, state: State) -> FloatArray:
+        fingers = torch.cat(list(self._scene.observe(state).values()), 1)
+        ball = state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
+        return np.asarray(torch.cat([fingers, ball], 1).double().cpu().numpy())
+
+    @override
+    def bodies(self, state: State) -> tuple[IntArray, FloatArray]:
+        return boundary_triangles(self._scene.scene.mesh), state.q.double().cpu().numpy()
+
+    @override
+    def obstacles(self) -> ObstacleSurface:
+        return ObstacleSurface.of(self._scene.scene)

@@ -58,9 +58,8 @@ def test_gymnasiums_checker_passes(fingers):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("world", "count"), [("simulator", 2), ("laboratory", 1)])
-def test_the_scripted_policy_lifts_the_ball_and_puts_it_down_at_its_goal(fingers, world, count):
-    arms = make_vector("pick_and_place", fingers, count, "sysid", world)
+def test_the_scripted_policy_lifts_the_ball_and_puts_it_down_at_its_goal(fingers):
+    arms = make_vector("pick_and_place", fingers, 2, "sysid")
     policy, heights = ScriptedPlace(arms), []
     seen, _ = arms.reset(seed=0)
     before = arms.rests[:, -1]

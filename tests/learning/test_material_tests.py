@@ -116,6 +116,18 @@ def test_glued_ends_against_gent_and_lindley():
     assert slope[1] == pytest.approx((value[1] - value[0]) / 0.005, rel=0.02)
 
 
+def test_a_specimen_is_simulated_where_samples_count():
+    """A table up to rupture, of which the first tenth counts."""
+    specimen, strains = Specimen(0.004, (0.01, 0.01), cells=1), np.linspace(0.02, 3.0, 150)
+    law = {"c10": 30e3, "bulk_1": bulk_of({"c10": 30e3}, 0.4995)}
+    exact = specimen.response("shear", strains[:15], law)[0]
+    table = np.append(exact, np.full(135, exact[-1]))
+    test = MaterialTest("shear", strains, table, specimen=specimen, counted=strains < 0.31)
+    found = identify_from_tests({"a": test}, terms=(), **MADE_OF)
+    assert found.parameters["c10"] == pytest.approx(30e3, rel=1e-3)
+    assert found.largest == pytest.approx(0.3)
+
+
 def test_derivatives_of_a_simulated_specimen():
     specimen, law = Specimen(0.004, (0.01, 0.01), cells=1), {"c10": 30e3, "ogden_3": 10e3, "bulk_1": 5e6}
     strains = np.array([0.1, 0.2, 0.3])

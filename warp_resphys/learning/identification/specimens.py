@@ -320,7 +320,8 @@ class MaterialTest(Brief):
             ConvergenceError: a simulated specimen has no equilibrium.
         """
         if self.specimen is not None:
-            return self.specimen.response(self.kind, strain, parameters)
+            reach = _SAME * float(self.strain[self.used].max())  # what does not count is not simulated
+            return self.specimen.response(self.kind, np.minimum(strain, reach), parameters)
 
         def total(strain: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
             columns = stress_columns(self.kind, strain, tuple(parameters), self.seconds)

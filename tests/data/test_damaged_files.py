@@ -155,6 +155,6 @@ def read_elsewhere(folder, name, seed, count):
 @pytest.mark.parametrize("name", ELSEWHERE)
 def test_many_damaged_files_that_are_read_in_another_process(tmp_path, name):
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        refused, peak = pool.submit(read_elsewhere, tmp_path, name, seed=1, count=60).result()
+        refused, peak = pool.submit(read_elsewhere, tmp_path, name, seed=1, count=30).result()
     assert 20 << 10 < peak < 600 << 10
     assert refused > 6

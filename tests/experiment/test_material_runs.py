@@ -21,7 +21,6 @@ from warp_resphys.settings.run import RunSettings
 
 SILICONE = {"c10": 10e3, "ogden_3": 25e3}
 BAR = "specimen: {length: 0.033, width: 0.006, thickness: 0.003, ends: free}"
-PUBLIC = Path(__file__).parents[2].parent / "shared" / "data" / "silicone_tensile"
 
 
 def written(folder, header="time [s], displacement [mm], force [N]", noise=0.005):
@@ -125,6 +124,8 @@ def test_refused_tables(tmp_path):
         ("data.tests.tension.kind=indentation", "kind is indentation if, and only if"),
         ("data.tests.tension.specimen.length=0", "length"),
         ("law.file=foo", "there is no law foo"),
+        ("law.trials=2", "law.trials is for laws from trials"),
+        ("+simulation.youngs_modulus=1e5", "simulation has youngs_modulus, which tests of specimens identify"),
     ],
 )
 def test_refused_configurations(tmp_path, change, said):
@@ -167,7 +168,6 @@ def test_simulated_tensile_test(tmp_path):
         assert law["stretches"] == pytest.approx([1.6**-0.5, 1.6], rel=0.02)
 
 
-@pytest.mark.skipif(not PUBLIC.is_dir(), reason="without the tables of the Soft Robotics Materials Database")
 @pytest.mark.parametrize(
     "name",
     [
@@ -179,10 +179,10 @@ def test_simulated_tensile_test(tmp_path):
         "Mold Star 16 FAST",
     ],
 )
-def test_public_silicones_beyond_their_tests(name):
+def test_public_silicones_beyond_their_tests(shared_data, name):
     """Identified from 5 to 100 % of strain: 3 % there (5 % Ecoflex), 12 % up to 200 %, within the 90 % interval."""
     columns = TableSettings(columns=("time [s]", None, None, "strain", "stress [MPa]"), header_lines=18)
-    read = read_test(PUBLIC / f"{name}.csv", columns)
+    read = read_test(shared_data / "silicone_tensile" / f"{name}.csv", columns)
     inside, beyond = ((read["strain"] >= low) & (read["strain"] <= 2.0 * low + 0.9 * (low < 1)) for low in (0.05, 1.0))
     test = MaterialTest("tension", read["strain"][inside], read["stress"][inside], zero=5e3)
     law = identify_from_tests({"tension": test}, density=1070.0)

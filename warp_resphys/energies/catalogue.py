@@ -214,6 +214,7 @@ def silicone(product: str) -> Material:
         InputError: the package has no law of it.
     """
     try:
-        return read_material(silicone_name(product))
+        name = silicone_name(product)
     except ValueError as error:
         raise InputError(f"silicone: {error}") from error
+    return read_material(name)

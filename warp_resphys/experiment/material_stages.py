@@ -16,7 +16,13 @@ from ..io.resuming import Stage, StageContext, package_versions, resources_used
 from ..io.safe_files import read_json, write_json
 from ..learning.identification.material_tests import MeasuredLaw, identify_from_tests
 from ..learning.identification.specimens import LEAST_SAMPLES, MaterialTest, Specimen
-from ..report.pages.material_page import TestMetrics, TestResult, test_table, test_verdict, write_material_report
+from ..report.pages.material_page import (
+    MaterialMetrics,
+    SpecimenResult,
+    material_verdict,
+    specimen_table,
+    write_material_report,
+)
 from ..settings.run import RunSettings
 from ..settings.specimen import MaterialTestData, SimulatedTests
 from ..settings.stage_keys import StageSettings
@@ -135,13 +141,13 @@ def identify_material(context: StageContext) -> None:
     write_json(context.run_dir / RESULTS, {"tests": results, "machines": law.machines, "rates": law.rates})
 
 
-def _result(name: str, test: MaterialTest, law: MeasuredLaw, simplest: MeasuredLaw) -> TestResult:
+def _result(name: str, test: MaterialTest, law: MeasuredLaw, simplest: MeasuredLaw) -> SpecimenResult:
     """Returns errors and curves of a test: in the range, and beyond it where the specimen is not simulated."""
     size, machine = np.abs(test.strain), law.machines[name]
     high = float(size[test.used].max())
     reach = high * (_REACH if test.specimen is None else 1.0)
     beyond = (size > high) & (size <= reach)
-    slope, offset = hooke = _hooke(test)
+    slope, offset = _hooke(test)
     away = {
         "law": law.away(name, test),
         "neo_hookean": simplest.away(name, test),
@@ -159,14 +165,12 @@ def _result(name: str, test: MaterialTest, law: MeasuredLaw, simplest: MeasuredL
         shown, curve, simple = taut[seen], law.curve(test, taut)[seen], simplest.curve(test, taut)[seen]
     else:
         shown = np.linspace(0.0, float(taut[seen].max()), _CURVE)
-        curve, simple = (
-            law.curve(replace(test, seconds=None), shown),
-            simplest.curve(replace(test, seconds=None), shown),
-        )
+        slowly = replace(test, seconds=None)
+        curve, simple = law.curve(slowly, shown), simplest.curve(slowly, shown)
     if slow:
         half = law.interval(test.kind, shown)[1].tolist()
     every = max(1, int(seen.sum()) // _DOTS)
-    return TestResult(
+    return SpecimenResult(
         kind=test.kind,
         errors=errors,
         covered=covered,
@@ -176,7 +180,7 @@ def _result(name: str, test: MaterialTest, law: MeasuredLaw, simplest: MeasuredL
         law=curve.tolist(),
         half_width=half,
         neo_hookean=simple.tolist(),
-        hooke=(hooke[0] * shown + hooke[1] - zero).tolist(),
+        hooke=(slope * shown + offset - zero).tolist(),
         range=[float(size[test.used].min()), high],
     )
 
@@ -202,7 +206,7 @@ def report_material(context: StageContext) -> None:
     )
 
 
-def material_metrics(folder: Path) -> TestMetrics:
+def material_metrics(folder: Path) -> MaterialMetrics:
     """Returns the content of metrics.json."""
     return {
         **read_json(folder / RESULTS),
@@ -217,4 +221,4 @@ def print_material(run: RunSettings, folder: Path) -> None:
     """Writes metrics.json, and prints the errors and the verdict."""
     metrics, law = material_metrics(folder), read_json(folder / LAW_FILE)
     write_json(folder / METRICS, metrics)
-    show(run.heading, test_table(metrics), *test_verdict(metrics, law, run), f"Report: {folder / REPORT}")
+    show(run.heading, specimen_table(metrics), *material_verdict(metrics, law, run), f"Report: {folder / REPORT}")

@@ -60,6 +60,20 @@ class MotionSettings(Settings):
         return self
 
 
+class WithoutMotion(Settings):
+    """Base of data in which neither the base of the body nor obstacles move."""
+
+    @property
+    def base_motion(self) -> None:
+        """Motion of the base: there is none."""
+        return None
+
+    @property
+    def obstacle_motion(self) -> dict[str, MotionSettings]:
+        """Motion of obstacles: none moves."""
+        return {}
+
+
 class WaveSettings(Settings):
     """Periodic inputs, `data.input_response.wave_inputs`."""
 

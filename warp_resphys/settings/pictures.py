@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from ..io.settings import Count, Many, Natural, NotNegative, Pair, Positive, Settings, Some, Vector, Word, setting
 from .mesh import LengthUnit, Place
-from .performed import LimitSettings, MotionSettings, different
+from .performed import LimitSettings, WithoutMotion, different
 
 _Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 _Rows = Annotated[Many[Vector], Field(min_length=3, max_length=3)]
@@ -114,7 +114,7 @@ class SimulatedCamera(Settings):
     looks_at: Vector = setting(description="point in the middle of the pictures", unit="m")
 
 
-class PictureData(Settings):
+class PictureData(WithoutMotion):
     """Bodies before a camera, at rest or released: outlines and tracked points in pictures."""
 
     kind: Literal["pictures"]
@@ -186,16 +186,6 @@ class PictureData(Settings):
         if isinstance(self.lens, dict):
             return self.lens
         return {} if self.lens is None else {"": self.lens}
-
-    @property
-    def base_motion(self) -> None:
-        """Motion of the base: bodies rest."""
-        return None
-
-    @property
-    def obstacle_motion(self) -> dict[str, MotionSettings]:
-        """Motion of obstacles: none moves."""
-        return {}
 
     def limited(self) -> "PictureData":
         """Returns the data with as many poses of training, and of the test of their materials, as the limit allows."""

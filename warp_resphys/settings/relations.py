@@ -7,8 +7,11 @@ from typing import Final
 
 from ..io.errors import listed
 from .data_kinds import ReleaseFromLoad
+from .learning import LawSettings
 from .run_keys import RunKeys
 
+_OF_SPECIMENS: Final = {"density", "poissons_ratio"}  # parameters of a law that tests of specimens do not show
+_OF_TRIALS: Final = ("families", "trials", "seconds", "max_evaluations", "tolerance")  # keys of laws from trials
 _LEAST_STEPS: Final = 20  # of a path that is followed
 
 
@@ -38,8 +41,13 @@ def _check_data(run: RunKeys) -> None:
     if run.material_tests is not None:
         if run.law is None:
             raise ValueError("law is null, but data.kind is material_tests: give its terms, law={terms: [ogden_3]}.")
-        if lost := {"density", "poissons_ratio"} - {*run.simulation.values}:
+        if lost := _OF_SPECIMENS - {*run.simulation.values}:
             raise ValueError(f"simulation lacks {min(lost)}, which tests of specimens do not show: give it.")
+        if more := {*run.simulation.values} - _OF_SPECIMENS:
+            raise ValueError(f"simulation has {min(more)}, which tests of specimens identify, or lack: leave it out.")
+        unset = LawSettings()
+        if idle := [key for key in _OF_TRIALS if getattr(run.law, key) != getattr(unset, key)]:
+            raise ValueError(f"law.{idle[0]} is for laws from trials, and data.kind is material_tests: leave it out.")
         return
     if run.tip is None:
         raise ValueError("tip is null: name the vertices whose mean motion is reported, such as {x: 0.1}.")

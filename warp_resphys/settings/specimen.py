@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from ..io.settings import Natural, NotNegative, Pair, Positive, Settings, Word, setting
 from .data_kinds import TableSettings
-from .performed import MotionSettings, rising
+from .performed import WithoutMotion, rising
 
 
 class SpecimenSettings(Settings):
@@ -74,7 +74,7 @@ class SimulatedTests(Settings):
     cells: Natural = setting(3, "cells across the thinnest direction of simulated specimens")
 
 
-class MaterialTestData(Settings):
+class MaterialTestData(WithoutMotion):
     """Tests of specimens: tension, compression, shear, indentation, relaxation."""
 
     kind: Literal["material_tests"]
@@ -95,13 +95,3 @@ class MaterialTestData(Settings):
         if self.folder is not None and (lost := [name for name, test in self.tests.items() if test.file is None]):
             raise ValueError(f"tests.{lost[0]}.file is null: name its table in data.folder.")
         return self
-
-    @property
-    def base_motion(self) -> None:
-        """Motion of the base: there is none."""
-        return None
-
-    @property
-    def obstacle_motion(self) -> dict[str, MotionSettings]:
-        """Motion of obstacles: none moves."""
-        return {}

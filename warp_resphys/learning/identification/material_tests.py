@@ -250,16 +250,15 @@ class _Search:
 
     def parameters(self, fit: _Fit) -> dict[str, float]:
         """Parameters of a `ConvexMaterial`."""
-        elastic = {name: value for name, value in fit.coefficients.items() if not name.startswith("prony")}
-        shear = shear_modulus(elastic)
-        kept = {name: value for name, value in elastic.items() if name == "c10" or value > _NEEDLESS * shear}
+        shear, elastic = shear_modulus(fit.coefficients), [name for name in fit.coefficients if TERMS.fullmatch(name)]
+        kept = {n: x for n in elastic if (x := fit.coefficients[n]) > _NEEDLESS * shear or n == "c10"}
         branches = {n: x for n, x in fit.law.items() if n.startswith("prony_") and x > _NEEDLESS * shear}
         viscosity = {name: value for name, value in fit.law.items() if name == "shear_viscosity"}
         relaxing = branches_of([*branches.values()], [float(name.removeprefix("prony_")) for name in branches])
         return {
             "density": self.density,
             **kept,
-            "bulk_1": bulk_of(elastic, self.poissons_ratio),
+            "bulk_1": bulk_of(fit.coefficients, self.poissons_ratio),
             **viscosity,
             **relaxing,
         }
@@ -270,8 +269,7 @@ class _Search:
         Raises:
             InputError: no elastic term resists.
         """
-        elastic = {name: value for name, value in fit.coefficients.items() if not name.startswith("prony")}
-        if not shear_modulus(elastic) > 0.0:
+        if not shear_modulus(fit.coefficients) > 0.0:
             raise InputError("no elastic term explains these stresses: check the signs and the columns of the tests.")
         parameters, tests = self.parameters(fit), [*self.tests.values()]
         kept = [k for k, name in enumerate(fit.coefficients) if name in parameters]
@@ -318,8 +316,7 @@ class _System:
         law, viscous = dict(coefficients), self.search.viscous
         for name, value in viscous.items():
             law[name] = law.get(name, 0.0) + value
-        elastic = {name: value for name, value in coefficients.items() if not name.startswith("prony")}
-        return coefficients, law | {"bulk_1": bulk_of(elastic, self.search.poissons_ratio)}, machines
+        return coefficients, law | {"bulk_1": bulk_of(coefficients, self.search.poissons_ratio)}, machines
 
     def linear(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Returns residuals (R,) and derivatives (R, P) by x (P,)."""

@@ -21,7 +21,7 @@ _HEIGHT: Final = 2.7  # inch, of a panel
 _ROW: Final = 2  # panels side by side
 
 
-class TestResult(TypedDict):
+class SpecimenResult(TypedDict):
     """Errors and curves of a test."""
 
     kind: str
@@ -37,16 +37,16 @@ class TestResult(TypedDict):
     range: list[float]  # strains that the law is identified from
 
 
-class TestMetrics(Usage, total=False):
+class MaterialMetrics(Usage, total=False):
     """Content of metrics.json of a run with tests of specimens."""
 
-    tests: dict[str, TestResult]
+    tests: dict[str, SpecimenResult]
     machines: dict[str, dict[str, float]]  # constants of the machines by test
     rates: list[float] | None  # least and largest rate of strain [1/s]
     parameters: Mapping[str, float]
 
 
-def test_table(metrics: TestMetrics) -> PageTable:
+def specimen_table(metrics: MaterialMetrics) -> PageTable:
     """Returns the relative errors, with a row for each test and part of its strains."""
     rows = []
     for name, result in metrics["tests"].items():
@@ -59,7 +59,7 @@ def test_table(metrics: TestMetrics) -> PageTable:
     return PageTable("Test", [*(f"{name} [%]" for name in _MODELS.values()), "In the 90 % interval"], rows, _NOTE)
 
 
-def test_verdict(metrics: TestMetrics, law: LawContent, run: RunSettings) -> list[str]:
+def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings) -> list[str]:
     """Returns how accurate the law is, beside the simplest ones, and advice."""
     names = [name for name in law["parameters"] if not name.startswith(("density", "bulk_1", "prony"))]
     branches = sum(name.startswith("prony_time") for name in law["parameters"])
@@ -83,7 +83,7 @@ def test_verdict(metrics: TestMetrics, law: LawContent, run: RunSettings) -> lis
     return said
 
 
-def _mean(metrics: TestMetrics, part: str) -> dict[str, float | None]:
+def _mean(metrics: MaterialMetrics, part: str) -> dict[str, float | None]:
     """Returns the root mean square over the tests, by model; None without samples."""
     errors = [result["errors"][part] for result in metrics["tests"].values()]
     known = {model: [x for one in errors if (x := one[model]) is not None] for model in _MODELS}
@@ -94,7 +94,7 @@ def _percent(error: float | None) -> str:
     return NONE if error is None else number_text(100.0 * error)
 
 
-def write_material_report(path: Path, metrics: TestMetrics, run: RunSettings, law: LawContent) -> None:
+def write_material_report(path: Path, metrics: MaterialMetrics, run: RunSettings, law: LawContent) -> None:
     """Writes the page, see `write_page`.
 
     Raises:
@@ -102,11 +102,11 @@ def write_material_report(path: Path, metrics: TestMetrics, run: RunSettings, la
     """
 
     def sections(canvas: Canvas) -> Iterator[Part]:
-        yield Part("", [draw_curves(metrics["tests"], canvas), test_table(metrics)])
+        yield Part("", [draw_curves(metrics["tests"], canvas), specimen_table(metrics)])
         yield Part("Law", [_coefficients(law), *_machines(metrics), _classes(law)])
         yield Part("How it is compared", [Text(_HOW)])
 
-    write_page(path, sections, run, test_verdict(metrics, law, run), metrics)
+    write_page(path, sections, run, material_verdict(metrics, law, run), metrics)
 
 
 _NOTE: Final = (
@@ -121,7 +121,7 @@ _HOW: Final = (
 )
 
 
-def draw_curves(tests: Mapping[str, TestResult], canvas: Canvas) -> Drawn:
+def draw_curves(tests: Mapping[str, SpecimenResult], canvas: Canvas) -> Drawn:
     """Draws stress over strain of every test."""
     columns = min(len(tests), _ROW)
     rows = -(-len(tests) // columns)
@@ -173,7 +173,7 @@ def _coefficients(law: LawContent) -> PageTable:
     return PageTable("Term", ["Identified", "Unit"], rows, note)
 
 
-def _machines(metrics: TestMetrics) -> list[Block]:
+def _machines(metrics: MaterialMetrics) -> list[Block]:
     """Returns the unknown constants of the machines."""
     units = {"zero": ("kPa", 1e-3), "toe": ("%", 100.0), "compliance": ("% of the length per MPa", 1e8)}
     names = [name for name in units if any(name in machine for machine in metrics["machines"].values())]

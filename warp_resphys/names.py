@@ -1,5 +1,6 @@
 """The public names of the package, which `warp_resphys` imports when one of them is first used."""
 
+from .data.force_sensors import ForceSensor as ForceSensor
 from .data.markers import Markers as Markers
 from .data.markers import Observation as Observation
 from .data.markers import bind_markers as bind_markers

@@ -25,7 +25,8 @@ from warp_resphys.experiment.splits import trials_of
 from warp_resphys.io.resuming import StageContext, fingerprint, run_stages
 from warp_resphys.io.safe_files import read_hdf5, read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.replay import Replay
+from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.pipeline import acquisition_stages
 from warp_resphys.settings.run import RunSettings

@@ -18,7 +18,7 @@ from warp_resphys.experiment.report import RunReader
 from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.sensitivity import sensitivities
-from warp_resphys.learning.replay import exact
+from warp_resphys.learning.parameters import exact
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.settings.performed import MotionSettings
 

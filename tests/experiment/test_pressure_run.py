@@ -326,7 +326,7 @@ def test_the_spread_of_predicted_markers_is_that_of_draws_of_the_parameters(fini
     drawn = np.random.default_rng(0).multivariate_normal(means, covariance, 400)
     replay = experiment.motions.replay(experiment.model_simulator("sysid"), ["t003"], experiment.identified("sysid"))
     sets = {name: torch.from_numpy(drawn[:, column].copy()) for column, name in enumerate(names)}
-    points = replay.varied(experiment.motions.start(replay, experiment.identified("sysid")), sets)[:, 0].numpy()
+    points = replay.varied(experiment.motions.start(replay, experiment.identified("sysid")), sets)[0][:, 0].numpy()
     with read_hdf5(finished / "rollouts.h5", "rollouts") as file:
         stored = read_array(file, "sysid_spread")[0]
         corrected = [read_array(file, f"{model}_spread")[0] for model in ("actuator", "resphys")]

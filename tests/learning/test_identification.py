@@ -16,7 +16,8 @@ from warp_resphys.learning.identification.search import Identification, first_po
 from warp_resphys.learning.identification.uncertainty import LinearMisfit, LinearTrial, uncertainty_of
 from warp_resphys.learning.metrics import redundancy
 from warp_resphys.learning.placement import Accuracy, PlacedMarkers, Placement
-from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.replay import Replay
+from warp_resphys.learning.start import Start
 from warp_resphys.settings.learning import Bounds, Prior
 
 TRUTH = {"youngs_modulus": 215e3, "stiffness_damping": 0.002}

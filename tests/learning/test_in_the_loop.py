@@ -8,10 +8,11 @@ from support.swinging_beam import double, simulated
 from warp_resphys import Body, ConvergenceError, Inputs, Simulator, State, box_hexahedra, select_vertices
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
-from warp_resphys.learning.observed_motions import at_steps
-from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.replay import Replay
+from warp_resphys.learning.resampling import at_steps
 from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
+from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings
 from warp_resphys.studies.gradient_check import central_difference
@@ -163,7 +164,7 @@ class TestInTheLoop:
         def failing(*_, **__):
             raise ConvergenceError("no", torch.zeros(1), None)
 
-        monkeypatch.setattr(Replay, "__call__", failing)
+        monkeypatch.setattr(Replay, "sensed", failing)
         assert loss.error_mm(None) == float("inf")
 
     def test_cross_validation_selects_the_number_of_epochs(self, loss):

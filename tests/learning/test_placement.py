@@ -19,7 +19,8 @@ from warp_resphys.learning import Bounds, Prior, search_parameters
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.identification.nuisances import NuisanceFit
 from warp_resphys.learning.placement import Accuracy, DisplacedMarkers, PlacedMarkers, Placement
-from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.replay import Replay
+from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.stepping.rotations import twisted
 
@@ -98,7 +99,7 @@ def test_the_placement_minimises_its_sum_of_squares():
     observed = torch.where(seen[0][..., None], at - errors[0], torch.nan)
     trials = TrialBatch(names, torch.arange(3).double().expand(2, -1), observed, held)
     group = (Replay(SIM, DisplacedMarkers(bind(), 4), trials), Start.resting(REST.expand(2, -1, -1)))
-    series = [torch.cat([at, *(at + turn for turn in turns.unbind(-1))], 2)[None]]
+    series = [(torch.cat([at, *(at + turn for turn in turns.unbind(-1))], 2)[None], trials.loads[None])]
     placed = NuisanceFit([group], weights, accuracy, 0.0)(series, 1e-5)[1]
     result, inside = placed.common, placed.rows / math.sqrt(1e-5)
     assert float(result.turn.norm()) > 0.02

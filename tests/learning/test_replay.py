@@ -17,7 +17,8 @@ from warp_resphys.io.settings import parse
 from warp_resphys.learning.identification.misfit import Misfit
 from warp_resphys.learning.parameters import tilted_gravity
 from warp_resphys.learning.release import ReleaseSettings, begin_inputs, estimate_release, hold, sideways_shapes
-from warp_resphys.learning.replay import Replay, Start
+from warp_resphys.learning.replay import Replay
+from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.mesh.selection import select_vertices
 from warp_resphys.settings.learning import Bounds
@@ -130,7 +131,7 @@ def test_gradients_of_every_parameter_agree_with_central_differences(integrator,
     assert float(differences.abs().min()) > 0.0
     torch.testing.assert_close(gradient[0] * scale, differences, rtol=1e-4, atol=1e-5 * float(differences.abs().max()))
     points = torch.cat([at[None], at + 0.1 * steps])
-    varied = replay.varied(release, dict(zip(replay.parameter_names, points.mT, strict=True)))
+    varied, _ = replay.varied(release, dict(zip(replay.parameter_names, points.mT, strict=True)))
     along = replay.errors(varied).square().sum((1, 2, 3, 4))
     torch.testing.assert_close(
         (along[1:] - along[0]) / 1e-5, differences, rtol=1e-3, atol=1e-4 * float(differences.abs().max())
@@ -292,7 +293,7 @@ def test_varied_trials_differ_from_the_first_as_trials_simulated_one_by_one(stat
     }
     with torch.no_grad():
         alone = replay(start, sets)
-    varied = replay.varied(start, sets)
+    varied, _ = replay.varied(start, sets)
     wanted = alone[1:] - alone[0]
     torch.testing.assert_close(varied[0], alone[0], rtol=0.0, atol=1e-10)
     torch.testing.assert_close(varied[1:] - varied[0], wanted, rtol=0.0, atol=1e-2 * float(wanted.abs().max()))

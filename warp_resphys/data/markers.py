@@ -89,6 +89,15 @@ class WholeState(Observation):
 WHOLE_STATE: Final = WholeState()
 
 
+@dataclass(frozen=True)
+class NoPoints(Observation):
+    """No position at all, where force sensors alone observe a body."""
+
+    @override
+    def __call__(self, positions: torch.Tensor) -> torch.Tensor:
+        return positions[:, :0]
+
+
 def _to(value: Any, like: torch.Tensor) -> Any:
     if isinstance(value, torch.Tensor):
         return value.to(like) if value.is_floating_point() else value.to(like.device)

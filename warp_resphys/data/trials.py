@@ -32,6 +32,7 @@ RESTING: Final = ("rest", UNDER_INPUTS, SLACK)  # of motions that inputs begin, 
 _KIND = "dataset"
 _RESTING, _CHANNELS = "_resting", "_channels"  # ends of names in a file
 T = TypeVar("T")
+_GROUPS = {"obstacles": "m, rad", "loads": "N, N m"}  # units of series by name
 _UNITS = {
     **dict.fromkeys(("observed", "smoothed", "held", "bound"), "m"),
     **{"velocity": "m/s", "times": "s", "payload": "kg", "base": "m, rad", "initial": "m, m/s"},
@@ -65,6 +66,7 @@ class Trials(Brief):
         obstacles: (R, K + 1, 6) motions of obstacles at the steps by name, see `data.obstacle_motion`.
         sessions: session in which each trial was recorded; empty if there is one.
         units: units of the inputs.
+        loads: (R, T, 6) readings of force sensors by name [N, N m], see `data.force_sensors`; NaN where there is none.
     """
 
     names: tuple[str, ...]
@@ -87,6 +89,7 @@ class Trials(Brief):
     obstacles: Mapping[str, FloatArray] = field(default_factory=dict)
     sessions: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    loads: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def session(self, name: str) -> str:
         """Session in which a trial was recorded; empty if there is one."""
@@ -134,7 +137,7 @@ class Trials(Brief):
         """
         words = {"names": self.names, "labels": self.labels, "begins": self.begins, "inputs": tuple(self.inputs)}
         words |= {"sessions": self.sessions} if self.sessions else {}
-        words |= {"obstacles": tuple(self.obstacles)} if self.obstacles else {}
+        words |= {key: tuple(values) for key in _GROUPS if (values := getattr(self, key))}
         words |= {f"{name}{_CHANNELS}": channels for name, channels in self.channels.items()}
         attributes = {**{key: list(strings) for key, strings in words.items()}, "gravity": self.gravity}
         with atomic_hdf5(path, _KIND, {**attributes, "time_step": self.time_step}) as file:
@@ -144,8 +147,9 @@ class Trials(Brief):
                     create(file, name, getattr(self, name), units=unit, time_axis=axis)
             for name, values in self.inputs.items():
                 create(file, name, values, units=self.units.get(name) or "1", time_axis=1)
-            for name, values in self.obstacles.items():
-                create(file, f"obstacles/{name}", values, units=_UNITS["base"])
+            for key, unit in _GROUPS.items():
+                for name, values in getattr(self, key).items():
+                    create(file, f"{key}/{name}", values, units=unit, time_axis=1)
             for name, values in self.resting.items():
                 create(file, f"{name}{_RESTING}", values, units=self.units.get(name) or "1")
 
@@ -159,7 +163,7 @@ class Trials(Brief):
         with read_hdf5(path, _KIND) as file:
             required = ("names", "labels", "begins", "inputs")
             words = {key: tuple(map(str, read_attribute(file, key))) for key in required}
-            more = {key: tuple(map(str, file.attrs.get(key, ()))) for key in ("sessions", "obstacles")}
+            more = {key: tuple(map(str, file.attrs.get(key, ()))) for key in ("sessions", *_GROUPS)}
             inputs, r = words.pop("inputs"), len(words["names"])
             times = read_array(file, "times", (r, None))
             observed = read_array(file, "observed", (r, times.shape[1], len(words["labels"]) or None, 3))
@@ -185,6 +189,7 @@ class Trials(Brief):
                 },
                 sessions=more["sessions"],
                 obstacles={n: read_array(file, f"obstacles/{n}", (r, None, 6)) for n in more["obstacles"]},
+                loads={n: read_array(file, f"loads/{n}", (*times.shape, 6)) for n in more["loads"]},
             )
 
     def joined(self, other: "Trials") -> "Trials":
@@ -193,10 +198,12 @@ class Trials(Brief):
             name: None if getattr(self, name) is None else np.concatenate([getattr(self, name), getattr(other, name)])
             for name in ("times", "observed", "held", "payload", "initial", "smoothed", "velocity", "base")
         }
-        inputs, obstacles = (
-            {name: np.concatenate([values, theirs[name]]) for name, values in mine.items()}
-            for mine, theirs in ((self.inputs, other.inputs), (self.obstacles, other.obstacles))
-        )
+        named = {
+            key: {
+                name: np.concatenate([values, getattr(other, key)[name]]) for name, values in getattr(self, key).items()
+            }
+            for key in ("inputs", *_GROUPS)
+        }
         resting = {
             name: np.concatenate(
                 [mine.resting.get(name, np.zeros_like(mine.inputs[name][:, 0])) for mine in (self, other)]
@@ -204,7 +211,7 @@ class Trials(Brief):
             for name in {**self.resting, **other.resting}
         }
         words = {key: getattr(self, key) + getattr(other, key) for key in ("names", "begins", "sessions")}
-        changed: dict[str, Any] = {**words, **arrays, "inputs": inputs, "resting": resting, "obstacles": obstacles}
+        changed: dict[str, Any] = {**words, **arrays, **named, "resting": resting}
         return replace(self, **changed)
 
     def chosen(self, names: Sequence[str] | None) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ Mass damping is linear in the solution, so it is merged with inertia and target.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar, cast
 
 import torch
@@ -231,6 +232,11 @@ class EnergySet:
                 others = "obstacles" if isinstance(bound, BoundContact) else "surfaces"
                 out[f"{self.placed[k].prefix}{others}"] = bound.forces(self._step(step, k), x)
         return out
+
+    @cached_property
+    def obstacle_names(self) -> frozenset[str]:
+        """Names of all obstacles."""
+        return frozenset(name for item in self.placed for name in getattr(item.energy, "obstacles", ()))
 
     def obstacles(self, states: Sequence[State], constants: Constants) -> tuple[Pose, ...]:
         """Returns the poses of all obstacles in each state; none without obstacles.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..linalg.linear_solver import Factor
 from ..linalg.threads import threads_for
+from ..stepping.state import State
 from .assembly import HessianAssembly
 from .time_step import TimeStep
 from .workspace import Workspace
@@ -34,6 +35,7 @@ class Linearisation:
 
     def __init__(self, problem: TimeStep) -> None:
         equations, self._workspace, self._terms = problem.equations, problem.workspace, problem.terms()
+        self._reaction = problem.reaction
         self.stage, self.finish, self._name = problem.step.stage, problem.finish, equations.settings.linear_solver
         self._fixed_positions, self._coordinates = problem.fixed_positions(), equations.coordinates
         self.start = self.hold(self.stage.target)
@@ -53,6 +55,13 @@ class Linearisation:
         self._potential.positions.copy_(x)
         self._potential.evaluate()
         return self._potential.residual.clone()
+
+    def reached(self, x: torch.Tensor) -> State:
+        """Returns the new state, with its reaction, as if x (B, N, 3) [m] solved the step, differentiable by x."""
+        self._potential.positions.copy_(x.detach())
+        self._potential.evaluate()
+        gradient = self._potential.fixed_gradient[:, self._workspace.fixed]
+        return replace(self.finish(x), reaction=self._reaction(self._terms, x, gradient))
 
     def factorise(self, x: torch.Tensor) -> None:
         """Prepares H at x (B, N, 3) [m] for `product` and `solve`, which makes an expensive factor if it needs one."""
@@ -142,6 +151,22 @@ class Linearisation:
         elastic, _ = self.matrix(x)
         self._potential.set_terms(self._terms)
         return scipy.sparse.csc_array(whole - elastic)
+
+
+def first_order(x: torch.Tensor, here: Linearisation, there: Linearisation) -> torch.Tensor:
+    """Returns solutions (E R, N, 3) of E other steps or equilibria each, to first order in what these differ by [m].
+
+    Args:
+        x: (R, N, 3) solution of the first ones [m].
+        here: linearisation of the first ones.
+        there: of the others.
+    """
+    here.factorise(x)
+    sets = len(there.start) // len(x)
+    at = x.repeat(sets, 1, 1)
+    forces = (there.residual(at) - here.residual(x).repeat(sets, 1, 1)).unflatten(0, (sets, -1))
+    moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))
+    return at - moved.permute(3, 0, 1, 2).flatten(0, 1)
 
 
 class _ShiftedHessian:

@@ -230,8 +230,7 @@ class Simulator:
             parameters: parameters or prepared constants (`prepare`).
 
         Returns:
-            Contact with ``obstacles``, and that between ``surfaces``; of the body NAME of a scene, ``NAME_obstacles``
-            and ``NAME_surfaces``.
+            Contact with ``obstacles`` and between ``surfaces``; ``NAME_obstacles`` of the body NAME of a scene.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.
@@ -240,25 +239,35 @@ class Simulator:
         with problem.workspace.potential.lock:
             return self.energies.contacts(problem.step, after.q)
 
-    def reaction(self, state: State | Motion, at: str | ArrayLike | None = None) -> Reaction:
-        """Returns what holds the fixed vertices in the step or equilibrium that led to a state, differentiable.
+    def reaction(
+        self,
+        state: State | Motion,
+        at: str | ArrayLike | None = None,
+        before: State | None = None,
+        inputs: Inputs | None = None,
+        parameters: Parameters | Constants | None = None,
+    ) -> Reaction:
+        """Returns what holds a body in the step or equilibrium that led to a state, differentiable.
 
         Args:
             state: state from `step` or `static_equilibrium`, or a motion from `rollout`, of which it is for every step.
             at: a region of the mesh or a body of a scene, with vertices that it shares with others, or numbers of fixed
-                vertices; None: all of these.
+                vertices; None: all of these. An obstacle, of which it presses on the body, needs what follows, too.
+            before: state at the start of the step; None: the state is an equilibrium.
+            inputs: inputs during the step.
+            parameters: parameters or prepared constants (`prepare`).
 
         Raises:
             InputError: no step led to the state, or nothing holds the body there.
         """
+        if isinstance(at, str) and isinstance(state, State) and at in self.energies.obstacle_names:
+            contacts = self.contacts(before or state, state, inputs, parameters).values()
+            return Reaction.join([contact.reaction(at) for contact in contacts if at in contact.obstacles])
         if state.reaction is None:
-            raise InputError(
-                "no step of a body with fixed vertices led to this state, or it is a copy, as by `detach`: it has no "
-                "reaction."
-            )
-        if at is None:
-            return state.reaction
-        return state.reaction.at(self.body.fixed_in(at) if isinstance(at, str) else at)
+            copied = "or it is a copy, as by `detach`: it has no reaction."
+            raise InputError(f"no step of a body with fixed vertices led to this state, {copied}")
+        at = self.body.fixed_in(at) if isinstance(at, str) else at
+        return state.reaction if at is None else state.reaction.at(at)
 
     def is_held(
         self, state: State, inputs: Inputs | None = None, parameters: Parameters | Constants | None = None
@@ -301,8 +310,8 @@ class Simulator:
     ) -> State:
         """Returns the static equilibrium under gravity and constant inputs, differentiable like a step.
 
-        Friction of contact makes it depend on the poses before. The state that is returned has the memory of contact;
-        that of other energies is of a body long at rest.
+        Friction of contact makes it depend on the poses before. The state has the memory of contact; that of other
+        energies is of a body long at rest.
 
         Args:
             inputs: constant inputs.

@@ -16,7 +16,7 @@ from ..io.progress import QUIET_SECONDS, Progress
 from ..stepping.inputs import Inputs
 from ..stepping.state import Constants, SolveReport, State
 from .energy_set import SimulatorStep
-from .equilibrium import equilibrium, reaction_of
+from .equilibrium import equilibrium
 from .nonlinear_solver import check_converged
 from .time_step import TimeStep
 
@@ -65,10 +65,8 @@ class StaticEquilibrium(TimeStep):
 
     def _solved(self, x: torch.Tensor) -> State:
         """Returns the state of the last `_balance`, with its reaction."""
-        energies = self.equations.energies
-        terms = self.terms(near=x if energies.follow_pose else None)
-        loads = energies.loads_at_fixed(terms, x)
-        return replace(self.finish(x), reaction=reaction_of(self.workspace, terms, x, self._gradient, loads))
+        terms = self.terms(near=x if self.equations.energies.follow_pose else None)
+        return replace(self.finish(x), reaction=self.reaction(terms, x, self._gradient))
 
     @override
     def solve(self, near: torch.Tensor | None = None) -> State:

@@ -55,6 +55,17 @@ class TimeStep:
         moved = torch.zeros_like(now) if fixed is None else fixed - now
         return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
 
+    def reaction(self, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor) -> Reaction | None:
+        """Returns the reaction at the fixed vertices, differentiable; None without such vertices.
+
+        Args:
+            terms: of the potential.
+            x: (B, N, 3) solution of the stage [m].
+            gradient: (B, D, 3) of the energies at the fixed vertices there, as numbers [N].
+        """
+        loads = self.equations.energies.loads_at_fixed(terms, x)
+        return self._at_known_velocity(reaction_of(self.workspace, terms, x, gradient, loads))
+
     def _at_known_velocity(self, reaction: Reaction | None) -> Reaction | None:
         """Returns the reaction with the inertia of fixed vertices, whose velocity V at the end is prescribed.
 
@@ -81,7 +92,6 @@ class TimeStep:
         terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
         x, report, gradient = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
         whole = equations.coordinates.expand(x)
-        reaction = reaction_of(workspace, terms, x, gradient, equations.energies.loads_at_fixed(terms, whole))
-        new = replace(self.finish(whole), report=report, reaction=self._at_known_velocity(reaction))
+        new = replace(self.finish(whole), report=report, reaction=self.reaction(terms, whole, gradient))
         workspace.record_positions(new.q)
         return new

@@ -162,7 +162,7 @@ class Experiment:
             assert markers is not None
             bound = bound_markers(markers, self.body.mesh, trials.bound, trials.labels)
             observe = ViewedMarkers.of(bound, marker_view_of(markers, trials.labels, trials.sets)).to(self.like)
-        more = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
+        more: dict[str, Any] = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
         return ObservedMotions(
             trials, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **more
         )

@@ -195,7 +195,7 @@ class Comparison:
         parts = self._rolled_out[0][model]
         order = [trial for part in parts for trial in part.names]
         rows = [order.index(trial) for trial in self.names]
-        if name == "observed":
+        if name in ("observed", "loads"):
             return self.parts.joined(parts, name, self.motions.trials.observed.shape[1])[rows]
         return np.concatenate([self.parts.read(part, name) for part in parts])[rows]
 
@@ -212,6 +212,16 @@ class Comparison:
     def simulated(self) -> dict[str, FloatArray]:
         """(R, T, M, 3) predicted points of the tested trials by model [m], first those without physics."""
         return self._without_physics[0] | {model: self._in_order(model, "observed") for model in self.models}
+
+    @cached_property
+    def loads(self) -> dict[str, FloatArray]:
+        """(R, T, S, 6) readings of the force sensors in tested trials by model [N, N m]; empty without sensors."""
+        if not self.motions.sensors:
+            return {}
+        as_points = _loads_as_points(self.motions)
+        plain, *_ = without_physics(as_points, self.names, self.train, self._first_frames)
+        shown = {model: values.reshape(*values.shape[:2], -1, 6) for model, values in plain.items()}
+        return shown | {model: self._in_order(model, "loads") for model in self.models}
 
     def film(self, model: str) -> FloatArray:
         """(F, N, 3) vertices of the filmed trial at `film_steps` [m]."""
@@ -264,6 +274,7 @@ class Comparison:
         compared = ComparedModels(
             *(self.motions, self.train, self.groups, self.simulated, left, self.reconstructed, self.horizons),
             first_frames=self._first_frames,
+            loads=self.loads,
         )
         content = compared.errors()
         if self._first_frames:
@@ -346,3 +357,12 @@ class Comparison:
         """Returns the intervals of a model with the growth of the one that shows it, see `_below`."""
         own, below = calibrated[model], calibrated.get(self._below(model) or "")
         return own if own is None or below is None else replace(own, reach=below.reach, growth=below.growth)
+
+
+def _loads_as_points(motions: ObservedMotions) -> ObservedMotions:
+    """Returns motions whose observed points are forces and moments, two of each sensor, for predictions from data."""
+    trials = motions.trials
+    readings = np.stack([*trials.loads.values()], 2).reshape(*trials.times.shape, -1, 3)
+    names = tuple(f"{name} {kind}" for name in trials.loads for kind in ("force", "moment"))
+    changed = replace(trials, labels=names, observed=readings, held=readings[:, 0], smoothed=None, bound=None)
+    return replace(motions, trials=replace(changed, loads={}), sensors={})

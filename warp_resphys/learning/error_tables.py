@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 from typing import TypedDict
 
 import numpy as np
+import torch
 
 from ..data.driving import PHASES, phases_of
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
 from ..data.trials import STATIC, Trials
-from ..io.arrays import FloatArray, IntArray
+from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
 from .evaluation import first_frame, used_frames
 from .identification.sensitivity import FreeFit
@@ -25,6 +26,13 @@ class RangeExits(TypedDict):
     first_s: dict[str, float]  # time at which each left, by trial
 
 
+class ForceErrors(TypedDict):
+    """Errors of the readings of a force sensor."""
+
+    unit: str
+    models: dict[str, ErrorSummary]
+
+
 class ErrorTables(TypedDict, total=False):
     """Content of errors.json."""
 
@@ -35,6 +43,7 @@ class ErrorTables(TypedDict, total=False):
     orientations_deg: dict[str, dict[str, float | None]]  # mean by model and rigid body
     horizons: dict[str, dict[str, ErrorSummary]]  # by duration [s] and model
     phases: dict[str, dict[str, ErrorSummary]]  # by phase of the inputs and model
+    forces: dict[str, ForceErrors]  # by sensor
     range: dict[str, RangeExits]  # by model with a network
     scales: dict[str, dict[str, ErrorSummary]]  # by scale of the inputs and model
     scales_range: dict[str, dict[str, RangeExits]]
@@ -59,6 +68,7 @@ class ComparedModels:
         reconstructed: (R, T, M, 3) reconstructed points of the trials with the original inputs [m]; None without any.
         horizons: durations of whose errors there is a table [s].
         first_frames: that do not count, see `Identified`.
+        loads: (R, T, S, 6) readings of force sensors by model [N, N m].
     """
 
     motions: ObservedMotions
@@ -69,6 +79,7 @@ class ComparedModels:
     reconstructed: FloatArray | None = None
     horizons: Sequence[float] = ()
     first_frames: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    loads: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def errors(self) -> ErrorTables:
         """Returns the tables that depend on the roll-outs alone."""
@@ -105,7 +116,26 @@ class ComparedModels:
             content["horizons"] = horizons
         if phases := self._by_phase(test, observed):
             content["phases"] = phases
+        if self.loads:
+            content["forces"] = self._by_sensor()
         return content | self._by_scale(models, observed)
+
+    def _by_sensor(self) -> dict[str, ForceErrors]:
+        """Returns the errors of forces by sensor and model, in the frames that count."""
+        motions, names = self.motions, self.groups["1"]
+        counts = counting(motions, self.train, names, self.first_frames)
+        rows_of = motions.trials.rows(names)
+        times, found = torch.from_numpy(motions.trials.times[rows_of]), dict[str, ForceErrors]()
+        for number, (name, readings) in enumerate(motions.trials.loads.items()):
+            sensor, read = motions.sensors[name], torch.from_numpy(readings[rows_of])
+            models = dict[str, ErrorSummary]()
+            for model, loads in self.loads.items():
+                away = sensor.distances(torch.from_numpy(loads[: len(names), :, number]), read, times).numpy()
+                known = [row[at & ~np.isnan(row)] for row, at in zip(away, counts, strict=True)]
+                if any(map(len, known)):
+                    models[model] = summarise(row for row in known if len(row))
+            found[name] = {"unit": sensor.unit, "models": models}
+        return found
 
     def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:
         """Returns the errors of the first seconds by duration and model, if frames of all trials count in them."""
@@ -165,18 +195,28 @@ def counted(
         InputError: nothing is left of a trial after the frames from which values were estimated.
     """
     observed = motions.trials.observed[motions.trials.rows(names)]
-    for row, name in enumerate(names):
-        if name in train:
-            observed[row, : motions.learned_steps(observed.shape[1] - 1) + 1] = np.nan
-    used = used_frames(motions.trials, names, first_frames)
-    for name, frames in zip(names, used, strict=True):
+    for name, frames in zip(names, used_frames(motions.trials, names, first_frames), strict=True):
         if frames.all():
             raise InputError(
                 f"values of {name!r} are estimated from all of it, so that nothing is left to test: shorten "
                 "release.window."
             )
-    observed[used] = np.nan
+    observed[~counting(motions, train, names, first_frames)] = np.nan
     return observed
+
+
+def counting(
+    motions: ObservedMotions,
+    train: Sequence[str],
+    names: Sequence[str],
+    first_frames: Mapping[str, Mapping[str, float]],
+) -> BoolArray:
+    """(R, T) whether frames of tested trials count, as nothing was learned or estimated from them."""
+    counts = ~used_frames(motions.trials, names, first_frames)
+    for row, name in enumerate(names):
+        if name in train:
+            counts[row, : motions.learned_steps(counts.shape[1] - 1) + 1] = False
+    return counts
 
 
 def amplitudes(trials: Trials, names: Sequence[str]) -> dict[str, float]:

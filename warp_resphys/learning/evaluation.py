@@ -14,14 +14,14 @@ import torch
 from ..data.trials import GIVEN, STATIC, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import BoolArray, FloatArray
-from ..io.errors import ConvergenceError, InputError, checks_types
+from ..io.errors import ConvergenceError, InputError, checks_types, listed
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..stepping.rollout import states
 from ..stepping.state import State
 from .metrics import marker_errors, summarise
 from .observed_motions import Identified, ObservedMotions
-from .replay import Start
 from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
+from .start import Start
 
 HELD_OUT: Final = "left-out training"
 _FOLDS: Final = 3  # of the training trials, where validation trials do not suffice
@@ -36,6 +36,7 @@ def evaluate(
     *,
     names: Sequence[str] | None = None,
     parameters: Identified | Mapping[str, float] | None = None,
+    sensor: str | None = None,
     parts: Parts | None = None,
 ) -> FloatArray:
     """Rolls a simulator out from the start of observed motions and measures its error.
@@ -47,11 +48,13 @@ def evaluate(
             (B, N, 3) [N] for trials that begin alike; None for the simulator alone.
         names: of the R trials; all by default.
         parameters: values in place of the simulator's, such as `Identification.parameters`.
+        sensor: name of the force sensor whose error is returned; None for that of the points.
         parts: workers and files of the work; this process and its memory if None.
 
     Returns:
-        (T, R) mean distance of the observed points in the unit of the observation, such as m; NaN where none was seen
-        or parameters were estimated (`Identified.first_frames`), infinite after a simulation diverged.
+        (T, R) mean distance of the observed points in the unit of the observation, such as m, or error of a force
+        (`ForceSensor.distances`) [N]; NaN where nothing was seen or parameters were estimated
+        (`Identified.first_frames`), infinite after a simulation diverged.
 
     Raises:
         InputError: an input that the body does not take.
@@ -59,14 +62,23 @@ def evaluate(
     """
     trials, parts = motions.trials, parts or Parts("evaluate")
     names = trials.chosen(names)
+    if sensor is not None and sensor not in motions.sensors:
+        raise InputError(f"there is no force sensor {sensor!r}: there are {listed([*motions.sensors]) or 'none'}.")
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
-    order = [name for part in cut_up for name in part.names]
-    points = parts.joined(cut_up, "observed", trials.observed.shape[1])[[order.index(name) for name in names]]
-    shown, observed = simulator.tensor(points), simulator.tensor(trials.observed[trials.rows(names)])
+    order, rows = [name for part in cut_up for name in part.names], trials.rows(names)
+    used = torch.from_numpy(used_frames(trials, names, Identified.of(parameters).first_frames))
+    array = "observed" if sensor is None else "loads"
+    made = parts.joined(cut_up, array, trials.observed.shape[1])[[order.index(name) for name in names]]
+    if sensor is not None:
+        shown, read = (
+            torch.from_numpy(x) for x in (made[:, :, [*trials.loads].index(sensor)], trials.loads[sensor][rows])
+        )
+        away = motions.sensors[sensor].distances(shown, read, torch.from_numpy(trials.times[rows]))
+        return np.asarray(torch.where(used, torch.nan, away).T.numpy())
+    shown, observed = simulator.tensor(made), simulator.tensor(trials.observed[rows])
     away = motions.observe.residual(shown.nan_to_num(math.inf), observed).norm(dim=-1).nan_to_num(math.inf)
-    used = torch.from_numpy(used_frames(trials, names, Identified.of(parameters).first_frames)).to(away.device)
-    seen = torch.isfinite(observed).all(-1) & ~used[..., None]
+    seen = torch.isfinite(observed).all(-1) & ~used[..., None].to(away.device)
     return np.asarray(torch.where(seen, away, torch.nan).nanmean(2).T.cpu().numpy())
 
 
@@ -125,15 +137,18 @@ def roll_out(
 
     Returns:
         ``observed`` (R, T, M, D) points at the frames, NaN where the roll-out diverged; ``sideways`` (R,) estimated
-        displacement of bodies before their release [mm], NaN where it is not estimated; with a network, ``left`` (R,)
+        displacement of bodies before their release [mm], NaN where it is not estimated; with force sensors, ``loads``
+        (R, T, S, 6) readings [N, N m], NaN where there is none of a model; with a network, ``left`` (R,)
         steps at which trials left the training range, -1 where they did not; ``film`` (K + 1, N, 3) vertices [m].
     """
     data_driven = isinstance(force, Learned) and force.replaces_simulator
     simulator = replace(simulator, solver=simulator.settings.changed(on_failure="count"))
     run, points, bodies = TrialRollout(simulator, motions, names, identified, data_driven), [], list[torch.Tensor]()
     predictor = run.predictor(force) if isinstance(force, Learned) else force
+    loads = list[torch.Tensor]()
     for state in run.roll(predictor):
         points.append(run.points(state))
+        loads.append(run.loads(state, len(loads)))
         lost = state.lost
         bodies += [
             torch.where(lost[row], torch.nan, state.q[row]).float() for row, name in enumerate(names) if name == filmed
@@ -143,6 +158,8 @@ def roll_out(
     sideways = torch.full((len(names),), torch.nan) if shift is None else 1e3 * shift.norm(dim=2).mean(1)
     arrays: dict[str, Any] = {"observed": (run.at_frames(points), motions.observe.unit)}
     arrays["sideways"] = (sideways.cpu().numpy(), "mm")
+    if motions.sensors:
+        arrays["loads"] = (run.loads_at_frames(loads), "N, N m")
     if isinstance(predictor, LearnedPredictor):
         left = predictor.left_at
         arrays["left"] = (np.full(len(names), -1) if left is None else left.cpu().numpy(), "1")
@@ -181,6 +198,7 @@ class TrialRollout:
         self.start = motions.start(self.replay, identified) if start is None else start
         self._constants, self._inputs, self._resting = self.replay.prepare(self._values)
         self._first: State | None = None  # of motions, whatever the network
+        self._before: State | None = None  # of which readings were taken last
         substeps = round(motions.trials.time_step / simulator.time_step)
         self.steps = -(-self.replay.steps(self.start) // substeps) * substeps
         if self.replay.is_static:
@@ -226,14 +244,32 @@ class TrialRollout:
         step = CorrectedSimulator(self._simulator, predictor, self._inputs, self._constants).step
         yield from states(step, state, range(self.steps))
 
+    @torch.no_grad()
+    def loads(self, state: State, number: int) -> torch.Tensor:
+        """(R, S, 6) readings in a state of `roll` by its number, NaN where there is none [N, N m]."""
+        before, self._before, sensors = self._before, state, len(self.replay.trials.sensors)
+        resting = number == 0 and self.start.at_rest
+        if self._data_driven or not (number or resting) or not sensors or bool(state.lost.all()):
+            return state.q.new_full((state.batch, sensors, 6), torch.nan)
+        inputs = self._resting if resting else self._inputs.at(number - 1)
+        read = self.replay.read(state, None if resting else before, inputs, self._constants)
+        return torch.where(state.lost[:, None, None], torch.nan, read)
+
     def points(self, state: State) -> torch.Tensor:
         """(R, M, D) observed points of a state; NaN where the roll-out has diverged."""
         return torch.where(state.lost[:, None, None], torch.nan, self.replay.observe(state.q))
 
     def at_frames(self, points: Sequence[torch.Tensor]) -> FloatArray:
         """(R, T, M, D) observed points at the frames of the trials, from those of all steps (R, M, D)."""
-        series = torch.stack([*points[-1:]] if self.replay.is_static else [*points], 1)
-        return np.asarray(self.replay.at_frames(series, self.start).cpu().numpy())
+        return np.asarray(self.replay.at_frames(self._stacked(points), self.start).cpu().numpy())
+
+    def loads_at_frames(self, loads: Sequence[torch.Tensor]) -> FloatArray:
+        """(R, T, S, 6) readings at the frames of the trials [N, N m], from those of all steps (R, S, 6)."""
+        return np.asarray(self.replay.loads_at_frames(self._stacked(loads), self.start).cpu().numpy())
+
+    def _stacked(self, steps: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Values of all steps, the last one alone of static poses."""
+        return torch.stack([*steps[-1:]] if self.replay.is_static else [*steps], 1)
 
     def errors(self, learned: Learned | None) -> list[FloatArray]:
         """Mean marker distances [mm] of each trial at its training frames; NaN where the roll-out diverged.

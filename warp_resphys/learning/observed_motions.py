@@ -12,24 +12,26 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.force_sensors import ForceSensor
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, with_means
-from ..data.markers import WHOLE_STATE, Markers, Observation, WholeState
+from ..data.markers import WHOLE_STATE, Markers, NoPoints, Observation, WholeState
 from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
 from ..dynamics.frames import BaseFrame, base_movement
 from ..dynamics.simulator import Simulator
 from ..io.arrays import Brief
-from ..io.errors import ConvergenceError, InputError, in_short
+from ..io.errors import ConvergenceError, InputError, in_short, listed
 from ..settings.learning import ActuationSettings, ReleaseSettings
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
-from ..stepping.rollout import sample
 from ..stepping.state import State
 from .parameters import split_name
 from .placement import PlacedMarkers, PlainPlacements, placement_of
 from .release import begin_inputs, estimate_release
-from .replay import Replay, Start
+from .replay import Replay
+from .resampling import at_steps, later
 from .scores import HeldOutTest
+from .start import Start
 from .trial_batch import TrialBatch
 
 _STANDS_STILL = 1e-9  # m/s, rad/s
@@ -82,6 +84,10 @@ class ObservedMotions(Brief):
         payload_at: vertices that carry the payloads of the trials; None if there are none.
         actuation: inputs of networks beside the state.
         train_fraction: share of every trial, from its beginning, that is learned from.
+        sensors: force sensors, by the name of their readings in the trials.
+
+    Raises:
+        InputError: readings without a sensor, or a sensor without readings.
     """
 
     trials: Trials
@@ -90,16 +96,26 @@ class ObservedMotions(Brief):
     payload_at: Place | None = None
     actuation: ActuationSettings = field(default_factory=ActuationSettings)
     train_fraction: float = 1.0
+    sensors: Mapping[str, ForceSensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Checks that sensors and readings belong together."""
+        if odd := {*self.sensors} ^ {*self.trials.loads}:
+            raise InputError(
+                f"force sensors are {listed([*self.sensors]) or 'none'}, but the trials have readings of "
+                f"{listed([*self.trials.loads]) or 'none'}: give {listed(sorted(odd))} both, or none."
+            )
 
     @classmethod
     def of(
         cls,
         simulator: Simulator,
-        observed: torch.Tensor | NDArray[np.float64],
+        observed: torch.Tensor | NDArray[np.float64] | None,
         start: State | None = None,
         inputs: Inputs | None = None,
         resting: Inputs | None = None,
         observation: Observation = WHOLE_STATE,
+        loads: Mapping[str, torch.Tensor | NDArray[np.float64]] | None = None,
         **more: Any,
     ) -> Self:
         """Returns motions of which every step of a simulator was observed.
@@ -107,24 +123,32 @@ class ObservedMotions(Brief):
         Args:
             simulator: of the same time step and body.
             observed: (T + 1, B, M, D) measured points [unit of `observation`], NaN where a point was not seen; by
-                default the positions of all vertices, as in `Motion.q`. (T + 1, M, D) is one motion.
+                default positions of all vertices, as in `Motion.q`. (T + 1, M, D) is one motion; None: forces alone.
             start: initial positions and velocities; None: at rest in equilibrium under `resting`.
             inputs: during the motion, with or without a time axis.
             resting: inputs before the motion, where `start` is None.
             observation: the sensor, such as markers from `bind_markers`.
+            loads: (T + 1, B, 6) readings of each of the `sensors` [N, N m], NaN where there is none; (T + 1, 6) of one
+                motion.
             more: further attributes.
 
         Raises:
             InputError: observations of a wrong shape or number of points, a start or inputs for another number of
                 motions or steps, or an input that the body does not take.
         """
-        observed = torch.as_tensor(observed)
-        observed = observed[:, None] if observed.ndim == 3 else observed
+        read = {name: _batched(readings, 3) for name, readings in (loads or {}).items()}
+        if observed is None:
+            shape = next((readings.shape[:2] for readings in read.values()), (0, 0))
+            observed, observation = torch.zeros(*shape, 0, 3), NoPoints()
+        observed = _batched(observed, 4)
         if observed.ndim != 4 or observed.shape[-1] != observation.dimension or len(observed) < 2:
             raise InputError(
                 f"observed has shape {tuple(observed.shape)}: it must be (time, motion, point, "
                 f"{observation.dimension}) in {observation.unit}, of two times or more."
             )
+        for name, readings in read.items():
+            if readings.shape != (wanted := (*observed.shape[:2], 6)):
+                raise InputError(f"readings of {name!r} have shape {tuple(readings.shape)}: it must be {wanted}.")
         count, frames, like = observed.shape[1], len(observed), simulator.rest_positions
         observation = observation.to(like)
         at_rest = observation(like.expand(count, -1, -1))
@@ -150,6 +174,7 @@ class ObservedMotions(Brief):
             initial=None if start is None else _array(torch.stack([start.q, start.v], 1)),
             inputs={name: _array(x if axis == 0 else x.transpose(0, 1)) for name, (x, axis) in acting.axes().items()},
             resting={name: _array(x) for name, x in before.fields.items()},
+            loads={name: _array(readings.transpose(0, 1)) for name, readings in read.items()},
         )
         return cls(trials, observation, **more)
 
@@ -165,7 +190,9 @@ class ObservedMotions(Brief):
 
     def batch(self, names: Sequence[str], simulator: Simulator) -> TrialBatch:
         """Trials that begin in the same way, on the device of a simulator, with inputs at its steps."""
-        batch = TrialBatch.of(self.trials, names, simulator.body, self.payload_at, simulator.time_step)
+        arguments = (self.trials, names, simulator.body, self.payload_at, simulator.time_step)
+        sensors = tuple(self.sensors[name] for name in self.trials.loads)
+        batch = TrialBatch.of(*arguments, sensors=sensors, noise=self.release.noise)
         return batch.to(simulator.rest_positions)
 
     def replay(self, simulator: Simulator, names: Sequence[str], identified: Identified | None = None) -> Replay:
@@ -313,6 +340,12 @@ class ObservedMotions(Brief):
         return torch.cat([*(values.expand(len(at), -1, -1) for values in constant), *series], -1)
 
 
+def _batched(values: Any, ndim: int) -> torch.Tensor:
+    """Returns values (T, B, ...), of (T, ...) for one motion."""
+    values = torch.as_tensor(values)
+    return values[:, None] if values.ndim == ndim - 1 else values
+
+
 def _fitted(simulator: Simulator, inputs: Inputs, count: int) -> Inputs:
     """Returns the inputs of some motions, or raises InputError for those that the body does not take."""
     fitted = inputs.fitted(simulator.counts, simulator.rest_positions, count).to(simulator.rest_positions)
@@ -320,49 +353,6 @@ def _fitted(simulator: Simulator, inputs: Inputs, count: int) -> Inputs:
     vertices, fixed = simulator.body.n_vertices, len(simulator.fixed)
     fitted.at(0).check(accepted, count, vertices, fixed, simulator.rest_positions)
     return fitted
-
-
-def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
-    """Values (B, K + 1, ...) at the times k h after delays (B,) [s], from those at k h.
-
-    Before the series, its first value holds; after its end, values are NaN.
-    """
-    last = series.shape[1] - 1
-    times = step * torch.arange(last + 1).to(delay) + delay[:, None]
-    over = times > (last + 1e-6) * step
-    return sample(series, times, step).masked_fill(over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan)
-
-
-def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
-    """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
-
-    Interpolates with cubic splines through the frames in which a marker was seen, starting from the held position at
-    time zero. A marker counts as not seen at steps that are more than 1.5 frames away from its nearest frame.
-
-    Args:
-        trials: observed trials.
-        step: time step h [s].
-        delay: (R,) delay of the release after time zero of the frames [s]; zero by default.
-    """
-    from scipy.interpolate import CubicSpline
-
-    since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
-    times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
-    steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
-    positions = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
-    for r, m in np.ndindex(len(times), markers.shape[2]):
-        seen = np.isfinite(markers[r, :, m]).all(1)
-        t, y = times[r, seen], markers[r, seen, m]
-        t, first = np.unique(t, return_index=True)
-        y = y[first]
-        if np.isfinite(held[r, m]).all() and (not len(t) or t[0] > 1e-9):
-            t, y = np.concatenate([[0.0], t]), np.concatenate([held[r, m][None], y])
-        if len(t) < min(4, len(times[r])):
-            continue
-        nearest = np.abs(steps[:, None] - t).min(1)
-        near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
-        positions[r, near, m] = CubicSpline(t, y)(steps[near])
-    return positions
 
 
 def _array(values: torch.Tensor) -> NDArray[np.float64]:

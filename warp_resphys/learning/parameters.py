@@ -5,6 +5,7 @@ parts (``tendon_stiffness_left``), of an input's response (``pressure_delay``), 
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -20,6 +21,7 @@ MASS_FACTOR: Final = "attached_mass_factor"
 TILTS: Final = ("gravity_tilt_1", "gravity_tilt_2")
 T = TypeVar("T")
 _OWN: Final = "@"
+_EXACT = 1e-12  # relative tolerance of a solver, small enough for differences of solutions
 HUNG: Final = ("attached_mass",)
 _NOT_NEGATIVE: Final = ("delay", "rise", "slew", "dead_band", "backlash", *SLOPES)  # of identified input responses
 
@@ -248,3 +250,8 @@ def configured_parameters(simulator: Simulator, names: Iterable[str]) -> dict[st
         return 1.0 if name == MASS_FACTOR or command_of(simulator, name)[1] in ("factor", *SLOPES) else 0.0
 
     return {name: find(name) for name in names}
+
+
+def exact(simulator: Simulator) -> Simulator:
+    """Returns a simulator whose solutions differ by their parameters alone, also where these hardly differ."""
+    return replace(simulator, solver=simulator.settings.changed(relative_tolerance=_EXACT))

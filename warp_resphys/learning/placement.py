@@ -18,7 +18,8 @@ from typing_extensions import TypedDict, override
 from ..data.markers import Markers, Observation
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
-from .replay import Replay, Start
+from .replay import Replay
+from .start import Start
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ from ..linalg.least_squares import Move, Point, Problem, damped, minimise
 from ..settings.learning import ReleaseSettings
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
-from .replay import Parameters, Replay, Start
+from .replay import Parameters, Replay
+from .start import Start
 
 _HOLD_ITERATIONS = 100
 _HOLD_TOLERANCE = 1e-7  # m, change of any position in the last iteration

@@ -8,7 +8,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -17,15 +17,15 @@ import torch
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of
 from ..data.markers import Observation
-from ..dynamics.linearisation import Linearisation
+from ..dynamics.linearisation import Linearisation, first_order
 from ..dynamics.simulator import Constants, Simulator
-from ..io.arrays import Brief
 from ..io.errors import ConvergenceError, InputError
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
 from .residuals.correction import equilibrium_under_feedback
+from .start import Start
 from .trial_batch import TrialBatch
 
 log = logging.getLogger(__name__)
@@ -35,51 +35,10 @@ Parameters = Mapping[str, torch.Tensor]
 Near = Callable[[int], torch.Tensor | None]
 Prepared = tuple[Constants, Inputs, Inputs]
 Record = Callable[[torch.Tensor, torch.Tensor], None]
+Sensed = tuple[torch.Tensor, torch.Tensor]  # points and readings of force sensors
 
 _FIRST, _OTHERS = slice(0, 1), slice(1, None)  # sets of parameters
 _AT_ONCE = 16  # positions that are observed together
-_EXACT = 1e-12  # relative tolerance of a solver, small enough for differences of solutions
-
-
-@dataclass(frozen=True)
-class Start(Brief):
-    """Initial conditions of R trials."""
-
-    state: State  # (R, N, 3) positions [m] and velocities [m/s]; a first guess where the trials begin at rest
-    delay: torch.Tensor  # (R,) between time zero of the frames and the release of the body, or of its inputs [s]
-    # (R, M, 3) true less bound marker places, where a body was held bent but registered as undeformed [m]; None for
-    # no shift
-    shift: torch.Tensor | None = None
-    # whether the bodies begin in equilibrium, which is then solved again for every set of parameters
-    at_rest: bool = False
-
-    @classmethod
-    def resting(cls, guess: torch.Tensor) -> "Start":
-        """Starts in equilibrium, which is solved from a first guess (R, N, 3) [m]."""
-        return cls(State(guess, torch.zeros_like(guess)), guess.new_zeros(len(guess)), at_rest=True)
-
-    def near(self, q: torch.Tensor) -> "Start":
-        """The start with another first guess of its equilibrium [m], (R or E R, N, 3) for E sets of parameters."""
-        return replace(self, state=State(q, torch.zeros_like(q)))
-
-    def select(self, indices: list[int]) -> "Start":
-        """The start of the trials with these indices."""
-        pick = torch.as_tensor(indices, device=self.delay.device)
-        shift = None if self.shift is None else self.shift[pick]
-        return replace(self, state=self.state.map(lambda t: t[pick]), delay=self.delay[pick], shift=shift)
-
-    def shifted(self, markers: torch.Tensor) -> torch.Tensor:
-        """(..., R, T, M, 3) true marker positions, from those of bound markers [m]."""
-        return markers if self.shift is None else markers + self.shift[:, None]
-
-    def bound(self, markers: torch.Tensor) -> torch.Tensor:
-        """(R, T, M, 3) positions of bound markers, from true marker positions [m]."""
-        return markers if self.shift is None else markers - self.shift[:, None]
-
-
-def exact(simulator: Simulator) -> Simulator:
-    """Returns a simulator whose solutions differ by their parameters alone, also where these hardly differ."""
-    return replace(simulator, solver=simulator.settings.changed(relative_tolerance=_EXACT))
 
 
 class Replay:
@@ -226,21 +185,55 @@ class Replay:
         Raises:
             ConvergenceError: see `Simulator.step`.
         """
-        series = self.series(start, parameters, force)
-        return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
+        return self.sensed(start, parameters, force)[0]
+
+    def sensed(self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None) -> Sensed:
+        """Points as of a call, and the readings of the sensors (E, R, T, S, 6) [N, N m]."""
+        return self._of_sets(self._series(start, parameters, force), start, _count(parameters))
 
     def series(
         self, start: Start, parameters: Parameters | None = None, force: StepForce | None = None
     ) -> torch.Tensor:
         """(E R, K + 1, M, 3) simulated points at the steps [m], from the release on; for the arguments, see a call."""
+        return self._series(start, parameters, force)[0]
+
+    def _series(self, start: Start, parameters: Parameters | None, force: StepForce | None) -> Sensed:
+        """Points as of `series`, and readings (E R, K + 1, S, 6) at the steps [N, N m]."""
         constants, inputs, resting = self.prepare(parameters)
 
-        def step(state: State, k: int) -> State:
-            added = None if force is None else force(state, k)
-            return self.simulator.step(state, inputs.at(k).plus(added), constants)
+        def step(last: tuple[State, torch.Tensor], k: int) -> tuple[State, torch.Tensor]:
+            state = last[0]
+            acting = inputs.at(k).plus(None if force is None else force(state, k))
+            new = self.simulator.step(state, acting, constants)
+            return new, self.read(new, state, acting, constants)
 
         begun = self.initial_state(start, constants, resting, _count(parameters), force)
-        return torch.stack(rollout(step, begun, range(self.steps(start)), lambda state: self.observe(state.q)), 1)
+        first = begun, self._first_reading(start, begun, resting, constants)
+        seen = rollout(step, first, range(self.steps(start)), lambda now: (self.observe(now[0].q), now[1]))
+        points, loads = (torch.stack([*values], 1) for values in zip(*seen, strict=True))
+        return points, loads
+
+    def read(self, after: State, before: State | None, inputs: Inputs, constants: Constants) -> torch.Tensor:
+        """Returns the readings (B, S, 6) of the sensors at the end of a step, differentiable [N, N m].
+
+        Args:
+            after: state at the end.
+            before: state at the start; None for an equilibrium.
+            inputs: during the step.
+            constants: from `prepare`.
+        """
+        rest, readings = self.simulator.rest_positions, list[torch.Tensor]()
+        for sensor in self.trials.sensors:
+            reaction = self.simulator.reaction(after, sensor.at, before, inputs, constants)
+            stands = isinstance(sensor.at, str) and sensor.at in self.simulator.energies.obstacle_names
+            readings.append(sensor(reaction, None if stands else rest[reaction.vertices]))
+        return torch.stack(readings, 1) if readings else after.q.new_zeros(after.batch, 0, 6)
+
+    def _first_reading(self, start: Start, state: State, resting: Inputs, constants: Constants) -> torch.Tensor:
+        """Returns the readings (B, S, 6) of the initial state, NaN where no equilibrium led there [N, N m]."""
+        if start.at_rest:
+            return self.read(state, None, resting, constants)
+        return state.q.new_full((state.batch, len(self.trials.sensors), 6), torch.nan)
 
     @torch.no_grad()
     def states(self, start: Start, parameters: Parameters, near: Near | None = None) -> list[State]:
@@ -275,22 +268,30 @@ class Replay:
             series.append(self.observe(torch.cat(some)).unflatten(0, (len(some), -1)).transpose(0, 1))
         return torch.cat(series, 1)
 
-    def seen(self, start: Start, states: Sequence[State]) -> torch.Tensor:
-        """(1, R, T, M, 3) points at the times of the frames [m], from `states`."""
-        return self.at_frames(self._observed(state.q for state in states), start)[None]
+    @torch.no_grad()
+    def observed(self, start: Start, states: Sequence[State], parameters: Parameters) -> Sensed:
+        """Points (1, R, T, M, 3) [m] and readings (1, R, T, S, 6) [N, N m] at the frames, from `states`."""
+        constants, inputs, resting = self.prepare(parameters)
+        pairs = enumerate(itertools.pairwise(states))
+        loads = [self.read(after, before, inputs.at(k), constants) for k, (before, after) in pairs]
+        loads.insert(0, self._first_reading(start, states[0], resting, constants))
+        return self._of_sets((self._observed(state.q for state in states), torch.stack(loads, 1)), start, 1)
 
     def varied(
         self, start: Start, parameters: Parameters, states: Sequence[State] | None = None, record: Record | None = None
-    ) -> torch.Tensor:
-        """(E, R, T, M, 3) simulated points as of a call, for sets of parameters that hardly differ from the first."""
-        series = self.varied_series(start, parameters, states, record)
-        return self.at_frames(series, start).unflatten(0, (_count(parameters), -1))
+    ) -> Sensed:
+        """Points and readings as of `sensed`, for sets of parameters that hardly differ from the first."""
+        return self._of_sets(self._varied_series(start, parameters, states, record), start, _count(parameters))
+
+    def varied_series(self, start: Start, parameters: Parameters) -> torch.Tensor:
+        """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first."""
+        return self._varied_series(start, parameters, None, None)[0]
 
     @torch.no_grad()
-    def varied_series(
-        self, start: Start, parameters: Parameters, states: Sequence[State] | None = None, record: Record | None = None
-    ) -> torch.Tensor:
-        """(E R, K + 1, M, 3) points as of `series`, for sets of parameters that hardly differ from the first.
+    def _varied_series(
+        self, start: Start, parameters: Parameters, states: Sequence[State] | None, record: Record | None
+    ) -> Sensed:
+        """Points (E R, K + 1, M, 3) and readings (E R, K + 1, S, 6) at the steps, for sets that hardly differ.
 
         The first set is simulated. In its equilibrium and each of its steps, with the solution x, the residual g(x) and
         its derivative H, the solutions of the others are x - H^-1 (g'(x) - g(x)), one step of Newton's method from
@@ -317,14 +318,22 @@ class Replay:
         sets: int,
         states: Sequence[State],
         record: Record | None = None,
-    ) -> torch.Tensor:
-        """(E R, K + 1, M, 3) points as of `varied_series`, from constants and inputs of `prepare` of E - 1 sets."""
-        return self._observed(self._varied_positions(start, first, others, sets, states, record))
+    ) -> Sensed:
+        """Points and readings as of `_varied_series`, from constants and inputs of `prepare` of E - 1 sets."""
+        loads = list[torch.Tensor]()
+
+        def positions() -> Iterator[torch.Tensor]:
+            for q, read in self._varied_positions(start, first, others, sets, states, record):
+                loads.append(read)
+                yield q
+
+        points = self._observed(positions())
+        return points, torch.stack(loads, 1)
 
     def _varied_positions(
         self, start: Start, first: Prepared, others: Prepared, sets: int, states: Sequence[State], record: Record | None
-    ) -> Iterator[torch.Tensor]:
-        """Yields the positions (E R, N, 3) of `varied_series` [m], from the release on."""
+    ) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        """Yields positions (E R, N, 3) of `varied_series` [m], and readings, from the release on."""
         (constants, inputs, resting), (their, their_inputs, their_resting), state = first, others, states[0]
         if not start.at_rest:
             whole = self.initial_state(start, constants, resting, 1 + sets)
@@ -337,7 +346,9 @@ class Replay:
             varied = self._varied(state.q, here, there)
         if record is not None:
             record(state.q, varied.q)
-        yield torch.cat([state.q, varied.q])
+        begun = (state, resting, constants), (varied, their_resting, their)
+        read = [self._first_reading(start, *now) for now in begun]
+        yield torch.cat([state.q, varied.q]), torch.cat(read)
         for k, (state, solved) in enumerate(itertools.pairwise(states)):
             here = self._beside[0].linearise(state, inputs.at(k), constants)
             try:
@@ -345,31 +356,39 @@ class Replay:
             except InputError as error:
                 message = f"the motion depends so much on the parameters that it has no derivatives from step {k} on."
                 raise ConvergenceError(message, None, None) from error
+            before, acting = varied, their_inputs.at(k)
             varied = self._varied(self.simulator.method.solution_for(state, solved.q), here, there)
-            yield torch.cat([solved.q, varied.q])
+            read = [self.read(solved, state, inputs.at(k), constants), self.read(varied, before, acting, their)]
+            yield torch.cat([solved.q, varied.q]), torch.cat(read)
             if record is not None:
                 record(solved.q, varied.q)
 
     def _varied(self, x: torch.Tensor, here: Linearisation, there: Linearisation) -> State:
         """Returns the states of the other sets of parameters, from the solution (R, N, 3) x of the first [m]."""
-        here.factorise(x)
-        sets = len(there.start) // len(x)
-        at = x.repeat(sets, 1, 1)
-        forces = (there.residual(at) - here.residual(x).repeat(sets, 1, 1)).unflatten(0, (sets, -1))
-        moved = here.solve(forces.permute(1, 2, 3, 0).flatten(1, 2)).unflatten(1, (-1, 3))
-        return there.finish(at - moved.permute(3, 0, 1, 2).flatten(0, 1))
+        near = first_order(x, here, there)
+        return there.reached(near) if self.trials.sensors else there.finish(near)
 
     @cached_property
     def _beside(self) -> tuple[Simulator, Simulator]:
         """Simulators whose buffers the steps of this one do not use."""
         return replace(self.simulator), replace(self.simulator)
 
+    def _of_sets(self, series: Sensed, start: Start, sets: int) -> Sensed:
+        """Points (E, R, T, M, 3) and readings (E, R, T, S, 6) at the frames, from those at the steps."""
+        points, loads = self.at_frames(series[0], start), self.loads_at_frames(series[1], start)
+        return points.unflatten(0, (sets, -1)), loads.unflatten(0, (sets, -1))
+
     def at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
         """(E R, T, M, 3) points at the frames [m], from points (E R, K + 1, M, 3) at the steps."""
+        points = self.loads_at_frames(series, start)
+        sets = len(series) // len(self.trials.names)
+        return start.shifted(points.unflatten(0, (sets, -1))).flatten(0, 1)
+
+    def loads_at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
+        """(E R, T, S, 6) readings at the frames [N, N m], from those (E R, K + 1, S, 6) at the steps."""
         sets = len(series) // len(self.trials.names)
         times = (self.trials.times - start.delay[:, None]).clamp_min(0.0).repeat(sets, 1)
-        points = sample(series, times, self.simulator.time_step)
-        return start.shifted(points.unflatten(0, (sets, -1))).flatten(0, 1)
+        return sample(series, times, self.simulator.time_step)
 
     def errors(self, simulated: torch.Tensor) -> torch.Tensor:
         """(E, R, T, M, 3) simulated less observed points [m], zero where a point was not seen."""

@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
 import torch
 
+from ..data.force_sensors import ForceSensor
 from ..data.trials import STATIC, Trials
 from ..fem.bodies import Body
 from ..io.arrays import Brief
@@ -30,9 +31,15 @@ class TrialBatch(Brief):
     # before time zero, for trials that begin at rest; weights are the same as in `inputs`
     resting: Inputs = field(default_factory=Inputs)
     session: str = ""  # in which all of them were recorded, if there are several
+    # (R, T, S, 6) readings of S force sensors [N, N m], NaN where there is none; None for no sensors
+    loads: torch.Tensor = field(default=None)  # type: ignore[assignment]
+    sensors: tuple[ForceSensor, ...] = ()
+    noise: float = 1.0  # standard deviation of a coordinate of a point, by which readings are weighted [m]
 
     @classmethod
-    def of(cls, trials: Trials, names: Sequence[str], body: Body, payload_at: Place | None, time_step: float) -> Self:
+    def of(
+        cls, trials: Trials, names: Sequence[str], body: Body, payload_at: Place | None, time_step: float, **more: Any
+    ) -> Self:
         """Returns trials that begin in the same way and are of one session, in float64 on the CPU; see `Trials.acting`.
 
         Raises:
@@ -43,20 +50,24 @@ class TrialBatch(Brief):
         times, observed = (torch.from_numpy(x[rows][:, :frames]) for x in (trials.times, trials.observed))
         inputs, resting = trials.acting(names, body, payload_at, time_step)
         held, session = torch.from_numpy(trials.held[rows]), trials.session(names[0])
-        return cls(tuple(names), times, observed, held, inputs, resting, session)
+        read = [torch.from_numpy(readings[rows][:, :frames]) for readings in trials.loads.values()]
+        loads = torch.stack(read, 2) if read else None
+        return cls(tuple(names), times, observed, held, inputs, resting, session, loads, **more)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
         """Checks that the shapes agree.
 
         Raises:
-            InputError: they do not agree, or no point of a trial was seen.
+            InputError: they do not agree, or no point of a trial was seen, and no force read.
         """
         r, t, m, d = self.observed.shape
+        if self.loads is None:
+            object.__setattr__(self, "loads", self.observed.new_zeros(r, t, 0, 6))
         batches = [v.shape[i] for inputs in (self.inputs, self.resting) for v, i in inputs.axes().values()]
         if self.times.shape != (r, t) or self.held.shape != (r, m, d) or set(batches) - {r}:
             raise InputError("the times, the held points and the inputs do not belong to the same trials.")
-        for name, seen in zip(self.names, self.seen, strict=True):
-            if not bool(seen.any()):
+        for name, seen, loads in zip(self.names, self.seen, self.loads, strict=True):
+            if not bool(seen.any() | loads.isfinite().any()):
                 raise InputError(f"no marker of the trial {name!r} was seen: leave it out.")
 
     @property
@@ -64,32 +75,63 @@ class TrialBatch(Brief):
         """Whether a point was seen, (R, T, M) bool."""
         return torch.isfinite(self.observed).all(-1)
 
+    def load_errors(self, simulated: torch.Tensor, at: tuple[torch.Tensor, torch.Tensor] | None = None) -> torch.Tensor:
+        """(E, R, T, S, 6) errors of readings without zero and drift, in lengths that are as likely for a point [m].
+
+        Args:
+            simulated: (E, R, T, S, 6) readings [N, N m].
+            at: measured ones (R, T, S, 6) and their times (R, T) [s] in place of those of the trials.
+        """
+        measured, times = at or (self.loads, self.times)
+        pairs = zip(self.sensors, simulated.unbind(3), measured.unbind(2), strict=True)
+        errors = [sensor.errors(reading, one, times) for sensor, reading, one in pairs]
+        return self.noise * torch.stack(errors, 3) if errors else simulated
+
+    @property
+    def count(self) -> torch.Tensor:
+        """(R,) number of points that were seen, three readings counting as one."""
+        return self.seen.sum((1, 2)) + self.readings / 3.0
+
+    @property
+    def readings(self) -> torch.Tensor:
+        """(R,) number of readings of the axes that sensors measure."""
+        measured = self.loads.new_tensor([sensor.deviations for sensor in self.sensors]).isfinite()
+        return (
+            (self.loads.isfinite() & measured).sum((1, 2, 3)) if self.sensors else self.times.new_zeros(len(self.times))
+        )
+
     @property
     def amplitude(self) -> torch.Tensor:
-        """Root mean square distance of the observed points from the held ones, (R,) [m]."""
+        """(R,) root mean square distance of points from the held ones, without any the size of readings [m]."""
+        if not self.observed.shape[2]:
+            squares = self.load_errors(torch.zeros_like(self.loads)[None])[0].square()
+            return (squares.sum((1, 2, 3)) / self.count).sqrt()
         square = (self.observed - self.held[:, None]).square().sum(-1)
         return square.nanmean((1, 2)).sqrt()
 
     @property
     def loss_weight(self) -> torch.Tensor:
         """Weights (R,) of sums of squares that give the mean over trials of the mean square over squared amplitude."""
-        return 1.0 / (self.seen.sum((1, 2)) * self.amplitude**2 * len(self.names))
+        return 1.0 / (self.count * self.amplitude**2 * len(self.names))
 
     def select(self, indices: list[int]) -> "TrialBatch":
         """Returns the trials with these indices."""
         pick = torch.as_tensor(indices, device=self.times.device)
         fields = (self.times[pick], self.observed[pick], self.held[pick])
-        names = tuple(self.names[i] for i in indices)
-        return TrialBatch(names, *fields, self.inputs.select(pick), self.resting.select(pick), self.session)
+        names, inputs = tuple(self.names[i] for i in indices), (self.inputs.select(pick), self.resting.select(pick))
+        return TrialBatch(names, *fields, *inputs, self.session, self.loads[pick], self.sensors, self.noise)
 
     def first(self, seconds: float) -> "TrialBatch":
         """Returns the trials with the frames after a time [s] left out or marked as not seen."""
         inside = self.times <= seconds + 1e-9
         last = int(inside.any(0).sum())
-        observed = torch.where(inside[..., None, None], self.observed, torch.nan)
-        return replace(self, times=self.times[:, :last], observed=observed[:, :last])
+        observed, loads = (
+            torch.where(inside[..., None, None], x, torch.nan)[:, :last] for x in (self.observed, self.loads)
+        )
+        return replace(self, times=self.times[:, :last], observed=observed, loads=loads)
 
     def to(self, like: torch.Tensor) -> "TrialBatch":
         """Returns the trials on the device and in the precision of a tensor."""
         fields = (self.times.to(like), self.observed.to(like), self.held.to(like))
-        return TrialBatch(self.names, *fields, self.inputs.to(like), self.resting.to(like), self.session)
+        inputs = (self.inputs.to(like), self.resting.to(like))
+        return TrialBatch(self.names, *fields, *inputs, self.session, self.loads.to(like), self.sensors, self.noise)

@@ -28,7 +28,8 @@ from ..dynamics.simulator import Simulator
 from ..io.arrays import IntArray
 from ..io.errors import InputError
 from ..learning.parameters import MASS_FACTOR, identifiable_parameters
-from ..learning.replay import Replay, Start
+from ..learning.replay import Replay
+from ..learning.start import Start
 from ..learning.trial_batch import TrialBatch
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample

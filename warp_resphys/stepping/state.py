@@ -49,6 +49,14 @@ class Reaction(Brief):
             known[0].vertices, *(torch.stack([getattr(one, key) for one in known]) for key in ("forces", "places"))
         )
 
+    @classmethod
+    def join(cls, reactions: "Sequence[Reaction]") -> "Reaction":
+        """Returns those of several sets of vertices as one."""
+        return cls(
+            torch.cat([one.vertices for one in reactions]),
+            *(torch.cat([getattr(one, key) for one in reactions], -2) for key in ("forces", "places")),
+        )
+
     @property
     def force(self) -> torch.Tensor:
         """(..., 3) their sum [N]."""

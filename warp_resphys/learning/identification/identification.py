@@ -35,7 +35,8 @@ from ..parameters import (
     value_name,
 )
 from ..placement import Accuracy, PlainPlacements
-from ..replay import Replay, Start
+from ..replay import Replay
+from ..start import Start
 from .misfit import Misfit
 from .search import Identification, first_points, refined_searches, search_parameters
 

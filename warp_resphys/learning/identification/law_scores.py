@@ -15,8 +15,9 @@ from ...io.arrays import FloatArray
 from ...mesh.volume_mesh import Mesh
 from ...settings.learning import LawSettings
 from ..observed_motions import Identified, ObservedMotions
-from ..replay import Replay, Start
+from ..replay import Replay
 from ..scores import Score
+from ..start import Start
 from .law import LawClass, branches_of, family, longest_side
 from .search import Identification
 

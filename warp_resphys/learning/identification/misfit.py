@@ -27,9 +27,10 @@ from ...linalg.threads import in_threads, thread_count
 from ...settings.learning import Bounds
 from ...stepping.state import State
 from ..metrics import redundancy
-from ..parameters import check_names, split_name
+from ..parameters import check_names, exact, split_name
 from ..placement import Accuracy, DisplacedMarkers
-from ..replay import Replay, Start, exact
+from ..replay import Replay, Sensed
+from ..start import Start
 from ..trial_batch import TrialBatch
 from .nuisances import NuisanceFit, Nuisances
 from .uncertainty import LinearMisfit, LinearTrial, Uncertainty, left_out, uncertainty_of
@@ -183,10 +184,12 @@ class Misfit(BoundedMisfit):
             amplitude = torch.ones_like(trials.amplitude) if self._known else trials.amplitude
             for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
                 if not moved > 0.0:
-                    raise InputError(f"the markers of the trial {name!r} stay where they were held: leave it out.")
+                    still = "markers" if trials.observed.shape[2] else "forces"
+                    stay = "stay where they were held" if trials.observed.shape[2] else "are zero"
+                    raise InputError(f"the {still} of the trial {name!r} {stay}: leave it out.")
             pair = replay.changed(simulator=self.simulator, trials=trials), start
             self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))
-            self._weights.append(1.0 / (trials.seen.sum((1, 2)) * amplitude**2 * count))
+            self._weights.append(1.0 / (trials.count * amplitude**2 * count))
         self._fit = NuisanceFit(self._replays, self._weights, accuracy, delay)
         self._moves = _moves_of(self.bounds)
         self.forget()
@@ -195,7 +198,7 @@ class Misfit(BoundedMisfit):
     def forget(self) -> None:
         """Forgets motions with earlier parameters, from which the next ones are predicted."""
         self._motions = [NearbyMotion(self.simulator.tensor(self._owners(r.trials))) for r, _ in self._replays]
-        self._last: tuple[torch.Tensor, list[torch.Tensor]] | None = None  # of `_followed`
+        self._last: tuple[torch.Tensor, list[Sensed]] | None = None  # of `_followed`
 
     @override
     def linearise(self, unit: FloatArray, derivatives: bool = True) -> LinearMisfit | None:
@@ -234,25 +237,25 @@ class Misfit(BoundedMisfit):
         points = self.simulator.tensor(np.concatenate([unit[None], unit + moved]))
         try:
             with torch.no_grad():
-                series = self._followed(points)
+                sensed = self._followed(points)
         except ConvergenceError as error:
             self.failure = str(error)
             return None
-        fitted, nuisances = self._fit(series, self.prior_weight)
+        fitted, nuisances = self._fit(sensed, self.prior_weight)
         trials = list[LinearTrial]()
         for number, (errors, weight) in enumerate(zip(fitted, self._weights, strict=True)):
             observed = self._replays[number][0].trials
-            weighted = (errors * weight.sqrt()[:, None, None, None]).double().cpu().numpy()  # (E, R, T, M, 3)
+            weighted = (errors * weight.sqrt()[:, None, None]).double().cpu().numpy()  # (E, R, T, C)
             flat = weighted.reshape(*weighted.shape[:2], -1)
-            slopes = np.zeros((*flat.shape[1:], len(unit)))  # (R, 3 T M, P)
+            slopes = np.zeros((*flat.shape[1:], len(unit)))  # (R, T C, P)
             for changed, columns, owners in zip(flat[1:], self._moves, self._owners(observed), strict=derivatives):
                 slopes[..., columns] = (changed - flat[0])[..., None] * (owners[:, columns] / steps[columns])[:, None]
             follow = nuisances.columns[number] if nuisances.columns else np.zeros((*slopes.shape[:2], 0))
             shown = observed.seen.sum(1).cpu().numpy()  # (R, M) frames
             shown = shown if self._shares is None else self._shares * shown
-            rows = weighted[0].reshape(*weighted.shape[1:3], -1)
-            seen = (observed.observed.shape[-1] * shown.sum(1)).tolist()
-            of_trials = zip(rows, slopes, seen, observed.names, follow, strict=True)
+            seen = observed.observed.shape[-1] * shown.sum(1)
+            seen = (seen + observed.readings.cpu().numpy()).tolist()
+            of_trials = zip(weighted[0], slopes, seen, observed.names, follow, strict=True)
             trials += [LinearTrial(r, s, n, name, observed.session, c) for r, s, n, name, c in of_trials]
         return LinearMisfit(trials, *self.prior_rows(unit), nuisances)
 
@@ -282,8 +285,8 @@ class Misfit(BoundedMisfit):
         others = {name: range_.prior.mean for name, range_ in common.items() if range_.prior is not None} | self._known
         return {name: torch.full_like(unit[:, 0], value) for name, value in others.items()} | values
 
-    def _followed(self, points: torch.Tensor) -> list[torch.Tensor]:
-        """(E, R, T, M, 3) simulated points of each replay [m], predicted from those with earlier parameters.
+    def _followed(self, points: torch.Tensor) -> list[Sensed]:
+        """Simulated points and readings of each replay (`Replay.sensed`), predicted from those with earlier parameters.
 
         The first motion is not simulated again where the last one had its parameters.
 
@@ -295,7 +298,7 @@ class Misfit(BoundedMisfit):
         unit, values = points[0], self._values(points)
         first = {name: value[:1] for name, value in values.items()}
 
-        def follow(number: int) -> torch.Tensor:
+        def follow(number: int) -> Sensed:
             (replay, start), motion = self._replays[number], self._motions[number]
             guess = motion.predict(unit, 0) if start.at_rest else None
             begin = start if guess is None else start.near(guess)
@@ -304,7 +307,7 @@ class Misfit(BoundedMisfit):
                 states = replay.states(begin, first, partial(motion.predict, unit))
                 motion.keep(unit, states)
             if len(points) == 1:
-                return replay.seen(begin, states)
+                return replay.observed(begin, states, first)
             motion.differentiate(points)
             return replay.varied(begin, values, states, motion.record)
 

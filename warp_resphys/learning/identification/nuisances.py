@@ -16,7 +16,8 @@ import torch
 from ...io.arrays import FloatArray
 from ...stepping.rollout import sample
 from ..placement import Accuracy, Placement, PlainPlacements, by_placement
-from ..replay import Replay, Start
+from ..replay import Replay, Sensed
+from ..start import Start
 
 _FURTHEST, _TRIED = 3.0, 61  # largest delay, in expected deviations, and number of delays from which the search begins
 _TURNS, _STEPS = 4, 6  # Gauss-Newton steps of places, as rotations by a few degrees are nearly linear; with delays
@@ -99,25 +100,25 @@ class NuisanceFit:
         """Whether there is nothing to fit."""
         return self._count == 0
 
-    def __call__(self, series: Sequence[torch.Tensor], prior_weight: float) -> tuple[list[torch.Tensor], Nuisances]:
+    def __call__(self, series: Sequence[Sensed], prior_weight: float) -> tuple[list[torch.Tensor], Nuisances]:
         """Residuals with the best places and delays for the first set of parameters, at which the loss is stationary.
 
         While the weight of the prior is not known, places and delays are nominal.
 
         Args:
-            series: (E, R, T, M or 4 M, 3) simulated points at the frames, by group [m].
+            series: (E, R, T, M or 4 M, 3) simulated points and (E, R, T, S, 6) readings at the frames, by group.
             prior_weight: of the squared nuisance parameters in standard deviations.
 
         Returns:
-            (E, R, T, M, 3) by group [m], and what was fitted.
+            (E, R, T, 3 M + 6 S) by group [m], and what was fitted.
         """
         solution = self._centre.new_zeros(self._count)
         for (_, start), late in zip(self._replays, self._late, strict=True):
             if late is not None:
                 solution[late] = start.delay / self._delay
         if self.is_empty or not prior_weight:
-            return [self._errors(n, points, solution) for n, points in enumerate(series)], Nuisances()
-        first = [points[:1].detach() for points in series]
+            return [self._errors(n, sensed, solution) for n, sensed in enumerate(series)], Nuisances()
+        first = [(points[:1].detach(), loads[:1].detach()) for points, loads in series]
         with torch.no_grad():
             for _ in range(_TURNS if self._accuracy is not None and self._accuracy.turn else 1):
                 solution = self._improved(first, solution, prior_weight, self._places)
@@ -125,7 +126,7 @@ class NuisanceFit:
                 solution = self._on_grid(first, solution, prior_weight)
                 for _ in range(_STEPS):
                     solution = self._improved(first, solution, prior_weight, self._count)
-            columns = [by.flatten(1, 3).double().cpu().numpy() for _, by in self._linearised(first, solution)]
+            columns = [by.flatten(1, 2).double().cpu().numpy() for _, by in self._linearised(first, solution)]
         placed = {name: self._placement(name, solution) for name in self._moves}
         sessions = dict.fromkeys(replay.trials.session for replay, _ in self._replays if placed)
         fitted = Nuisances(
@@ -135,79 +136,78 @@ class NuisanceFit:
             common=placed.get(None),
             moves={name: by.double().cpu().numpy() for name, by in self._moves.items() if name is not None},
         )
-        return [self._errors(n, points, solution) for n, points in enumerate(series)], fitted
+        return [self._errors(n, sensed, solution) for n, sensed in enumerate(series)], fitted
 
     def _placement(self, session: str | None, solution: torch.Tensor) -> Placement:
         moved = self._moves[session] @ solution[: self._places]
         return Placement(moved[:-6].view(-1, 3), moved[-6:-3], moved[-3:], self._centre)
 
-    def _points(self, number: int, points: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
-        """(E, R, T, M or 4 M, 3) points of a group, later by its delays."""
+    def _later(self, number: int, series: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
+        """Points or readings (E, R, T, ...) of a group, later by its delays."""
         late, (replay, start) = self._late[number], self._replays[number]
         if late is None:
-            return points
+            return series
         times, delay = replay.trials.times, self._delay * solution[late] - start.delay
-        step, at = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(points), 1)
-        series, beyond = points.flatten(0, 1), (at - times.max()).clamp_min(0.0)[..., None, None]
-        ahead = beyond * (series[:, -1:] - series[:, -2:-1]) / step  # straight on after the last frame
-        return (sample(series, at, step) + ahead).unflatten(0, points.shape[:2])
+        step, at = float(times[0, 1]), (times - delay[:, None]).clamp_min(0.0).repeat(len(series), 1)
+        flat, beyond = series.flatten(0, 1), (at - times.max()).clamp_min(0.0)[..., None, None]
+        ahead = beyond * (flat[:, -1:] - flat[:, -2:-1]) / step  # straight on after the last frame
+        return (sample(flat, at, step) + ahead).unflatten(0, series.shape[:2])
 
-    def _errors(self, number: int, points: torch.Tensor, solution: torch.Tensor) -> torch.Tensor:
-        """(E, R, T, M, 3) residuals of a group [m]."""
-        replay, points = self._replays[number][0], self._points(number, points, solution)
-        if self._accuracy is None:
-            return replay.errors(points)
-        return replay.errors(self._placement(replay.trials.session, solution).places(points)[0])
+    def _errors(self, number: int, sensed: Sensed, solution: torch.Tensor) -> torch.Tensor:
+        """(E, R, T, 3 M + 6 S) residuals of a group [m]."""
+        replay, (points, loads) = self._replays[number][0], (self._later(number, x, solution) for x in sensed)
+        if self._accuracy is not None:
+            points = self._placement(replay.trials.session, solution).places(points)[0]
+        return torch.cat([replay.errors(points).flatten(3), replay.trials.load_errors(loads).flatten(3)], 3)
 
-    def _linearised(
-        self, first: Sequence[torch.Tensor], solution: torch.Tensor
-    ) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Weighted residuals (R, T, M, 3) of each group and their derivatives (R, T, M, 3, K)."""
+    def _linearised(self, first: Sequence[Sensed], solution: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Weighted residuals (R, T, C) of each group and their derivatives (R, T, C, K)."""
         result = []
-        for number, (points, weight) in enumerate(zip(first, self._weights, strict=True)):
-            replay, late, root = self._replays[number][0], self._late[number], weight.sqrt()[:, None, None, None]
-            errors = self._errors(number, points, solution)[0]
+        for number, (sensed, weight) in enumerate(zip(first, self._weights, strict=True)):
+            replay, late, root = self._replays[number][0], self._late[number], weight.sqrt()[:, None, None]
+            errors = self._errors(number, sensed, solution)[0]
             columns = errors.new_zeros(*errors.shape, self._count)
             if self._accuracy is not None:
                 placement = self._placement(replay.trials.session, solution)
-                placed = placement.places(self._points(number, points, solution)[0])
+                placed = placement.places(self._later(number, sensed[0], solution)[0])
                 slopes = by_placement(placement, *placed) * replay.trials.seen[..., None, None]
-                columns[..., : self._places] = slopes @ self._moves[replay.trials.session]
+                moved = (slopes @ self._moves[replay.trials.session]).flatten(2, 3)
+                columns[:, :, : moved.shape[2], : self._places] = moved
             if late is not None:
                 step, rows = _DIFFERENCE * float(replay.trials.times[0, 1]), torch.arange(len(errors))
                 ends = []
                 for by in (step, -step):
                     moved = solution.clone()
                     moved[late] += by / self._delay
-                    ends.append(self._errors(number, points, moved)[0])
+                    ends.append(self._errors(number, sensed, moved)[0])
                 columns[rows, ..., late.start + rows] = (ends[0] - ends[1]) * self._delay / (2.0 * step)
             result.append((errors * root, columns * root[..., None]))
         return result
 
     def _improved(
-        self, first: Sequence[torch.Tensor], solution: torch.Tensor, prior_weight: float, count: int
+        self, first: Sequence[Sensed], solution: torch.Tensor, prior_weight: float, count: int
     ) -> torch.Tensor:
         """The solution after a step of the first unknowns of a number."""
         normal, right = prior_weight * torch.eye(count).to(solution), torch.zeros_like(solution[:count])
         for residual, columns in self._linearised(first, solution) if count else ():
-            jacobian = columns[..., :count].flatten(0, 3)
+            jacobian = columns[..., :count].flatten(0, 2)
             normal = normal + jacobian.T @ jacobian
             right = right - jacobian.T @ (residual.flatten() - jacobian @ solution[:count])
         change = torch.linalg.solve(normal, right) - solution[:count]
         change[self._places :].clamp_(-_LONGEST, _LONGEST)
         return torch.cat([solution[:count] + change, solution[count:]])
 
-    def _on_grid(self, first: Sequence[torch.Tensor], solution: torch.Tensor, prior_weight: float) -> torch.Tensor:
+    def _on_grid(self, first: Sequence[Sensed], solution: torch.Tensor, prior_weight: float) -> torch.Tensor:
         """The solution with the best delays of a grid for each trial."""
         grid, best = torch.linspace(-_FURTHEST, _FURTHEST, _TRIED).to(solution), solution.clone()
-        for number, (points, late) in enumerate(zip(first, self._late, strict=True)):
+        for number, (sensed, late) in enumerate(zip(first, self._late, strict=True)):
             if late is None:
                 continue
             costs = []
             for by in grid:
                 moved = solution.clone()
                 moved[late] += by
-                squares = self._errors(number, points, moved)[0].square().sum((1, 2, 3))
+                squares = self._errors(number, sensed, moved)[0].square().sum((1, 2))
                 costs.append(self._weights[number] * squares + prior_weight * moved[late].square())
             best[late] += grid[torch.stack(costs).argmin(0)]
         return best

@@ -27,9 +27,8 @@ from ...io.progress import Progress
 from ...linalg.threads import in_threads, thread_count
 from ..metrics import mean_distance
 from ..observed_motions import ObservedMotions
-from ..parameters import HUNG, configured_parameters, parameters_of_parts, split_name, value_name
+from ..parameters import HUNG, configured_parameters, exact, parameters_of_parts, split_name, value_name
 from ..placement import DisplacedMarkers, Placement, by_placement, placement_of
-from ..replay import exact
 from .search import Identification
 
 log = logging.getLogger(__name__)
@@ -126,7 +125,7 @@ def _of_batch(
         if (whole := of_parts.get(parameter, ("", 0))[0]) in moved and whole not in identified.parameters:
             # What moves all parts moves each: factors relatively.
             sets[name][rows[whole]] += moved[whole] * (sets[name][0] if whole.endswith("_factor") else 1.0)
-    points = (replay.varied if moved and not replay.is_static else replay)(start, sets)
+    points, _ = (replay.varied if moved and not replay.is_static else replay.sensed)(start, sets)
     slopes: Any = [None] * len(names)
     if placement is not None:
         points, rotations = placement.places(points)

@@ -37,8 +37,9 @@ from ...settings.learning import ActuatorSettings
 from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
 from ..parameters import HUNG
-from ..replay import Replay, Start
+from ..replay import Replay
 from ..scores import HeldOutTest, held_out_test, text_of
+from ..start import Start
 from .in_the_loop import JudgedTrainer, MotionLoss, TrialGroup, cross_validated_epochs
 from .linearised import Linearised, chosen_penalty, fit_linearised
 from .training import Snapshot, run_epochs

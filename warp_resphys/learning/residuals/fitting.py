@@ -21,8 +21,9 @@ from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
 from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
-from ..replay import Replay, Start
+from ..replay import Replay
 from ..scores import HeldOutTest, held_out_test, text_of
+from ..start import Start
 from .correction import Learned, Range, force_frames
 from .in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from .networks import NextState, ResidualForce, StateMap, build_model

@@ -23,7 +23,8 @@ from ...dynamics.frames import BaseFrame, VertexFrames
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...settings.learning import InTheLoopSettings, LoopSettings
-from ..replay import Replay, Start
+from ..replay import Replay, Sensed
+from ..start import Start
 from .correction import LearnedPredictor
 from .networks import OwnNetwork, ResidualForce
 from .training import EpochTrainer
@@ -48,6 +49,8 @@ class TrialGroup:
 class MotionLoss:
     """Mean over trials of the mean squared distance of markers, in units of each trial's amplitude.
 
+    Readings of force sensors count as `TrialBatch.load_errors`.
+
     Args:
         groups: of trials.
         parameters: (1,) identified physical parameters.
@@ -63,8 +66,8 @@ class MotionLoss:
         shares = [count / sum(counts) for count in counts]
         self.weights = [g.replay.trials.loss_weight * share for g, share in zip(groups, shares, strict=True)]
 
-    def _errors(self, model: Corrects | None) -> list[torch.Tensor]:
-        """(R, T, M, 3) simulated less observed markers of each group [m], of the simulator if the model is None.
+    def _errors(self, model: Corrects | None) -> list[Sensed]:
+        """Errors (R, T, M, 3) of markers and (R, T, S, 6) of readings of each group [m]; None: those of the simulator.
 
         Raises:
             ConvergenceError: the simulation fails.
@@ -75,14 +78,15 @@ class MotionLoss:
             replay = group.replay.changed(actuator=model.inputs) if isinstance(model, Actuator) else group.replay
             if isinstance(model, ResidualForce):
                 force = LearnedPredictor(model, group.context, None, group.frames, group.base)
-            simulated = replay(group.start, self._parameters or None, force=force)
-            errors.append(replay.errors(simulated)[0])
+            points, loads = replay.sensed(group.start, self._parameters or None, force=force)
+            errors.append((replay.errors(points)[0], replay.trials.load_errors(loads)[0]))
         return errors
 
     def __call__(self, model: Corrects | None) -> torch.Tensor:
         """Returns the loss, differentiable in the model's weights."""
         pairs = zip(self._errors(model), self.weights, strict=True)
-        return torch.stack([(errors.square().sum((1, 2, 3)) * weight).sum() for errors, weight in pairs]).sum()
+        squares = [(sum(x.square().sum((1, 2, 3)) for x in errors) * weight).sum() for errors, weight in pairs]
+        return torch.stack(squares).sum()
 
     def error_mm(self, model: Corrects | None) -> float:
         """Mean distance of the seen markers, all trials with equal weight [mm]; infinite where a trial diverged.
@@ -92,7 +96,7 @@ class MotionLoss:
         seen = [group.replay.trials.seen for group in self._groups]
         try:
             with torch.no_grad():
-                distances = [errors.norm(dim=-1) for errors in self._errors(model)]
+                distances = [errors.norm(dim=-1) for errors, _ in self._errors(model)]
         except ConvergenceError:
             self.judged.append([np.full(1, np.nan) for one in seen for _ in one])
             return float("inf")

@@ -13,7 +13,8 @@ from ...data.input_network import Actuator
 from ...data.input_response import InputResponse
 from ...stepping.inputs import Inputs
 from ...stepping.rollout import sample
-from ..replay import Replay, Start
+from ..replay import Replay
+from ..start import Start
 
 _CHANGE: Final = 1e-5  # of the largest input, by which the derivatives are computed
 _ITERATIONS: Final = 200  # of L-BFGS on linearised motions
@@ -65,7 +66,7 @@ class Linearised:
         during, before = (_changed(inputs, sizes, columns, sets) for inputs in fields)
         for name, changes in random.items():
             during.actuation[name][:, -changes.shape[1] :] += changes
-        series = replay.varied_points(start, prepared, (constants, during, before), sets, states)
+        series, _ = replay.varied_points(start, prepared, (constants, during, before), sets, states)
         first, *rest = replay.at_frames(series, start).unflatten(0, (1 + sets, -1))
         times = (replay.trials.times - start.delay[:, None]).clamp_min(0.0)
         slopes: dict[str, list[torch.Tensor]] = {name: [] for name in sizes}

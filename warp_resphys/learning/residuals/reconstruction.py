@@ -38,7 +38,8 @@ from ...stepping.rollout import states
 from ...stepping.state import State
 from ..metrics import mean_distance
 from ..observed_motions import Identified, ObservedMotions
-from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, StepProblem
+from ..resampling import loads_at_steps
+from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Read, StepProblem
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +90,7 @@ class Reconstructor(ABC):
         observed: torch.Tensor,
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
+        read: Read | None = None,
     ) -> ReconstructedStep:
         """Reconstructs the force of a step from a state to an observation.
 
@@ -98,6 +100,7 @@ class Reconstructor(ABC):
             inputs: during the step; an external force is added to the reconstructed one.
             first_guess: (B, N, 3) initial guess of the force, such as that of the last step [N]; not all methods use
                 it.
+            read: errors of force sensors after the step.
 
         Raises:
             ConvergenceError: the method did not converge.
@@ -125,12 +128,13 @@ class LeastSquares(Reconstructor):
         observed: torch.Tensor,
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
+        read: Read | None = None,
     ) -> ReconstructedStep:
         acting, constants = inputs or Inputs(), self._constants
         step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
-                problem = kind(*step, self.settings.tolerance)
+                problem = kind(*step, self.settings.tolerance, read)
                 result = minimise(
                     problem, problem.start(first_guess), self.settings.tolerance, self.settings.max_iterations
                 )
@@ -161,6 +165,7 @@ class LBFGSB(Reconstructor):
         observed: torch.Tensor,
         inputs: Inputs | None = None,
         first_guess: torch.Tensor | None = None,
+        read: Read | None = None,
     ) -> ReconstructedStep:
         sim, like, acting = self.simulator, state.q, inputs or Inputs()
         free = sim.rest_positions.new_ones(sim.body.n_vertices, 1)
@@ -170,9 +175,10 @@ class LBFGSB(Reconstructor):
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
             force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
-            end = sim.step(state, acting.plus(free * force), self._constants).q
-            residual = self.observation.residual(self.observation(end), observed)
+            end = sim.step(state, acting.plus(free * force), self._constants)
+            residual = self.observation.residual(self.observation(end.q), observed)
             misfit = (free * residual if whole else residual).square().sum()
+            misfit = misfit if read is None else misfit + read(end).square().sum()
             value = misfit + self.regularisation * force.square().sum()
             (gradient,) = torch.autograd.grad(value, force)
             # Divided by lambda, the objective and its change have the magnitude of f^2.
@@ -206,7 +212,11 @@ class LBFGSB(Reconstructor):
 
 
 def follow(
-    method: Reconstructor, state: State, targets: Iterable[torch.Tensor], inputs: Inputs | None = None
+    method: Reconstructor,
+    state: State,
+    targets: Iterable[torch.Tensor],
+    inputs: Inputs | None = None,
+    read: Callable[[State, State, int], torch.Tensor] | None = None,
 ) -> Iterator[ReconstructedStep]:
     """Yields the steps that bring bodies to observed points; each starts from the force of the last one.
 
@@ -215,12 +225,15 @@ def follow(
         state: at the start.
         targets: (B, M, D) measured points at the end of each step [unit].
         inputs: of the steps.
+        read: errors of force sensors (B, C) [m] from the states before and after the step of a number.
     """
 
     def step(last: ReconstructedStep, now: tuple[int, torch.Tensor]) -> ReconstructedStep:
         number, observed = now
+        sensed = None if read is None else lambda after: read(last.state, after, number)
         with torch.enable_grad():
-            result = method.step(last.state, observed, None if inputs is None else inputs.at(number), last.force)
+            acting = None if inputs is None else inputs.at(number)
+            result = method.step(last.state, observed, acting, last.force, sensed)
         return ReconstructedStep(result.state.detach(), result.force.detach(), result.iterations)
 
     start = ReconstructedStep(state, torch.zeros_like(state.q), 0)
@@ -346,10 +359,22 @@ def _reconstructed(
         simulator = replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
         observed = torch.cat([torch.full_like(observed, torch.nan), observed], 1)
         inputs = resting
+    frame, reader = replay.simulator.time_step, replay.changed(simulator=replace(simulator))
+    loads = loads_at_steps(replay.trials, frame, start.delay)
+
+    def read(before: State, after: State, number: int) -> torch.Tensor:
+        now = 0 if replay.is_static else number + 1
+        if now >= loads.shape[1]:
+            return after.q.new_zeros(after.batch, 0)
+        sensed = reader.read(after, before, inputs.at(number), constants)[None, :, None]
+        measured = loads[:, now, None], loads.new_full((after.batch, 1), frame * now)
+        return replay.trials.load_errors(sensed, measured)[0].flatten(1)
+
     method = make_reconstructor(simulator, settings, replay.observe)
     reached, forces = [state], [torch.zeros_like(state.q)]
     report()
-    for step in follow(method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs):
+    sensed = read if replay.trials.sensors else None
+    for step in follow(method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs, sensed):
         reached.append(step.state)
         forces.append(step.force)
         report(iterations=step.iterations)

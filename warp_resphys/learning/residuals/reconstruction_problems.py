@@ -2,6 +2,7 @@
 
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -16,6 +17,8 @@ from ...linalg.conjugate_gradients import LinearMap, conjugate_gradients
 from ...linalg.least_squares import Move, Point, Problem, ridge
 from ...stepping.inputs import Inputs
 from ...stepping.state import State
+
+Read = Callable[[State], torch.Tensor]  # errors of readings in the state after a step, (B, C) as lengths [m]
 
 _SHORT = 0.1  # of the tolerance: length of a step of Gauss-Newton that needs no check
 
@@ -35,6 +38,7 @@ class StepProblem(Problem):
     weight: float  # lambda [unit^2/N^2]
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     tolerance: float = 0.0  # of the distance of two iterates at the minimum [m]
+    read: Read | None = None  # of force sensors, differentiable; C' below then has C more rows
 
     def __post_init__(self) -> None:
         """Linearises the step."""
@@ -44,14 +48,29 @@ class StepProblem(Problem):
         """Returns the linearisation of the step without a residual force."""
         return self.simulator.linearise(self.state, self.inputs, self.constants)
 
-    def missing(self, end: torch.Tensor) -> torch.Tensor:
-        """Returns y - C(q+), (B, M D, 1) [unit], zero where not seen."""
-        return -self.observation.residual(self.observation(end), self.observed).flatten(1)[..., None]
+    def missing(self, end: State) -> torch.Tensor:
+        """Returns y - C(q+), and the same of readings, (B, M D + C, 1) [unit], zero where not seen."""
+        seen = -self.observation.residual(self.observation(end.q), self.observed).flatten(1)
+        return (seen if self.read is None else torch.cat([seen, -self.read(end)], 1))[..., None]
 
-    def transposed_jacobian(self, end: torch.Tensor) -> torch.Tensor:
-        """Returns C'^T, (B, 3 N, M D), zero for points that were not seen."""
+    def transposed_jacobian(self, step: Linearisation, x: torch.Tensor) -> torch.Tensor:
+        """Returns C'^T, (B, 3 N, M D + C), zero for points that were not seen, at positions x of the stage [m].
+
+        Derivatives of readings by x are those by q+, which moves 1 / e times as far (`MarkerPositionProblem`).
+        """
         seen = torch.isfinite(self.observed).all(-1, keepdim=True).expand_as(self.observed)
-        return torch.where(seen.flatten(1)[:, None], self.observation.transposed_jacobian(end), 0.0)
+        points = torch.where(seen.flatten(1)[:, None], self.observation.transposed_jacobian(step.finish(x).q), 0.0)
+        if self.read is None:
+            return points
+        with torch.enable_grad():
+            at = x.detach().requires_grad_(True)
+            errors = self.read(step.reached(at)).unbind(1)
+            columns = [torch.autograd.grad(one.sum(), at, retain_graph=True)[0].flatten(1) for one in errors]
+        return torch.cat([points, step.stage.end * torch.stack(columns, 2)], 2)
+
+    def _reached(self, step: Linearisation, x: torch.Tensor) -> State:
+        """Returns the state after the step with positions x of the stage [m]."""
+        return step.finish(x) if self.read is None else step.reached(x)
 
     @abstractmethod
     def start(self, first_guess: torch.Tensor | None) -> Point:
@@ -168,12 +187,11 @@ class MarkerPositionProblem(StepProblem):
     @override
     def linearise(self, point: Point) -> Move:
         x, step = point.x[:, 0], self._step
-        end = step.finish(x).q
+        transposed, missing = self.transposed_jacobian(step, x), self.missing(self._reached(step, x))
         residual = step.residual(x).reshape(len(x), -1, 1).to(x.dtype)
         step.factorise(x)
-        transposed = self.transposed_jacobian(end)
         response, settling = step.solve(torch.cat([transposed, residual], dim=2)).tensor_split([-1], dim=2)
-        right = step.stage.end * self.missing(end) + transposed.mT @ settling
+        right = step.stage.end * missing + transposed.mT @ settling
         force = ridge(response.mT, right, self.weight * step.stage.end**2)
         new = x + (step.solve(force) - settling).view_as(x)
         return lambda _: torch.stack([new, force.view_as(x)], 1)
@@ -207,20 +225,19 @@ class MarkerForceProblem(StepProblem):
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
         try:
-            end = self.simulator.step(self.state, self.inputs.plus(x), self.constants).q
+            end = self.simulator.step(self.state, self.inputs.plus(x), self.constants)
         except ConvergenceError:
             return Point(x, x.new_full((len(x),), torch.inf), (self.state.q,))
         value = self.missing(end).square().sum((1, 2)) + self.weight * x.square().sum((1, 2))
-        return Point(x, value, (end,))
+        return Point(x, value, (end.q,))
 
     @override
     def linearise(self, point: Point) -> Move:
-        force, (end,) = point.x.flatten(1)[..., None], point.kept
-        step = self.without_force()
-        step.factorise(self.solution(point)[0])
+        force, x, step = point.x.flatten(1)[..., None], self.solution(point)[0], self.without_force()
+        transposed, missing = self.transposed_jacobian(step, x), self.missing(self._reached(step, x))
+        step.factorise(x)
         # q+ moves 1 / stage.end times as far as x.
-        jacobian = step.solve(self.transposed_jacobian(end)).mT / step.stage.end
-        missing = self.missing(end)
+        jacobian = step.solve(transposed).mT / step.stage.end
 
         def damped_step(damping: torch.Tensor) -> torch.Tensor:
             factor = (1.0 + damping)[:, None, None]

@@ -1,0 +1,224 @@
+"""Force sensors: readings in their axes, errors without zero and drift, and parameters that they identify."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from support.clamped import clamped
+from support.refusals import refuses
+from warp_resphys import (
+    Body,
+    Contact,
+    Corotated,
+    ForceSensor,
+    HalfSpace,
+    Inputs,
+    Simulator,
+    State,
+    bind_markers,
+    box_hexahedra,
+    select_vertices,
+)
+from warp_resphys.io.errors import InputError
+from warp_resphys.learning import ObservedMotions, evaluate, identify, reconstruct
+from warp_resphys.learning.residuals.in_the_loop import MotionLoss, TrialGroup
+from warp_resphys.settings.learning import ReconstructionSettings, ReleaseSettings
+from warp_resphys.stepping.state import Reaction
+
+BAR = box_hexahedra(size=(0.02, 0.02, 0.06), divisions=(2, 2, 4))
+TRUE = {"youngs_modulus": 80e3}
+RANGES = {"youngs_modulus": (30e3, 300e3)}
+
+
+def double(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_a_reading_is_in_the_axes_of_the_sensor_about_its_origin():
+    reaction = Reaction(
+        torch.tensor([4, 7]), double([[[0.0, 0.0, 3.0], [0.0, 0.0, 1.0]]]), double([[[0.1, 0, 0], [0.2, 0, 0]]])
+    )
+    turned = ForceSensor(moment_noise=1e-3, origin=(0.1, 0.0, 0.0), rotation=(math.pi / 2, 0.0, 0.0))
+    # Its y axis is the body's z axis; the moment of 1 N at 0.1 m about the origin is -0.1 N m about y, its -z axis.
+    torch.testing.assert_close(turned(reaction), double([[0.0, -4.0, 0.0, 0.0, 0.0, -0.1]]), rtol=0, atol=1e-14)
+    torch.testing.assert_close(replace(turned, on_body=True)(reaction), -turned(reaction))
+
+
+def test_a_sensor_moves_with_the_vertices_that_it_holds():
+    rest = double(np.random.default_rng(0).normal(size=(5, 3)))
+    angle = 0.7
+    turn = double([[math.cos(angle), -math.sin(angle), 0.0], [math.sin(angle), math.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    forces, shift = double(np.random.default_rng(1).normal(size=(1, 5, 3))), double([0.3, -0.2, 0.1])
+    sensor = ForceSensor(moment_noise=1e-3, origin=(0.2, 0.1, 0.0), rotation=(0.1, 0.4, -0.2))
+    still = sensor(Reaction(torch.arange(5), forces, rest[None]), rest)
+    moved = sensor(Reaction(torch.arange(5), forces @ turn.T, (rest @ turn.T + shift)[None]), rest)
+    torch.testing.assert_close(moved, still, rtol=1e-12, atol=1e-12)
+
+
+def test_errors_have_the_inverse_covariance_of_noise_zero_and_drift():
+    sensor, times = ForceSensor(axes=("fz",), noise=0.02, zero=30.0, drift=5.0), double([[0.0, 0.1, 0.2, 0.5, 0.9]])
+    random = np.random.default_rng(2)
+    predicted, measured = (double(random.normal(size=shape)) for shape in ((2, 1, 5, 6), (1, 5, 6)))
+    measured[0, 2, 2] = math.nan
+    errors = sensor.errors(predicted, measured, times)
+    assert float(errors[..., [0, 1, 3, 4, 5]].abs().max()) == float(errors[:, :, 2].abs().max()) == 0.0
+    seen = [0, 1, 3, 4]
+    t, e = times[0, seen].numpy(), (predicted[0, 0, seen, 2] - measured[0, seen, 2]).numpy()
+    covariance = 0.02**2 * (np.eye(4) + 30.0**2 * np.ones((4, 4)) + 5.0**2 * np.outer(t, t))
+    assert float(errors[0, 0].square().sum()) == pytest.approx(e @ np.linalg.solve(covariance, e), rel=1e-9)
+    plain = replace(sensor, zero=0.0, drift=0.0).errors(predicted, measured, times)
+    np.testing.assert_allclose(plain[0, 0, seen, 2], e / 0.02, rtol=1e-12)
+
+
+def stretched(modulus=TRUE["youngs_modulus"], **options):
+    """A bar in a testing machine, and the motion of its upper grip by 6 mm and back."""
+    ends = np.concatenate([select_vertices(BAR, z=0.0), select_vertices(BAR, z=0.06)])
+    simulator = Simulator(
+        Body(BAR, np.sort(ends)), Corotated(modulus, 0.45), time_step=0.05, gravity=(0, 0, 0), **options
+    )
+    way = 6e-3 * torch.sin(torch.linspace(0.0, math.pi, 13).double())[1:]
+    held = simulator.rest_positions[simulator.fixed].expand(12, 1, -1, -1).clone()
+    held[..., 2] += way[:, None, None] * (held[..., 2] > 0.03)
+    return simulator, Inputs(fixed_positions=held)
+
+
+def measured(simulator, inputs, noise=0.0, zero=0.0, seed=0):
+    """Readings (T, 6) of the pull at the upper grip, with an own zero."""
+    start = simulator.static_equilibrium()
+    motion = simulator.rollout(start, 12, inputs)
+    upper = select_vertices(BAR, z=0.06)
+    pull = [simulator.reaction(start, upper).force[0, 2], *simulator.reaction(motion, upper).force[:, 0, 2]]
+    readings = np.full((13, 6), np.nan)
+    readings[:, 2] = [float(force) for force in pull] + noise * np.random.default_rng(seed).normal(size=13) + zero
+    return readings
+
+
+def test_stiffness_is_identified_from_force_and_way_alone():
+    simulator, inputs = stretched(relative_tolerance=1e-10)
+    sensor = ForceSensor(at=tuple(select_vertices(BAR, z=0.06)), axes=("fz",), noise=0.01, on_body=True)
+    readings = measured(simulator, inputs, noise=0.01)
+    largest = np.nanmax(readings)
+    guess, _ = stretched(150e3)
+    motions = ObservedMotions.of(guess, None, inputs=inputs, sensors={"load": sensor}, loads={"load": readings})
+    found = identify(guess, motions, RANGES)
+    assert abs(found.parameters["youngs_modulus"] / TRUE["youngs_modulus"] - 1.0) < 3 * 0.01 / largest
+    shifted = replace(motions.trials, loads={"load": readings[None] + 0.3})
+    zeroed = {"load": replace(sensor, zero=1e3)}
+    again = identify(guess, replace(motions, trials=shifted, sensors=zeroed), RANGES)
+    assert abs(again.parameters["youngs_modulus"] / TRUE["youngs_modulus"] - 1.0) < 6 * 0.01 / largest
+
+
+def pressing(integrator):
+    """A beam that falls on a plate at its tip, sensed at its clamp and by the plate."""
+    mesh = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(6, 2, 2))
+    contact = Contact({"plate": HalfSpace(position=(0.0, 0.0, -0.004))}, stiffness=2e3, friction=0.3)
+    simulator = Simulator(
+        clamped(mesh, energies=[contact]),
+        Corotated(80e3, 0.45),
+        time_step=0.01,
+        integrator=integrator,
+        relative_tolerance=1e-12,
+    )
+    sensors = {
+        "base": ForceSensor(moment_noise=1e-3, origin=(0.0, 0.01, 0.01)),
+        "load": ForceSensor("plate", ("fx", "fz")),
+    }
+    return simulator, sensors
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_readings_of_nearby_parameters_are_right_to_first_order(integrator):
+    simulator, sensors = pressing(integrator)
+    loads = {name: np.zeros((26, 6)) for name in sensors}
+    motions = ObservedMotions.of(simulator, None, simulator.rest_state(), sensors=sensors, loads=loads)
+    ((replay, start),) = motions.replays(simulator)
+    size, whole = 1e-6, {"youngs_modulus": double([80e3, 80e3 * (1 + 1e-6)])}
+    near, exact = replay.varied(start, whole)[1], replay.sensed(start, whole)[1]
+    assert bool(near[:, :, 0].isnan().all())  # no step led to the initial state
+    near, exact = near[:, 0, 1:], exact[:, 0, 1:]
+    torch.testing.assert_close(near[0], exact[0], rtol=1e-9, atol=1e-12)
+    slopes = [(x[1] - x[0]) / size for x in (near, exact)]
+    assert float(exact[0, :, 1, 2].min()) < -0.05  # the plate is pressed down
+    torch.testing.assert_close(*slopes, rtol=1e-3, atol=1e-3 * float(slopes[1].abs().max()))
+
+
+@pytest.fixture(scope="module")
+def pushed():
+    """A beam that a force on its middle bends, which its simulator lacks; one marker, and a sensor at its clamp."""
+    mesh = box_hexahedra(size=(0.1, 0.02, 0.02), divisions=(5, 1, 1))
+    simulator = Simulator(clamped(mesh), Corotated(150e3, 0.45, stiffness_damping=0.01), time_step=0.01)
+    start, force = simulator.static_equilibrium(), torch.zeros(8, 1, len(mesh.vertices), 3).double()
+    force[:, :, select_vertices(mesh, x=0.04), 1] = 0.05 * torch.linspace(0.2, 1.0, 8).double()[:, None, None]
+    motion = simulator.rollout(start, 8, Inputs(external_force=force))
+    clamp = ForceSensor(axes=("fx", "fy", "fz"), noise=1e-3)
+    read = [clamp(simulator.reaction(start)), *(clamp(one) for one in reactions(motion))]
+    marker = bind_markers(mesh, [[0.1, 0.01, 0.02]], ["tip"])
+    seen = torch.stack([marker(q) for q in motion.q])
+    return simulator, start, force, marker, seen, clamp, torch.stack(read)
+
+
+def reactions(motion):
+    held = motion.reaction
+    return [Reaction(held.vertices, f, p) for f, p in zip(held.forces, held.places, strict=True)]
+
+
+@pytest.mark.parametrize("method", ["gauss_newton", "levenberg_marquardt", "lbfgsb"])
+def test_reconstructed_forces_agree_with_the_sensor_at_the_clamp(pushed, method):
+    simulator, start, force, marker, seen, clamp, read = pushed
+    settings = ReconstructionSettings(method=method, regularisation=1e-8, max_iterations=200, tolerance=1e-9)
+    given = {"start": State(start.q, start.v), "observation": marker, "release": ReleaseSettings(noise=1e-4)}
+    blind = ObservedMotions.of(simulator, seen, **given)
+    sensing = ObservedMotions.of(simulator, seen, **given, sensors={"clamp": clamp}, loads={"clamp": read})
+    errors, wanted = [], force.sum(2)[:, 0]
+    for motions in (blind, sensing):
+        (forces,) = reconstruct(simulator, motions, settings=settings).of(["motion 0"], "force")
+        errors.append(float((torch.from_numpy(forces[0, 1:]).double().sum(1) - wanted).norm() / wanted.norm()))
+    assert errors[1] < 0.03 < 0.3 < errors[0]
+
+
+def test_errors_of_readings_are_those_of_the_force(pushed):
+    simulator, start, force, marker, seen, clamp, read = pushed
+    given = {"start": State(start.q, start.v), "observation": marker, "sensors": {"clamp": clamp}}
+    shifted = read + torch.tensor([0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
+    motions = ObservedMotions.of(simulator, seen, **given, loads={"clamp": shifted})
+    away = evaluate(simulator, motions, lambda state, k: force[k], sensor="clamp")
+    assert math.isnan(away[0, 0])  # no step led to the given state
+    np.testing.assert_allclose(away[1:, 0], 0.03, rtol=1e-6)
+    zeroed = replace(motions, sensors={"clamp": replace(clamp, zero=1e4)})
+    assert np.nanmax(evaluate(simulator, zeroed, lambda state, k: force[k], sensor="clamp")) < 1e-4
+    assert evaluate(simulator, motions, lambda state, k: force[k])[1:].max() < 1e-9
+    refuses(InputError, "no force sensor 'lid'", evaluate, simulator, motions, sensor="lid")
+
+
+def test_the_loss_of_training_through_the_simulator_has_readings(pushed):
+    simulator, start, _, marker, seen, clamp, read = pushed
+    given = {"start": State(start.q, start.v), "observation": marker, "release": ReleaseSettings(noise=1e-4)}
+    losses = []
+    for more in ({}, {"sensors": {"clamp": clamp}, "loads": {"clamp": read}}):
+        motions = ObservedMotions.of(simulator, seen, **given, **more)
+        ((replay, begin),) = motions.replays(simulator)
+        losses.append(float(MotionLoss([TrialGroup(replay, begin)], {})(None)))
+    points, loads = replay.sensed(begin)
+    squares = (
+        replay.errors(points).square().sum() + (1e-4 * (loads[0, 0, 1:, 0] - read[1:, 0])[:, :3] / 1e-3).square().sum()
+    )
+    counted, size = 9 + 9 * 3 / 3, replay.trials.amplitude
+    assert losses[1] == pytest.approx(float(squares / (counted * size**2)), rel=1e-9)
+    assert losses[0] == pytest.approx(float(replay.errors(points).square().sum() / (9 * size**2)), rel=1e-9)
+
+
+def test_bad_sensors_and_readings_are_refused():
+    simulator, _ = pressing("bdf2")
+    given = {"start": simulator.rest_state(), "sensors": {"load": ForceSensor("lid", ("fz",))}}
+    motions = ObservedMotions.of(simulator, None, loads={"load": np.ones((3, 6))}, **given)
+    refuses(InputError, "no region 'lid'", identify, simulator, motions, RANGES)
+    refuses(InputError, "force sensors are .load.", replace, motions, trials=replace(motions.trials, loads={}))
+    few = {"load": np.zeros((3, 2))}
+    refuses(InputError, "'load' have shape", ObservedMotions.of, simulator, None, loads=few, **given)
+    refuses(InputError, "moment_noise", ForceSensor, axes=("tx",))
+    refuses(InputError, "axis 'fw'", ForceSensor, axes=("fw",))
+    refuses(InputError, "no axes", ForceSensor, axes=())
+    refuses(InputError, "noise of a force sensor is 0.0", ForceSensor, axes=("fx",), noise=0.0)

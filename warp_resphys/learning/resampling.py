@@ -1,0 +1,70 @@
+"""What was observed at the frames of trials, at the steps of a simulator."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..stepping.rollout import sample
+from .trial_batch import TrialBatch
+
+
+def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:
+    """Values (B, K + 1, ...) at the times k h after delays (B,) [s], from those at k h.
+
+    Before the series, its first value holds; after its end, values are NaN.
+    """
+    last = series.shape[1] - 1
+    times = step * torch.arange(last + 1).to(delay) + delay[:, None]
+    over = times > (last + 1e-6) * step
+    return sample(series, times, step).masked_fill(over.view(*over.shape, *[1] * (series.ndim - 2)), torch.nan)
+
+
+def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None) -> NDArray[np.float64]:
+    """(R, K + 1, M, 3) markers at the steps of a simulation [m], NaN after a motion's end and in long occlusions.
+
+    Interpolates with cubic splines through the frames in which a marker was seen, starting from the held position at
+    time zero. A marker counts as not seen at steps that are more than 1.5 frames away from its nearest frame.
+
+    Args:
+        trials: observed trials.
+        step: time step h [s].
+        delay: (R,) delay of the release after time zero of the frames [s]; zero by default.
+    """
+    from scipy.interpolate import CubicSpline
+
+    since = trials.times if delay is None else (trials.times - delay[:, None]).clamp_min(0.0)
+    times, markers, held = (t.cpu().numpy() for t in (since, trials.observed, trials.held))
+    steps = step * np.arange(int(times.max() / step + 1e-6) + 1)
+    positions = np.full((len(times), len(steps), *markers.shape[2:]), np.nan)
+    for r, m in np.ndindex(len(times), markers.shape[2]):
+        seen = np.isfinite(markers[r, :, m]).all(1)
+        t, y = times[r, seen], markers[r, seen, m]
+        t, first = np.unique(t, return_index=True)
+        y = y[first]
+        if np.isfinite(held[r, m]).all() and (not len(t) or t[0] > 1e-9):
+            t, y = np.concatenate([[0.0], t]), np.concatenate([held[r, m][None], y])
+        if len(t) < min(4, len(times[r])):
+            continue
+        nearest = np.abs(steps[:, None] - t).min(1)
+        near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
+        positions[r, near, m] = CubicSpline(t, y)(steps[near])
+    return positions
+
+
+def loads_at_steps(trials: TrialBatch, step: float, delay: torch.Tensor) -> torch.Tensor:
+    """(R, K + 1, S, 6) readings at the steps of a simulator [N, N m], linear between frames; NaN before and after them.
+
+    Args:
+        trials: observed trials.
+        step: time step h [s].
+        delay: (R,) delay of the release after time zero of the frames [s].
+    """
+    since = (trials.times - delay[:, None]).cpu().numpy()
+    steps = step * np.arange(int(since.max() / step + 1e-6) + 1)
+    loads = trials.loads.cpu().numpy()
+    series = np.full((len(since), len(steps), *loads.shape[2:]), np.nan)
+    for row, sensor, axis in np.ndindex(len(since), *loads.shape[2:]):
+        known = np.isfinite(values := loads[row, :, sensor, axis])
+        if known.any():
+            series[row, :, sensor, axis] = np.interp(steps, since[row, known], values[known], np.nan, np.nan)
+    return trials.loads.new_tensor(series)

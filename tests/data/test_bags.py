@@ -69,6 +69,11 @@ class Messages:
         values = np.array([*positions.values()], dtype=np.float64)
         return self.of("sensor_msgs/msg/JointState")(self.header(time), names, values, none, none)
 
+    def wrench(self, time, force):
+        parts = (self.of("geometry_msgs/msg/Vector3")(*map(float, part)) for part in (force, (0.0, time, 0.0)))
+        wrench = self.of("geometry_msgs/msg/Wrench")(*parts)
+        return self.of("geometry_msgs/msg/WrenchStamped")(self.header(time), wrench)
+
     def numbers(self, values):
         layout = self.of("std_msgs/msg/MultiArrayLayout")([], 0)
         return self.of("std_msgs/msg/Float64MultiArray")(layout, np.array(values, dtype=np.float64))
@@ -102,6 +107,7 @@ def written(path, kind="sqlite3", left_out=(), late=0.0):
             write("/tf", make.transforms(other, place(1, other), turn(other), "plate"), other)
             write("/tf", make.transforms(other, place(5, other), turn(0.0), "other"), other)
             write("/cloud", make.cloud(time, [place(3, time), place(2, time)]), time)
+            write("/wrench", make.wrench(other, (other, 0.0, 2.0 * other)), other)
             if number % 10 == 0:
                 write("/pressure", make.numbers([0.0, number]), time)
                 write("/joint_states", make.joints(time, arm=9.0, winch=0.5 * number), time)
@@ -142,6 +148,14 @@ def test_a_pose_is_the_motion_of_the_base(tmp_path):
     np.testing.assert_allclose(read.base, since_first(place(1, times), quaternions, path), atol=2e-4)
 
 
+def test_wrenches_are_readings_of_force_sensors(tmp_path):
+    bag = BagSettings(markers={"tip": "/mocap/tip"}, loads={"load": "/wrench"})
+    readings = read_recording(written(tmp_path / "trial"), bag=bag).loads["load"]
+    assert np.isnan(readings[0]).all()  # before its first message
+    expected = np.stack([TIMES, 0.0 * TIMES, 2.0 * TIMES, 0.0 * TIMES, TIMES, 0.0 * TIMES], 1)
+    np.testing.assert_allclose(readings[1:], expected[1:], atol=1e-8)
+
+
 def test_a_gap_is_not_bridged(tmp_path):
     read = read_recording(written(tmp_path / "trial", left_out=range(10, 15)), bag=of_tip("/mocap/tip"))
     np.testing.assert_array_equal(np.flatnonzero(~read.seen[:, 0]), range(10, 15))
@@ -155,6 +169,10 @@ def test_a_gap_is_not_bridged(tmp_path):
     [
         (of_tip("/mocap/tup"), DataFileError, "no topic /mocap/tup, did you mean '/mocap/tip'"),
         (of_tip("/tf#tip"), DataFileError, "/tf has no message of tip"),
+        (
+            BagSettings(markers={"tip": "/mocap/tip"}, loads={"load": "/tf"}),
+            *(DataFileError, "/tf has messages of the type tf2_msgs/msg/TFMessage, which hold no force"),
+        ),
         (of_tip("/pressure#1"), DataFileError, "which hold no place"),
         (of_tip("/cloud"), InputError, "say which entry"),
         (of_tip("/mocap/tip", "/pressure#3 [mbar]"), DataFileError, "has 2 entries"),

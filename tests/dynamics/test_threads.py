@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from support.clamped import clamped
-from warp_resphys import Contact, Corotated, HalfSpace, Inputs, Simulator, box_hexahedra, select_vertices
+from warp_resphys import Body, Contact, Corotated, HalfSpace, Inputs, Simulator, box_hexahedra, select_vertices
+from warp_resphys.energies.convex_material import ConvexMaterial
 from warp_resphys.studies.check import MOTIONS, positions
 
 MESH = box_hexahedra((0.1, 0.02, 0.02), (6, 2, 2))
@@ -140,6 +141,16 @@ def test_copies_of_a_used_simulator_move_as_it_does(name, recwarn):
         torch.testing.assert_close(positions(other), expected, rtol=0.0, atol=1e-12, msg=way)
     assert copies["copy"].body is sim.body
     assert copies["deepcopy"].body is not sim.body
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_copies_of_laws(way):
+    """Their kernels, which are made for their terms, belong to a process."""
+    law = ConvexMaterial(c10=30e3, bulk_1=1e6, ogden={3: 2e3})
+    body = Body(box_hexahedra(divisions=(2, 1, 1)), fixed=[0, 1, 2, 3])
+    expected = Simulator(body, law).static_equilibrium().q
+    copied = Simulator(body, WAYS[way](law)).static_equilibrium().q
+    torch.testing.assert_close(copied, expected, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -355,3 +355,15 @@ def test_the_identified_material_on_other_bodies(folder, no_report):
     assert found["finer"]["vertices"] == found["thin"]["vertices"]
     assert found["finer"]["errors_mm"]["sysid"] > 100.0 * found["thin"]["errors_mm"]["sysid"]
     assert found["finer"]["moved_mm"] == pytest.approx(found["thin"]["moved_mm"], rel=0.3)
+
+
+@pytest.mark.usefixtures("folder", "no_report")
+def test_the_force_of_a_finger_is_predicted_from_motions_in_free_air():
+    """Blocked force: from SysID within 5 % of its mean (asked), which nothing without physics knows."""
+    metrics = results(finish("experiment=finger_force", "budget=quick", "law=null", "reconstruction=none"))
+    forces = metrics["forces"]["load"]
+    errors = {model: summary["mean"] for model, summary in forces["models"].items()}
+    assert forces["unit"] == "N"
+    assert errors["sysid"] < 0.05 * forces["size"]
+    assert min(errors[model] for model in ("rest", "regression")) > 0.9 * forces["size"]
+    assert errors["sysid"] < 0.3 * errors["simulation"]

@@ -9,9 +9,9 @@ from warp_resphys import Body, ConvergenceError, Inputs, Simulator, State, box_h
 from warp_resphys.data.markers import bind_markers
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.replay import Replay
-from warp_resphys.learning.resampling import at_steps
 from warp_resphys.learning.residuals.in_the_loop import InTheLoop, MotionLoss, TrialGroup, cross_validated_epochs
 from warp_resphys.learning.residuals.networks import ResidualForce, build_model
+from warp_resphys.learning.sensing import at_steps
 from warp_resphys.learning.start import Start
 from warp_resphys.learning.trial_batch import TrialBatch
 from warp_resphys.settings.learning import InTheLoopSettings, NetworkSettings

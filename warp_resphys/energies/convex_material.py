@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from numbers import Integral
 from typing import Any, ClassVar, NamedTuple
 
@@ -112,6 +112,15 @@ class ConvexMaterial(Material):
         for name, value in law.items():
             object.__setattr__(self, name, value)
         super().__post_init__()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the arguments, of which a copy is built: the kernel's functions belong to a process."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Builds a copy from its arguments."""
+        vars(self).update(state)
+        self.__post_init__()
 
     @property
     @override

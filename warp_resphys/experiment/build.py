@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from ..data.force_sensors import ForceSensor
 from ..data.marker_view import MarkerView
 from ..data.markers import BoundMarkers, JoinedMarkers, Markers, bind_markers, follow_vertices
 from ..data.rigid_bodies import arms, corners_of
@@ -49,7 +50,7 @@ from ..settings.mesh import (
     SymmetrySettings,
     TetrahedralBox,
 )
-from ..settings.observed import BindingSettings, MarkerSettings, RigidBodySettings
+from ..settings.observed import BindingSettings, ForceSensorSettings, MarkerSettings, RigidBodySettings
 from .actuators import build_actuators
 
 _BYTES_PER_CELL = 4_000  # lower bound for the mesh, its points and its matrix
@@ -307,6 +308,12 @@ def mounted_on(settings: RigidBodySettings, mesh: Mesh) -> IntArray:
         assert settings.at is not None
         return vertices_at(mesh, settings.at)
     return np.unique(mesh.cells[mesh.region(settings.part)])
+
+
+def force_sensor(settings: ForceSensorSettings) -> ForceSensor:
+    """Returns a configured force sensor."""
+    turned = tuple(math.radians(angle) for angle in settings.rotation)
+    return ForceSensor(**{**dict(settings), "rotation": turned})
 
 
 def nominal_places(settings: BindingSettings, mesh: Mesh) -> FloatArray:

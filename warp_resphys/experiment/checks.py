@@ -54,6 +54,7 @@ def check_run(run: RunSettings) -> None:
     vertices_at(body.mesh, run.tip)
     simulator = build_simulator(run, run.simulation, body)
     _check_target(run, body, drive)
+    _check_sensors(run, simulator)
     if run.ablation is not None:
         check_ablation(run, simulator)
     else:
@@ -73,6 +74,20 @@ def check_run(run: RunSettings) -> None:
                     f"{name} is identified, but plans need an input without dead band, zero or backlash, which changes "
                     "with every command: take it out of identify.parameters, or set control=none."
                 )
+
+
+def _check_sensors(run: RunSettings, simulator: Simulator) -> None:
+    """Refuses force sensors without recordings, and those on what nothing holds."""
+    if run.sensors and run.recorded is None:
+        raise InputError("sensors are read from recordings: set sensors to {}, or take data.kind recorded.")
+    for name, sensor in run.sensors.items():
+        if sensor.at in simulator.energies.obstacle_names:
+            continue
+        if not len(simulator.fixed):
+            raise InputError(f"sensors.{name}: nothing holds the body: name an obstacle in at, or fix vertices.")
+        if sensor.at is not None:
+            with naming(f"sensors.{name}.at: "):
+                simulator.body.fixed_in(sensor.at)
 
 
 def _check_target(run: RunSettings, body: Body, drive: Drive | None) -> None:

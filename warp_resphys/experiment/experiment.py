@@ -27,7 +27,7 @@ from ..settings.body import MaterialSettings, SimulatorSettings
 from ..settings.run import RunSettings
 from ..settings.run_keys import models_of
 from ..settings.stage_keys import StageSettings
-from .build import bound_markers, build_body, build_simulator, marker_view_of
+from .build import bound_markers, build_body, build_simulator, force_sensor, marker_view_of
 from .files import (
     ACTUATOR_FILE,
     DATASET,
@@ -162,9 +162,13 @@ class Experiment:
             assert markers is not None
             bound = bound_markers(markers, self.body.mesh, trials.bound, trials.labels)
             observe = ViewedMarkers.of(bound, marker_view_of(markers, trials.labels, trials.sets)).to(self.like)
+        sensors = {name: force_sensor(settings.sensors[name]) for name in trials.loads}
         more: dict[str, Any] = {"actuation": settings.actuation} if "actuation" in settings.reads else {}
         return ObservedMotions(
-            trials, observe, settings.release, settings.payload_at, train_fraction=settings.train_fraction, **more
+            *(trials, observe, settings.release, settings.payload_at),
+            train_fraction=settings.train_fraction,
+            sensors=sensors,
+            **more,
         )
 
     def identified(self, model: str) -> Identification:

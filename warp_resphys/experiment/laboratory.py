@@ -7,7 +7,7 @@ slightly from their nominal places, and cameras see the markers in their own fra
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..data.base_motion import in_frame, rigid
+from ..data.force_sensors import AXES
 from ..data.input_response import draw_inputs, wave_inputs
 from ..data.recordings.recording import ARM, Recording
 from ..data.recordings.recording_files import write_recording
@@ -28,6 +29,7 @@ from ..io.fan_out import ALONE, Workers
 from ..io.parts import Arrays, Parts, Report, TrialPart, cut
 from ..io.resuming import StageContext
 from ..io.safe_files import write_json
+from ..learning.sensing import readings
 from ..mesh.selection import vertices_at
 from ..settings.performed import Trial
 from ..settings.played import LaboratorySettings
@@ -37,9 +39,9 @@ from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample
 from ..stepping.state import State
 from .actuators import driven_parts, driving_quantity
-from .build import bound_markers, build_body, build_simulator, nominal_places
+from .build import bound_markers, build_body, build_simulator, force_sensor, nominal_places
 from .files import TRUTH
-from .simulate import distributed, played, substeps_of, target_settings, true_motions
+from .simulate import LOADS, distributed, played, substeps_of, target_settings, true_motions
 
 _LARGEST_OFFSET = 0.5  # m, of the origin of the cameras' frame
 _LARGEST_MOUNTING = 0.02  # m, of each coordinate of a rigid body from the centre of what carries it
@@ -101,8 +103,12 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     parts = Parts.of(context, workers)
     parts.run(cut_up)
     setup = make_setup(settings)
-    markers = {name: row for part in cut_up for name, row in zip(part.names, parts.read(part, "markers"), strict=True)}
-    noise = [_record(context, setup, trial, markers[trial.name]) for trial in trials]
+    seen = {
+        name: row
+        for part in cut_up
+        for name, *row in zip(part.names, *(parts.read(part, key) for key in ("markers", "loads")), strict=True)
+    }
+    noise = [_record(context, setup, trial, *seen[trial.name]) for trial in trials]
     if all(trial.scale == 1.0 for trial in trials):
         material, fibres, muscles = (getattr(laboratory, key) for key in ("material", "fibres", "muscles"))
         wound = {} if fibres is None else {"fibre_stiffness": fibres.stiffness}
@@ -124,7 +130,7 @@ def run_laboratory(context: StageContext, workers: Workers = ALONE) -> None:
     parts.remove()
 
 
-def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray) -> float:
+def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArray, loads: FloatArray) -> float:
     """Writes the recording of a trial; returns the mean distance by which noise moves its tracked markers [m]."""
     settings: StageSettings = context.settings
     laboratory, data = settings.laboratory, settings.data
@@ -136,8 +142,8 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
         assert laboratory.seconds is not None
         frames = int((laboratory.held_seconds + laboratory.seconds) * rate) + 1
         times = np.maximum(np.arange(frames) / rate - released, 0.0)
-        sampled = sample(torch.from_numpy(series)[None], torch.from_numpy(times)[None], laboratory.time_step)
-        series = sampled[0].numpy()
+        at = torch.from_numpy(times)[None], laboratory.time_step
+        series, loads = (sample(torch.from_numpy(x)[None], *at)[0].numpy() for x in (series, loads))
     base, pushing = true_motions(data, [trial], times)
     still = np.zeros((len(times), 6))
     poses = still if base is None else base[0]
@@ -166,10 +172,24 @@ def _record(context: StageContext, setup: Setup, trial: Trial, series: FloatArra
     motion = in_frame(poses, setup.frame) if data.base_motion == "recorded" else None
     path = context.run_dir / trial.recording
     recording = Recording(tuple(labels), positions + noise, rate, path, actuation=actuation, rest=rest, base=motion)
+    recording = replace(recording, loads=_measured(settings, trial, loads, rate))
     lengths = {name: body.length for name, body in settings.binding.rigid_bodies.items()}
     write_recording(path, with_axes(recording, lengths), {"payload_kg": trial.payload})
     moved = as_markers(noise[:, : series.shape[1]], settings.binding.observed)
     return float(np.linalg.norm(moved, axis=-1).mean())
+
+
+def _measured(settings: StageSettings, trial: Trial, loads: FloatArray, rate: float) -> dict[str, FloatArray]:
+    """Readings (T, 6) of force sensors [N, N m] with noise, zero and drift, of the axes that they measure."""
+    draw, measured = np.random.default_rng([settings.seed, 3, zlib.crc32(trial.name.encode())]), dict[str, FloatArray]()
+    times = np.arange(len(loads))[:, None] / rate
+    for number, (name, one) in enumerate(settings.sensors.items()):
+        sensor = force_sensor(one)
+        off = draw.standard_normal(loads[:, number].shape)
+        off += sensor.zero * draw.standard_normal(6) + sensor.drift * times * draw.standard_normal(6)
+        seen = [axis in sensor.axes for axis in AXES]
+        measured[name] = np.where(seen, loads[:, number] + np.where(seen, sensor.deviations, 0.0) * off, np.nan)
+    return measured
 
 
 def _drawn(settings: StageSettings, trial: Trial) -> tuple[np.random.Generator, float | None]:
@@ -344,8 +364,15 @@ def _played(settings: StageSettings, names: Sequence[str], frames: int, report: 
     substeps = 1
     if not released:
         substeps = 0 if begins == STATIC else substeps_of(settings.time_step, settings.laboratory, "laboratory")
-    seen = []
-    for state in played(frames, simulator, substeps, settings.data, trials, begin, inputs_at):
+    sensors = [force_sensor(sensor) for sensor in settings.sensors.values()]
+    unread = begin.q.new_full((len(trials), len(sensors), 6), torch.nan)
+    if not released:
+        unread = readings(simulator, sensors, begin, None, inputs_at(0, 0.0), simulator.prepare())
+    begin, seen, loads = begin.with_memory({"loads": unread}, LOADS), list[torch.Tensor](), list[torch.Tensor]()
+    read = partial(readings, simulator, sensors) if sensors else None
+    for state in played(frames, simulator, substeps, settings.data, trials, begin, inputs_at, read):
         seen.append(markers(state.q))
+        loads.append(state.memory_of(LOADS).get("loads", unread))
         report()
-    return {"markers": (torch.stack(seen, 1).cpu().numpy(), "m")}
+    series = {"markers": (seen, "m"), "loads": (loads, "N, N m")}
+    return {name: (torch.stack(values, 1).cpu().numpy(), unit) for name, (values, unit) in series.items()}

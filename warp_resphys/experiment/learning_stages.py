@@ -225,6 +225,8 @@ def evaluate(context: StageContext, workers: Workers = ALONE) -> None:
     with atomic_hdf5(context.run_dir / ROLLOUTS, "rollouts", attributes) as file:
         for model, values in compared.simulated.items():
             create(file, f"{model}_observed", values, "m", time_axis=1)
+        for model, values in compared.loads.items():
+            create(file, f"{model}_loads", values, "N, N m", time_axis=1)
         for model in compared.models:
             create(file, f"{model}_film", compared.film(model), "m")
         create(file, "film_steps", compared.film_steps)

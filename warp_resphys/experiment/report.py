@@ -59,6 +59,7 @@ from .files import (
     fold_folder,
     read_if_there,
 )
+from .force_curves import force_curves
 
 
 def make_report(context: StageContext) -> None:
@@ -192,8 +193,7 @@ class RunReader:
     @cached_property
     def scaled(self) -> Trials | None:
         """Trials with scaled inputs, if there are any."""
-        path = self.common / SCALED_DATASET
-        return Trials.read(path) if path.is_file() else None
+        return Trials.read(path) if (path := self.common / SCALED_DATASET).is_file() else None
 
     def report(self) -> RunReport:
         """Returns all data of the page."""
@@ -204,8 +204,7 @@ class RunReader:
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
         assert run.tip is not None
         names = {name for result in identification.values() for name in result.parameters}
-        files = training_files(self.folder, run)
-        histories = {model: read_if_there(path).get("epochs") for model, path in files.items()}
+        histories = ((m, read_if_there(path).get("epochs")) for m, path in training_files(self.folder, run).items())
         return RunReport(
             metrics=metrics,
             settings=run,
@@ -220,13 +219,14 @@ class RunReader:
             film=self.film,
             driven=self.driven,
             recordings=self.recordings(*self._at_rest()),
+            forces=force_curves(self.folder, run, self.dataset, trials.names, [*trials.positions]),
             identification=identification,
             actuator=read_actuator(self.folder) if run.with_actuator else {},
             **(self._stretches(metrics["law"]) if "law" in metrics else {}),
             start=configured_parameters(build_simulator(run, run.simulation), sorted(names)),
             truth={name: value for name, value in material.items() if name != "model"} | true_contact(run),
             true_material=material.get("model", "corotated"),
-            training={model: epochs for model, epochs in histories.items() if epochs},
+            training={model: epochs for model, epochs in histories if epochs},
             followed=self._followed(),
         )
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import islice, repeat
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -38,10 +38,12 @@ from ..settings.stage_keys import StageSettings
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import states
 from ..stepping.rotations import twisted
-from ..stepping.state import State
+from ..stepping.state import Constants, State
 from .build import build_body, build_simulator, whole_mesh
 from .files import DATASET
 
+LOADS: Final = "sensors"  # owner of the readings in the memory of a state
+Read = Callable[[State, State, Inputs, Constants], torch.Tensor]
 _LARGEST_DISTANCE = 0.2  # of a vertex from the cell of the other mesh that it is extrapolated from, over its diagonal
 
 
@@ -184,6 +186,7 @@ def played(
     trials: Sequence[Trial],
     begin: State,
     inputs_at: Callable[[int, float], Inputs] = lambda number, share: Inputs(),
+    read: Read | None = None,
 ) -> Iterator[State]:
     """Yields the states at the frames of bodies that stand in for real ones.
 
@@ -195,6 +198,7 @@ def played(
         trials: trials of the part.
         begin: state of the first frame.
         inputs_at: inputs besides motions, at a share of the time from a frame to the next.
+        read: returns readings (B, S, 6) of force sensors after a step, which states have in their memory (`LOADS`).
     """
     times = simulator.time_step * np.arange((frames - 1) * substeps + 1)
     base, obstacles = true_motions(data, trials, times)
@@ -212,7 +216,8 @@ def played(
         # Inputs are taken at the end of a step, or in its middle.
         share = (i + 1 - 0.5 * (simulator.integrator == "midpoint")) / substeps
         now = inputs_at(frame, share).replace(**{name: values[number + 1] for name, values in moving.items()})
-        return simulator.step(state, now, constants)
+        new = simulator.step(state, now, constants)
+        return new if read is None else new.with_memory({"loads": read(new, state, now, constants)}, LOADS)
 
     if substeps:
         yield from islice(states(step, begin, range((frames - 1) * substeps)), 0, None, substeps)

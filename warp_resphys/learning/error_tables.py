@@ -30,6 +30,7 @@ class ForceErrors(TypedDict):
     """Errors of the readings of a force sensor."""
 
     unit: str
+    size: float  # mean size of the force in the same frames, without its zero
     models: dict[str, ErrorSummary]
 
 
@@ -134,7 +135,12 @@ class ComparedModels:
                 known = [row[at & ~np.isnan(row)] for row, at in zip(away, counts, strict=True)]
                 if any(map(len, known)):
                     models[model] = summarise(row for row in known if len(row))
-            found[name] = {"unit": sensor.unit, "models": models}
+            size = sensor.distances(torch.zeros_like(read), read, times).numpy()
+            found[name] = {
+                "unit": sensor.unit,
+                "size": float(np.nanmean(np.where(counts, size, np.nan))),
+                "models": models,
+            }
         return found
 
     def _by_horizon(self, test: Mapping[str, FloatArray], observed: FloatArray) -> dict[str, dict[str, ErrorSummary]]:

@@ -29,8 +29,8 @@ from .parameters import split_name
 from .placement import PlacedMarkers, PlainPlacements, placement_of
 from .release import begin_inputs, estimate_release
 from .replay import Replay
-from .resampling import at_steps, later
 from .scores import HeldOutTest
+from .sensing import at_steps, later
 from .start import Start
 from .trial_batch import TrialBatch
 

@@ -25,6 +25,7 @@ from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
 from .residuals.correction import equilibrium_under_feedback
+from .sensing import readings
 from .start import Start
 from .trial_batch import TrialBatch
 
@@ -214,20 +215,8 @@ class Replay:
         return points, loads
 
     def read(self, after: State, before: State | None, inputs: Inputs, constants: Constants) -> torch.Tensor:
-        """Returns the readings (B, S, 6) of the sensors at the end of a step, differentiable [N, N m].
-
-        Args:
-            after: state at the end.
-            before: state at the start; None for an equilibrium.
-            inputs: during the step.
-            constants: from `prepare`.
-        """
-        rest, readings = self.simulator.rest_positions, list[torch.Tensor]()
-        for sensor in self.trials.sensors:
-            reaction = self.simulator.reaction(after, sensor.at, before, inputs, constants)
-            stands = isinstance(sensor.at, str) and sensor.at in self.simulator.energies.obstacle_names
-            readings.append(sensor(reaction, None if stands else rest[reaction.vertices]))
-        return torch.stack(readings, 1) if readings else after.q.new_zeros(after.batch, 0, 6)
+        """Returns `readings` of the sensors of the trials."""
+        return readings(self.simulator, self.trials.sensors, after, before, inputs, constants)
 
     def _first_reading(self, start: Start, state: State, resting: Inputs, constants: Constants) -> torch.Tensor:
         """Returns the readings (B, S, 6) of the initial state, NaN where no equilibrium led there [N, N m]."""

@@ -16,7 +16,7 @@ from .evaluation import used_frames
 from .observed_motions import ObservedMotions
 from .plain_trials import PlainTrials
 from .release import least_delays
-from .resampling import at_steps
+from .sensing import at_steps
 from .trial_batch import TrialBatch
 
 _SETTLED: Final = 0.2  # share of a motion at its end, in which a released body is about at rest

@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from statistics import fmean
 from typing import NotRequired, TypedDict
 
 import numpy as np
@@ -170,6 +171,18 @@ class TrialResults:
 
 
 @dataclass(frozen=True, eq=False)
+class ForceCurve:
+    """A component of the force of a sensor in the test trial in which it is largest."""
+
+    trial: str
+    axis: str  # Such as fz.
+    unit: str
+    times: FloatArray  # (T,) [s].
+    measured: FloatArray  # (T,) without the zero and drift that the last model leaves.
+    models: Mapping[str, FloatArray]  # (T,) by model.
+
+
+@dataclass(frozen=True, eq=False)
 class Film:
     """Motion of the bodies in one test trial."""
 
@@ -234,6 +247,7 @@ class RunReport:
     film: Film | None = None  # Motion of the bodies in one of them.
     driven: Driven | None = None  # Inputs of all trials.
     recordings: Recordings | None = None  # Quality and registration of all trials.
+    forces: Mapping[str, ForceCurve] = field(default_factory=dict)  # By sensor.
     identification: Mapping[str, Identification] = field(default_factory=dict)  # By model.
     actuator: Mapping[str, InputNetwork] = field(default_factory=dict)  # Learned changes of inputs, by input.
     stretches: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # Least and largest, by kind of trial.
@@ -280,6 +294,19 @@ def other_trials(settings: RunSettings) -> tuple[str, ...]:
 def folds_in(metrics: Metrics) -> list[Metrics]:
     """Returns the metrics of each fold, or those of a split alone."""
     return [*metrics.get("folds", {}).values()] or [metrics]
+
+
+def force_errors(metrics: Metrics) -> dict[str, tuple[str, float, dict[str, float]]]:
+    """Unit, mean size of the force and mean errors by model of each force sensor, of those without a diverged trial."""
+    found = dict[str, tuple[str, float, dict[str, float]]]()
+    folds = [fold["forces"] for fold in folds_in(metrics) if "forces" in fold]
+    for name in folds[0] if folds else ():
+        tables = [fold[name] for fold in folds]
+        shared = [model for model in tables[0]["models"] if all(model in table["models"] for table in tables)]
+        means = {model: [table["models"][model]["mean"] for table in tables] for model in shared}
+        known = {model: fmean(x for x in of if x is not None) for model, of in means.items() if None not in of}
+        found[name] = tables[0]["unit"], fmean(table["size"] for table in tables), known
+    return found
 
 
 def trial_errors(metrics: Metrics, others: Collection[str] = (), outside: bool = False) -> Errors:

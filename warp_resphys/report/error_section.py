@@ -10,7 +10,7 @@ from ..io.arrays import BoolArray, FloatArray
 from ..io.errors import listed, number_of
 from ..learning.metrics import median_filter
 from . import figures
-from .data import MeshCheck, RunReport, grouped_errors
+from .data import ForceCurve, MeshCheck, RunReport, force_errors, grouped_errors
 from .page import Canvas, Part, Text
 from .sections import model_table, numbers
 from .wording import MODELS, TONES, largest_text, mm_text, number_text, unbroken
@@ -46,6 +46,17 @@ def error_section(data: RunReport, canvas: Canvas) -> Part | None:
         shown = [label for label in trials.labels if any(label in markers for markers in by_model.values())]
         by_label = {label: {m: markers.get(label) for m, markers in by_model.items()} for label in shown}
         blocks.append(model_table("Each marker [mm]", numbers(by_label), metrics["errors_mm"]))
+    if forces := force_errors(metrics):
+        for name, curve in data.forces.items():
+            alt = f"{curve.axis} of {name} over time in the test trial {curve.trial}, measured and of the models."
+            blocks.append(
+                canvas.figure(f"force_{name}", force_over_time(name, curve), alt, f"Test trial {curve.trial}.")
+            )
+        by_sensor = {
+            f"{name} [{unit}], of {size:.3g} {unit}": {**known} for name, (unit, size, known) in forces.items()
+        }
+        note = "Mean error of the force, beside its mean size; without zero and drift, where the sensor has them."
+        blocks.append(model_table("Force", numbers(by_sensor), metrics["errors_mm"], note))
     if by_phase := metrics.get("phases"):
         rows = {
             phase.capitalize(): {m: summary["mean"] for m, summary in models.items()}
@@ -120,6 +131,18 @@ def error_over_time(
         figures.use_logarithm(axes, 0.4 * min(lowest, default=0.0))  # Cuts off the small errors at the start.
     every[0, 0].set_ylabel(f"mean {of} error [mm]")
     figures.legend_above(figure, every[0, 0])
+    return figure
+
+
+def force_over_time(name: str, curve: ForceCurve) -> Figure:
+    """Draws a measured component of a force, and those of the models."""
+    figure = figures.new_figure(3.0)
+    axes = figure.subplots()
+    for model, values in curve.models.items():
+        axes.plot(curve.times, values, **figures.model_line(model))
+    axes.plot(curve.times, curve.measured, color="black", linewidth=0.9, label="measured", zorder=3)
+    axes.set(xlabel="time [s]", ylabel=f"{name}.{curve.axis} [{curve.unit}]", xlim=(curve.times[0], curve.times[-1]))
+    figures.legend_above(figure, axes)
     return figure
 
 

@@ -14,7 +14,7 @@ from ..learning.baselines import BASELINES
 from ..learning.metrics import Gain, mean_interval, paired_gain
 from ..settings.learning import IdentifySettings
 from ..settings.run import RunSettings
-from .data import Errors, Metrics, folds_in, grouped_errors, missing_baselines, unused
+from .data import Errors, Metrics, folds_in, force_errors, grouped_errors, missing_baselines, unused
 from .identification_section import first_frames_text, in_sentence, with_unit
 from .page import Cell, PageTable, Row
 from .wording import mm_text, model_words, number_text, share_text, unbroken
@@ -79,7 +79,7 @@ def best_pair(known: Known) -> tuple[str, str]:
 
 
 def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
-    """Returns the mean errors, with a column for each group of test trials and each factor of the inputs.
+    """Returns the mean errors, with a column for each group of test trials, factor of the inputs and force sensor.
 
     Of the models without physics, the best one of each column is shown. The metrics are of a split or of folds.
     """
@@ -94,6 +94,10 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
             columns[title] = {model: Cell(number_text(summary["mean"])) for model, summary in errors.items()}
             means = {m: mean for m in BASELINES if m in errors and (mean := errors[m]["mean"]) is not None}
             plain[title] = min(means, key=means.__getitem__, default="")
+    for name, (unit, _, of_models) in force_errors(metrics).items():
+        title = f"{name} [{unit}]"
+        columns[title] = {model: Cell(number_text(mean)) for model, mean in of_models.items()}
+        plain[title] = min((m for m in BASELINES if m in of_models), key=of_models.__getitem__, default="")
     last = next(reversed(groups.values()), {})
     best, mark = best_of(known_errors(last, idle), _RANKED), "best beyond the training" if len(groups) > 1 else "best"
     rows = []

@@ -103,6 +103,7 @@ class BagSettings(Settings):
     markers: dict[str, Word] = setting(description="topics by name of the marker; poses are rigid bodies")
     inputs: Many[Word] = setting((), "topics with units: '/pressure#1 [mbar]'")
     base: Word | None = setting(None, "topic of the pose of the base")
+    loads: dict[str, Word] = setting({}, "topics of forces and moments (WrenchStamped) by name of the sensor")
     rate: Positive | None = setting(None, "rate of the frames; null: that of the first marker", "Hz")
 
 

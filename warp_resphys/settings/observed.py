@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from ..io.classes import ClassSettings
-from ..io.settings import Many, Positive, Settings, Vector, Word, setting
+from ..io.settings import Many, NotNegative, Positive, Settings, Some, Vector, Word, setting
 from .mesh import Place
 from .performed import CORNERS, Axis, different
 
@@ -34,6 +34,30 @@ class RigidBodySettings(Settings):
     def length(self) -> float:
         """Length that an error of one radian counts as [m]."""
         return self.position_deviation / math.radians(self.orientation_deviation)
+
+
+class ForceSensorSettings(Settings):
+    """A load cell or force-torque sensor, whose readings are columns such as ``load.fz [N]`` of the recordings."""
+
+    at: Word | None = setting(None, "fixed region that it holds, or obstacle that it carries; null: all fixed vertices")
+    axes: Annotated[Some[Literal["fx", "fy", "fz", "tx", "ty", "tz"]], AfterValidator(different)] = setting(
+        ("fx", "fy", "fz"), "forces and moments that it measures"
+    )
+    noise: Positive = setting(description="standard deviation of a force", unit="N")
+    moment_noise: Positive | None = setting(None, "standard deviation of a moment", "N m")
+    origin: Vector = setting((0.0, 0.0, 0.0), "point about which moments are measured, on the body at rest", "m")
+    rotation: Vector = setting(
+        (0.0, 0.0, 0.0), "rotation vector of its axes in the frame of the body at rest", "degrees"
+    )
+    on_body: bool = setting(False, "readings are forces on the body, such as a testing machine's, not on the sensor")
+    zero: NotNegative = setting(0.0, "standard deviation of its unknown zero in each trial, over the noise")
+    drift: NotNegative = setting(0.0, "standard deviation of the drift of the zero per second, over the noise", "1/s")
+
+    @model_validator(mode="after")
+    def _has_noise(self) -> Self:
+        if self.moment_noise is None and any(axis.startswith("t") for axis in self.axes):
+            raise ValueError("axes names moments: give moment_noise, in N m, as well.")
+        return self
 
 
 class BindingSettings(Settings):

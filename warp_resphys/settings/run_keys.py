@@ -24,7 +24,7 @@ from .learning import (
     TrainingSettings,
 )
 from .mesh import Place
-from .observed import BindingSettings, MarkerSettings
+from .observed import BindingSettings, ForceSensorSettings, MarkerSettings
 from .performed import MotionSettings, by_file
 from .pictures import PictureData
 from .played import LaboratorySettings, ShapeSettings
@@ -78,6 +78,9 @@ class RunKeys(SimulatorSettings):
     data: DataSettings
     markers: MarkerSettings | None = setting(
         None, "observed markers; null: every vertex is observed, as in simulations"
+    )
+    sensors: dict[str, ForceSensorSettings] = setting(
+        {}, "force sensors, by the name of their readings in the recordings"
     )
     laboratory: LaboratorySettings | None = setting(
         None, "simulation that stands in for the real body where there are no recordings"

@@ -39,10 +39,10 @@ def keys_of(group: str, settings: type[Settings]) -> tuple[str, ...]:
 
 SIMULATOR: Final = tuple(SimulatorSettings.model_fields)
 BATCH: Final = "parallel.batch"
-IMPORTED: Final = (*SIMULATOR, "simulation", "markers", *keys_of("data", ReadingSettings))
+IMPORTED: Final = (*SIMULATOR, "simulation", "markers", "sensors", *keys_of("data", ReadingSettings))
 # Keys of a simulated laboratory.
 PLAYED: Final = (
-    *("gravity", "time_step", "solver", "device", "seed", "tip"),
+    *("gravity", "time_step", "solver", "device", "seed", "tip", "sensors"),
     *keys_of("laboratory", PlaySettings),
     *keys_of("markers", BindingSettings),
     *keys_of("data", ReadingSettings),
@@ -50,7 +50,7 @@ PLAYED: Final = (
 # Keys of all stages of a split, and of all with networks.
 LEARNING: Final = (
     *SIMULATOR,
-    *("simulation", "markers", "release", "force_frame", "identify", "law", "actuator"),
+    *("simulation", "markers", "sensors", "release", "force_frame", "identify", "law", "actuator"),
     *("data.payload_at", "data.seconds", "data.train_fraction", BATCH),
 )
 NETWORKS: Final = ("actuation", "range_guard")

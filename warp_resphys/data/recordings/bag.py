@@ -57,10 +57,11 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     markers = [_Source(path, text, _pose) for text in bag.markers.values()]
     inputs = [_Source(path, text, _input) for text in bag.inputs]
     base = None if bag.base is None else _Source(path, bag.base, _pose)
+    wrenches = {name: _Source(path, text, _wrench) for name, text in bag.loads.items()}
     if not markers:
         raise InputError("data.bag.markers is empty: name a topic for every marker.")
     factors = [source.factor for source in inputs]
-    sources = [*markers, *inputs, *([] if base is None else [base])]
+    sources = [*markers, *inputs, *([] if base is None else [base]), *wrenches.values()]
     with _opened(path) as reader:
         there = {connection.topic for connection in reader.connections}
         for topic in sorted({source.topic for source in sources} - there):
@@ -85,6 +86,7 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     for source in inputs:
         stamps, values = source.series(late)
         columns.append(values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0])
+    loads = {name: _between(*source.series(late), times) for name, source in wrenches.items()}
     poses = None if base is None else _at_frames(*base.series(late), times, rate)
     return Recording(
         (*bag.markers,),
@@ -94,6 +96,7 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
         np.stack(columns, 1) * factors if columns else None,
         base=None if poses is None else since_first(poses[:, :3], poses[:, 3:], path),
         turns=moved[..., 3:] if np.isfinite(moved[..., 3:]).any() else None,
+        loads=loads,
     )
 
 
@@ -247,6 +250,22 @@ def _input(source: _Source, kind: str, message: Any) -> Sequence[float] | None:
         f"{source.path}: {source.topic} has messages of the type {kind}, which hold no input: inputs are numbers and "
         "arrays of numbers (std_msgs), JointState and FluidPressure."
     )
+
+
+def _wrench(source: _Source, kind: str, message: Any) -> Sequence[float]:
+    """Returns force and moment [N, N m]."""
+    wrench = getattr(message, "wrench", message)
+    if not (hasattr(wrench, "force") and hasattr(wrench, "torque")):
+        raise DataFileError(
+            f"{source.path}: {source.topic} has messages of the type {kind}, which hold no force: readings of force "
+            "sensors are Wrench and WrenchStamped."
+        )
+    return [float(getattr(part, axis)) for part in (wrench.force, wrench.torque) for axis in "xyz"]
+
+
+def _between(times: FloatArray, values: FloatArray, frames: FloatArray) -> FloatArray:
+    """Values (T, C) at the frames, linear between messages, NaN before the first and after the last."""
+    return np.stack([np.interp(frames, times, column, np.nan, np.nan) for column in values.T], 1)
 
 
 def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tuple[FloatArray, float]:

@@ -4,6 +4,7 @@ A cell that is empty or NaN is an occlusion.
 """
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from ...io.arrays import FloatArray, IntArray
 from ...io.errors import DataFileError
 from ...io.text import Rows, number
-from .recording import Recording
+from ..force_sensors import AXES as FORCES
+from ..force_sensors import UNITS
+from .recording import SI_PER_LOAD_UNIT, Recording
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +30,8 @@ _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
 _LONGEST_GAP = 3.0  # median intervals between lines, through which coordinates of uneven times are interpolated
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
+
+_LOAD = re.compile(r"(?P<name>.+)\.(?P<axis>[ft][xyz])", re.IGNORECASE)  # of a force sensor
 
 Place = tuple[str, str, int]  # label, axis and column of a coordinate
 # Names of the k columns with the rotation of a rigid body, and a function of their numbers (T, k) that returns
@@ -58,6 +63,7 @@ class Layout:
         rate: of the frames [Hz], where there is no time; with times, that at which these are sampled again, as they are
             uneven.
         channels: factors to SI units of the columns of the actuation.
+        loads: name, index in `force_sensors.AXES` and factor to SI units of the columns of force sensors.
         planar: whether a coordinate that no marker has a column for is zero.
         turn: how rotations are given.
     """
@@ -70,6 +76,7 @@ class Layout:
     seconds: float | None = None
     rate: float | None = None
     channels: Mapping[int, float] = field(default_factory=dict)
+    loads: Mapping[int, tuple[str, int, float]] = field(default_factory=dict)
     planar: bool = False
     turn: Turn = QUATERNION
 
@@ -78,7 +85,7 @@ class Layout:
         markers, chosen, turned = self._markers(path)
         others = [column for columns in turned.values() for column in columns]
         others += [] if self.clock is None else [self.clock]
-        known = sorted({*chosen, *others, *self.channels} - {-1})
+        known = sorted({*chosen, *others, *self.channels, *self.loads} - {-1})
         read, lines = self._numbers(rows, known, path)
         values = np.zeros((len(read), max(known, default=0) + 2))  # The last column stays zero, for planar markers.
         values[:, known] = read
@@ -105,6 +112,9 @@ class Layout:
             actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
         positions = np.full((frames[-1] + 1, len(markers), 3), np.nan)  # NaN in frames that were not recorded
         positions[frames] = values[:, chosen].reshape(len(values), -1, 3)
+        loads = {name: np.full((len(positions), len(FORCES)), np.nan) for name, *_ in self.loads.values()}
+        for column, (name, axis, factor) in self.loads.items():
+            loads[name][frames, axis] = factor * values[:, column]
         turns = np.full((*positions.shape[:2], 4), np.nan)
         for marker, columns in turned.items():
             try:
@@ -118,6 +128,7 @@ class Layout:
             start=float(stamps[0]) if timed else 0.0,
             unit=self.unit or "",
             turns=turns if turned else None,
+            loads=loads,
         )
 
     def _even(
@@ -203,6 +214,26 @@ class Layout:
         if len(values) < _LEAST_FRAMES:
             raise DataFileError(f"{path} holds {len(values)} frames: a recording needs two or more.")
         return np.array(values, dtype=np.float64), lines
+
+
+def load_of(head: str, unit: str | None, path: Path) -> tuple[str, int, float] | None:
+    """Returns the sensor, index in `force_sensors.AXES` and factor to SI units of a column; None for another column.
+
+    Raises:
+        DataFileError: it has no unit of a force or moment.
+    """
+    if (match := _LOAD.fullmatch(head)) is None:
+        return None
+    name, axis = match["name"], match["axis"].lower()
+    kind, factor = SI_PER_LOAD_UNIT.get(unit or "", ("", 0.0))
+    if kind != axis[0]:
+        given = "no unit" if unit is None else f"the unit '{unit}'"
+        known = ", ".join(word for word, (of, _) in SI_PER_LOAD_UNIT.items() if of == axis[0])
+        raise DataFileError(
+            f"{path}: the column {head} of a force sensor has {given}: give one of {known} in brackets, as in "
+            f"'{head} [{UNITS[axis]}]'."
+        )
+    return name, FORCES.index(axis), factor
 
 
 def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatArray:

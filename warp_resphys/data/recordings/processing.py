@@ -88,8 +88,12 @@ def resample(recording: Recording, rate: float) -> Recording:
         actuation = np.stack([np.interp(new, old, channel) for channel in recording.actuation.T], axis=1)
     base = None if recording.base is None else at_times(recording.base, old, new)
     moved = {name: at_times(poses, old, new) for name, poses in recording.obstacles.items()}
+    loads = {
+        name: np.stack([np.interp(new, old, axis) for axis in readings.T], axis=1)  # NaN beside NaN
+        for name, readings in recording.loads.items()
+    }
     resampled = dataclasses.replace(recording, positions=positions, actuation=actuation, base=base, rate=float(rate))
-    return dataclasses.replace(resampled, obstacles=moved)
+    return dataclasses.replace(resampled, obstacles=moved, loads=loads)
 
 
 def smooth(recording: Recording, cutoff: float) -> Recording:

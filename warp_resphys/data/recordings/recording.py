@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ...io.arrays import BoolArray, Brief, FloatArray
 from ...io.errors import DataFileError, InputError, listed, number_of
+from ..force_sensors import AXES
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +26,8 @@ _UNLABELLED = re.compile(
     r"(?:.*:)?\*|unlabell?ed|uname|[\d ]*$", re.IGNORECASE
 )  # as Vicon and OptiTrack name trajectories
 # Factors to SI units; 1 for an actuation without a unit.
+SI_PER_LOAD_UNIT = {"N": ("f", 1.0), "mN": ("f", 1e-3), "kN": ("f", 1e3)}  # of forces, and of moments
+SI_PER_LOAD_UNIT |= {"N m": ("t", 1.0), "Nm": ("t", 1.0), "N mm": ("t", 1e-3), "mN m": ("t", 1e-3)}
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
 LEAST_SPAN = 1e-3  # [m]
@@ -54,6 +57,8 @@ class Recording(Brief):
     start: float = 0.0  # Time of the first frame [s]; after `trim_to_release`, since the release
     # (T, 6) motions of obstacles, if recorded; see `data.obstacle_motion`
     obstacles: Mapping[str, FloatArray] = dataclasses.field(default_factory=dict)
+    # (T, 6) readings of force sensors by name [N, N m] (`data.force_sensors`), NaN where there is none
+    loads: Mapping[str, FloatArray] = dataclasses.field(default_factory=dict)
     unit: str = "m"  # of positions and rest
     # (T, M, 4) quaternions, w first, of those markers that are rigid bodies; NaN for others; None after `in_metres`
     turns: FloatArray | None = None
@@ -88,9 +93,9 @@ class Recording(Brief):
     def frames(self, chosen: slice) -> "Recording":
         """Returns some of the frames, with rate and start unchanged."""
         actuation, base = (None if series is None else series[chosen] for series in (self.actuation, self.base))
-        obstacles = {name: poses[chosen] for name, poses in self.obstacles.items()}
-        positions = self.positions[chosen]
-        return dataclasses.replace(self, positions=positions, actuation=actuation, base=base, obstacles=obstacles)
+        obstacles, loads = ({n: x[chosen] for n, x in named.items()} for named in (self.obstacles, self.loads))
+        kept = dataclasses.replace(self, positions=self.positions[chosen], actuation=actuation, base=base)
+        return dataclasses.replace(kept, obstacles=obstacles, loads=loads)
 
 
 def length_unit(text: str) -> str:
@@ -180,6 +185,9 @@ def _check_shapes(recording: Recording) -> None:
         raise DataFileError(
             f"{path}: actuation has the shape {driven.shape}; it needs a row for each of the {shape[0]} frames."
         )
+    for name, readings in recording.loads.items():
+        if readings.shape != (wanted := (shape[0], len(AXES))):
+            raise DataFileError(f"{path}: the readings of {name!r} have the shape {readings.shape}, not {wanted}.")
     if driven is not None and not np.isfinite(driven).all():
         raise DataFileError(f"{path}: an actuation is NaN or infinite; every frame needs one.")
     if not np.isfinite(recording.start):

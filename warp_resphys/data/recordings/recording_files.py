@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ...io.arrays import FloatArray
 from ...io.decoding import Arrays, decode
-from ...io.errors import DataFileError, DecodingError, InputError
+from ...io.errors import DataFileError, DecodingError, InputError, listed
 from ...io.safe_files import FORMAT, atomic_hdf5, create, hdf5_error, read_arrays
 from ...io.text import decoded
 from ...settings.data_kinds import BagSettings, TableSettings
@@ -21,7 +21,8 @@ from .text_exports import read_text_export
 
 _KIND = "recording"
 _UNITS = {"positions": "units", "actuation": "actuation_units"}
-_NAMES = ("positions", "labels", "rate_hz", "actuation", "rest", "base", "start", "quaternions", *_UNITS.values())
+_SENSED = ("positions", "actuation", "quaternions", "loads", "sensors")
+_NAMES = (*_SENSED, "labels", "rate_hz", "rest", "base", "start", *_UNITS.values())
 _C3D_MAGIC = 0x50
 _SGI_PROCESSOR = 86
 
@@ -84,6 +85,9 @@ def write_recording(path: str | Path, recording: Recording, attributes: Mapping[
             create(file, "rest", recording.rest, units="m")
         if recording.actuation is not None:
             create(file, "actuation", recording.actuation, units="1")
+        if recording.loads:
+            create(file, "loads", np.stack([*recording.loads.values()], 1), units="N, N m")
+            file.attrs["sensors"] = [*recording.loads]
         if recording.base is not None:
             quaternions = Rotation.from_rotvec(recording.base[:, 3:]).as_quat()[:, [3, 0, 1, 2]]
             create(file, "base", np.concatenate([recording.base[:, :3], quaternions], axis=1), units="m, 1")
@@ -127,7 +131,7 @@ def _read_hdf5(path: Path) -> Recording:
 
 def _assembled(arrays: Arrays, path: Path) -> Recording:
     """Returns the recording of arrays of the layout, by name."""
-    words = ("labels", *_UNITS.values())
+    words = ("labels", "sensors", *_UNITS.values())
     found = {name: numbers(arrays, name, path) for name in _NAMES if name in arrays and name not in words}
     for name in ("rate_hz", "start"):
         if name in found and found[name].size != 1:
@@ -140,6 +144,13 @@ def _assembled(arrays: Arrays, path: Path) -> Recording:
             )
         with np.errstate(over="ignore"):
             found["actuation"] = found["actuation"] * SI_PER_ACTUATION_UNIT[unit]
+    sensors = [_text(name) for name in np.ravel(arrays["sensors"])] if "sensors" in arrays else []
+    loads = found.get("loads", np.zeros((0, len(sensors), 6)))
+    if loads.ndim != 3 or loads.shape[1] != len(sensors):
+        raise DataFileError(
+            f"{path}: loads has the shape {loads.shape}, and sensors names {listed(sensors) or 'none'}: loads are "
+            "(frames, sensors, 6), forces and moments of each sensor [N, N m], NaN where they were not measured."
+        )
     positions, base = numbers(arrays, "positions", path), found.get("base")
     if base is not None and base.shape != (len(positions), 7):
         raise DataFileError(
@@ -157,6 +168,7 @@ def _assembled(arrays: Arrays, path: Path) -> Recording:
         start=found["start"].item() if "start" in found else 0.0,
         unit=_word(arrays, "units") or "m",
         turns=found.get("quaternions"),
+        loads={name: loads[:, number] for number, name in enumerate(sensors)},
     )
 
 

@@ -21,15 +21,14 @@ from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, did_you_mean, listed
 from ...io.text import Rows, number, read_rows
 from ...settings.data_kinds import TableSettings
-from .columns import AXES, QUATERNION, Layout, Place, Turn, is_data, quaternions
+from .columns import AXES, QUATERNION, Layout, Place, Turn, is_data, load_of, quaternions
 from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, Recording, hide_zeros, length_unit, without_subject
 
 log = logging.getLogger(__name__)
 
 Columns = Mapping[int, tuple[str, str | None]]  # names and units by number
 
-# A column in a length is a misspelt marker rather than an actuation.
-_CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]
+_CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]  # not of misspelt markers
 _TIMES = ("time", "t", "timestamp", "zeit", "temps", "tiempo", "tempo")
 _FRAMES = ("frame", "frame#", "frames", "frame number", "frame_number", "index", "sample")
 _SECONDS = {
@@ -48,8 +47,7 @@ _FORMS = (  # of names of coordinates; all but the first need a second axis besi
     re.compile(r"(?P<label>.*)(?P<axis>[xyz])", re.IGNORECASE),  # tipX, x
 )
 _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "NO_OF_BODIES", "FREQUENCY", "MARKER_NAMES")
-_ANGLES = ("roll", "pitch", "yaw")
-_MATRIX = tuple(f"rot[{entry}]" for entry in range(9))
+_ANGLES, _MATRIX = ("roll", "pitch", "yaw"), tuple(f"rot[{entry}]" for entry in range(9))
 _VICON = ("Trajectories", "Objects", "Devices", "Joints", "Model Outputs", "Segments")  # sections
 _VICON_AXES = {"tx": "x", "ty": "y", "tz": "z"} | {axis: axis for axis in (*AXES, "rx", "ry", "rz", "rw")}
 
@@ -135,7 +133,7 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
 def _read_table(
     rows: Rows, first: int, columns: Columns, accepted: Sequence[str], width: int, path: Path, rate: float | None = None
 ) -> Recording:
-    """Reads columns `time [s]` or `frame`, `<marker>.x`, `.y` and `.z`, of a rigid body `.qw` to `.qz`, and channels.
+    """Reads columns `time [s]` or `frame`, `<marker>.x` to `.z`, of rigid bodies `.qw`, forces `.fx`, and channels.
 
     Args:
         rows: all lines.
@@ -164,8 +162,11 @@ def _read_table(
                 f"{path} gives its time in '{unit}': it must be in s, ms, us, ns or iso, as in 'time [s]'."
             )
     places, units, channels, coordinates = list[Place](), set[str](), dict[int, float](), _coordinates(columns)
+    loads = dict[int, tuple[str, int, float]]()
     for column, (name, unit) in columns.items():
-        if column in coordinates:
+        if (load := load_of(name, unit, path)) is not None:
+            loads[column] = load
+        elif column in coordinates:
             label, axis = coordinates[column]
             places.append((label, axis, column))
             units |= {unit} if unit and axis in AXES else set()
@@ -183,7 +184,7 @@ def _read_table(
             )
     if len(units) > 1:
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
-    layout = Layout(first, width, places, next(iter(units), None), clock, seconds, rate, channels=channels, planar=True)
+    layout = Layout(first, width, places, next(iter(units), None), clock, seconds, rate, channels, loads, planar=True)
     return layout.read(rows, path)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...data.base_motion import at_times, check_steps
+from ...data.force_sensors import AXES, UNITS
 from ...data.input_response import NO_INPUT
 from ...data.recordings.marker_quality import Quality, quality
 from ...data.recordings.processing import smooth
@@ -267,8 +268,31 @@ def _dataset(recorded: RegisteredTrials, bound: FloatArray, shifts: FloatArray, 
         base=_motion(recorded, "the base", [r.base for r in recorded.moving], at_steps) if moved else None,
         obstacles=obstacles,
         sessions=sessions if any(sessions) else (),
+        loads=_loads(recorded, times.shape[1]),
         **driven,
     )
+
+
+def _loads(recorded: RegisteredTrials, frames: int) -> dict[str, FloatArray]:
+    """(R, T, 6) readings of each force sensor at the frames [N, N m], NaN where there is none.
+
+    Raises:
+        DataFileError: no recording has readings of a sensor, or of one of its axes.
+    """
+    found = dict[str, FloatArray]()
+    for name, sensor in recorded.settings.sensors.items():
+        found[name] = np.full((len(recorded.moving), frames, len(AXES)), np.nan)
+        for row, moving in enumerate(recorded.moving):
+            if name in moving.loads:
+                read = moving.loads[name][:frames]
+                found[name][row, : len(read)] = read
+        for axis in sensor.axes:
+            if not np.isfinite(found[name][..., AXES.index(axis)]).any():
+                raise DataFileError(
+                    f"sensors.{name} measures {axis}, but no recording has it: name its column "
+                    f"'{name}.{axis} [{UNITS[axis]}]' (docs/recordings.md), or take it out of sensors.{name}.axes."
+                )
+    return found
 
 
 def _series(

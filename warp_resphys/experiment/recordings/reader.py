@@ -243,6 +243,7 @@ class Reader:
         else:
             assert trial.file is not None
             recording = read_recording(trial.file, data.units, data.rate, trial.labels, data.table, data.bag)
+        recording = replace(recording, loads={n: x for n, x in recording.loads.items() if n in self.settings.sensors})
         lengths = {name: body.length for name, body in self.markers.rigid_bodies.items() if trial.has(name)}
         recording = with_corners(recording, lengths)
         seconds = _HELD_SECONDS if trial.is_released else data.rest_seconds

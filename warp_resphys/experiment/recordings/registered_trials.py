@@ -1,6 +1,7 @@
 """Recorded trials: time zero, registration to the frame of the body, inputs, and motions of base and obstacles."""
 
 import logging
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -143,7 +144,9 @@ class RegisteredTrials(Reader):
             frames = max(round(POSE_SECONDS * moving.rate), 1)
             last = _central(moving.frames(slice(-frames, None)), tracked, np.median, "is held")
             driven = None if driven is None else np.median(driven[-frames:], axis=0)[None]
-            moving = replace(moving, positions=last[None], actuation=driven, obstacles={})
+            with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # axes that are not measured
+                loads = {name: np.nanmedian(x[-frames:], axis=0)[None] for name, x in moving.loads.items()}
+            moving = replace(moving, positions=last[None], actuation=driven, obstacles={}, loads=loads)
         return moving, rest, trial.payload == 0.0 and not loaded
 
     def _released(self, trial: Trial, recording: Recording, release: Release) -> tuple[Recording, FloatArray, bool]:

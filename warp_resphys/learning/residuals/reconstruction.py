@@ -38,7 +38,7 @@ from ...stepping.rollout import states
 from ...stepping.state import State
 from ..metrics import mean_distance
 from ..observed_motions import Identified, ObservedMotions
-from ..resampling import loads_at_steps
+from ..sensing import loads_at_steps
 from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Read, StepProblem
 
 log = logging.getLogger(__name__)

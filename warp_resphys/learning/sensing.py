@@ -1,11 +1,46 @@
-"""What was observed at the frames of trials, at the steps of a simulator."""
+"""What was observed at the frames of trials, at the steps of a simulator; readings of force sensors in a step."""
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.force_sensors import ForceSensor
+from ..dynamics.simulator import Simulator
+from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample
+from ..stepping.state import Constants, State
 from .trial_batch import TrialBatch
+
+
+def readings(
+    simulator: Simulator,
+    sensors: Sequence[ForceSensor],
+    after: State,
+    before: State | None,
+    inputs: Inputs,
+    constants: Constants,
+) -> torch.Tensor:
+    """Returns the readings (B, S, 6) of force sensors at the end of a step, differentiable [N, N m].
+
+    Args:
+        simulator: of the step.
+        sensors: the S sensors.
+        after: state at the end.
+        before: state at the start; None for an equilibrium.
+        inputs: during the step.
+        constants: of the simulator.
+
+    Raises:
+        InputError: a sensor is on nothing that holds or touches the body.
+    """
+    found = list[torch.Tensor]()
+    for sensor in sensors:
+        reaction = simulator.reaction(after, sensor.at, before, inputs, constants)
+        stands = isinstance(sensor.at, str) and sensor.at in simulator.energies.obstacle_names
+        found.append(sensor(reaction, None if stands else simulator.rest_positions[reaction.vertices]))
+    return torch.stack(found, 1) if found else after.q.new_zeros(after.batch, 0, 6)
 
 
 def later(series: torch.Tensor, delay: torch.Tensor, step: float) -> torch.Tensor:

@@ -34,6 +34,15 @@ TENTACLE += ("data.trials=null", f"+data.trials={{{POSES}}}", "data.validation=[
 PRIOR = "prior: {mean: 1.0, deviation: 0.1}"
 
 CASES = {
+    ("experiment=finger_force",): [
+        (r"^sensors\.load\.at: the body has no region 'lid': its mesh has no regions\.$", "sensors.load.at=lid"),
+        (r"sensors\.load\.axes names moments: give moment_noise, in N m, as well", "sensors.load.axes=[fz,tx]"),
+        (r"sensors\.load\.axes", "sensors.load.axes=[fw]"),
+        (r"sensors\.load\.noise", "sensors.load.noise=0"),
+    ],
+    ("experiment=beam_oscillation", "+sensors.load={noise: 0.01}"): [
+        (r"^sensors are read from recordings: set sensors to \{\}, or take data\.kind recorded\.$", "seed=1")
+    ],
     tuple(TINY): [
         ("the mesh is", "simulation.density=1e30"),
         ("fixed is null, and obstacles has none that the body lies on", "fixed=null"),

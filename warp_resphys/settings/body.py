@@ -70,12 +70,16 @@ class RegionMaterialSettings(_Parameters):
     model: Word | None = setting(None, "constitutive model; a different one has its own parameters alone")
 
 
+def _of_material(schema: dict[str, Any]) -> None:
+    """Lets editors accept the parameters of any material, and the name of a silicone."""
+    schema["additionalProperties"] = {"anyOf": [{"type": "number"}, {"type": "null"}]}
+    schema["properties"]["name"] = {"type": "string", "description": "of the silicone, where the model is silicone"}
+
+
 class MaterialSettings(_Parameters):
     """A material and its parameters, in SI units, as `energies.materials` lists them; null takes one out."""
 
-    model_config = ConfigDict(
-        json_schema_extra={"additionalProperties": {"anyOf": [{"type": "number"}, {"type": "null"}]}}
-    )
+    model_config = ConfigDict(json_schema_extra=_of_material)
 
     model: Word = Field(
         "corotated",

@@ -181,21 +181,25 @@ def reaction_of(
     """
     if not len(fixed := workspace.fixed):
         return None
-    gradient = gradient.to(x)
-    if torch.is_grad_enabled():
-        values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
-        gradient = _FixedGradient.apply(workspace, gradient, x, terms.target, terms.inertia, terms.force, *values)
-    places = x[:, fixed]
-    inertia = terms.inertia[:, fixed, None] * (places - terms.target[:, fixed])
     force = terms.force if loads is None else terms.force + loads
-    return Reaction(fixed, gradient + inertia - force[:, fixed], places)
+    values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
+    tensors = gradient.to(x), x, terms.target, terms.inertia, force
+    forces = _FixedForces.apply(workspace, *tensors, *values) if torch.is_grad_enabled() else _held(fixed, *tensors)
+    return Reaction(fixed, forces, x.index_select(1, fixed))
 
 
-class _FixedGradient(AdjointFunction):
-    """g = sum_e dE_e / dx at the fixed vertices, known from the solve, and its adjoint.
+def _held(fixed: torch.Tensor, gradient: Any, x: Any, target: Any, inertia: Any, force: Any) -> torch.Tensor:
+    """Returns the reaction (B, D, 3) [N] from the gradient of the energies there (equation of the module)."""
+    held: torch.Tensor = gradient + (inertia[..., None] * (x - target) - force).index_select(1, fixed)
+    return held
 
-    For a loss with derivatives z by g, zero at other vertices, dL/dx = K z and dL/dtheta = z . dg/dtheta, with the
-    stiffness K at x and the values theta of the energies.
+
+class _FixedForces(AdjointFunction):
+    """r = k (x - y) - f + sum_e dE_e / dx at the fixed vertices, whose last part is known from the solve; its adjoint.
+
+    For a loss with derivatives z by r, zero at other vertices, dL/dx = K z + k z, dL/dy = -k z, dL/dk = z . (x - y),
+    dL/df = -z and dL/dtheta = z . dg/dtheta, with the stiffness K at x, the gradient g of the energies, and their
+    values theta.
     """
 
     @override
@@ -203,7 +207,7 @@ class _FixedGradient(AdjointFunction):
     def forward(ctx: Any, workspace: Workspace, known: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
         ctx.workspace = workspace
         ctx.save_for_backward(*tensors)
-        return known.clone()
+        return _held(workspace.fixed, known, *tensors[:4])
 
     @override
     @staticmethod
@@ -211,6 +215,7 @@ class _FixedGradient(AdjointFunction):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         tensors: list[Any] = [None if tensor is None else tensor.detach() for tensor in ctx.saved_tensors]
         x, *terms = tensors
+        z = torch.zeros_like(x).index_copy(1, ctx.workspace.fixed, gradient)
         by_position, _, _, _, *by_values = ctx.needs_input_grad[2:]
         names = ctx.workspace.potential.value_names
 
@@ -218,8 +223,7 @@ class _FixedGradient(AdjointFunction):
             potential, mine = workspace.potential, StepTerms.of(names, *(_rows(tensor, rows) for tensor in terms))
             potential.set_terms(mine)
             potential.positions.copy_(x[rows])
-            along = torch.zeros_like(potential.positions)
-            along[:, workspace.fixed] = gradient[rows].double()
+            along = z[rows].double()
             if by_position:
                 potential.update_tangent()
             slopes = _by_values(potential, names, mine, by_values, along)
@@ -230,7 +234,10 @@ class _FixedGradient(AdjointFunction):
         product, *slopes = (
             _join_gradients(*pair) for pair in zip((x, *terms[3:]), zip(*found, strict=True), strict=True)
         )
-        return None, None, product, None, None, None, *slopes
+        target, inertia, *_ = terms
+        stiff = inertia[..., None] * z
+        product = None if product is None else product + stiff
+        return None, None, product, -stiff, (z * (x - target)).sum(-1), -z, *slopes
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:

@@ -76,6 +76,11 @@ class Reaction(Brief):
         rows = [place[vertex] for vertex in chosen]
         return Reaction(self.vertices[rows], self.forces[..., rows, :], self.places[..., rows, :])
 
+    def select(self, environments: Sequence[int]) -> "Reaction":
+        """Returns those of some environments, by number, as constants."""
+        rows = [*environments]
+        return Reaction(self.vertices, *(x.detach()[..., rows, :, :] for x in (self.forces, self.places)))
+
 
 @dataclass(frozen=True)
 class State:

@@ -268,7 +268,12 @@ def test_an_environment_that_diverges_has_no_reaction_and_the_other_keeps_its_ow
 
 def test_wrong_places_are_refused():
     simulator = swinging()
-    refuses(InputError, "no step of a body with fixed vertices led to this", simulator.reaction, simulator.rest_state())
+    refuses(
+        InputError,
+        "no step of a body with fixed vertices or symmetry planes led to this",
+        simulator.reaction,
+        simulator.rest_state(),
+    )
     state = simulator.step(simulator.rest_state())
     refuses(InputError, "no region 'roof': its mesh has no regions", simulator.reaction, state, "roof")
     whole, some = simulator.reaction(state), simulator.fixed[[3, 0, 5]]

@@ -101,10 +101,10 @@ class World(ABC, Generic[S]):
 
 
 def total_force(simulator: Simulator, state: State, at: str | None = None) -> FloatArray:
-    """Returns the force (B, 3) of the reaction, of one body of a scene if it is named [N]; zero where it is unknown."""
+    """Returns the force (B, 3) on fixed vertices, of a body of a scene if it is named [N]; zero where it is unknown."""
     if state.reaction is None:
         return np.zeros((state.batch, 3))
-    return np.nan_to_num(simulator.reaction(state, at).force.detach().double().cpu().numpy())
+    return np.nan_to_num(simulator.reaction(state, at or simulator.fixed).force.detach().double().cpu().numpy())
 
 
 class RobotWorld(World[State]):

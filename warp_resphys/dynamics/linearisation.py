@@ -68,7 +68,7 @@ class Linearisation:
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""
         hessian = self._workspace.hessian(self._name)
-        fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
+        fields = self._coordinates.restrict(self._coordinates.reduce(right.unflatten(1, (-1, 3))))
         with threads_for(self._unknowns):
             solution = None
             if hessian.kept is not None and not self._has_factor:

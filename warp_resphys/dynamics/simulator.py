@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ..energies.contact.barrier import ContactForces
 from ..energies.materials import Corotated, Material
 from ..fem.bodies import Body
+from ..fem.coordinates import SymmetryPlane
 from ..io.errors import InputError
 from ..io.machine import find_device
 from ..io.settings import parse
@@ -240,24 +241,29 @@ class Simulator:
         with problem.workspace.potential.lock:
             return self.energies.contacts(problem.step, after.q)
 
-    def reaction(self, state: State | Motion, at: str | ArrayLike | None = None) -> Reaction:
-        """Returns what holds the fixed vertices in the step or equilibrium that led to a state, differentiable.
+    def reaction(self, state: State | Motion, at: str | SymmetryPlane | ArrayLike | None = None) -> Reaction:
+        """Returns what holds the body in the step or equilibrium that led to a state, differentiable.
 
         Args:
             state: state from `step` or `static_equilibrium`, or a motion from `rollout`, of which it is for every step.
-            at: a region of the mesh or a body of a scene, with vertices that it shares with others, or numbers of fixed
-                vertices; None: all of these.
+            at: fixed vertices: a region of the mesh or a body of a scene, with vertices that it shares with others, or
+                numbers; a symmetry plane, without fixed vertices in it; None: all of these.
 
         Raises:
             InputError: no step led to the state, or nothing holds the body there.
         """
         if state.reaction is None:
             raise InputError(
-                "no step of a body with fixed vertices led to this state, or it is a copy, as by `detach`: it has no "
-                "reaction."
+                "no step of a body with fixed vertices or symmetry planes led to this state, or it is a copy, as by "
+                "`detach`: it has no reaction."
             )
         if at is None:
             return state.reaction
+        if isinstance(at, SymmetryPlane):
+            vertices, shares = self.body.sliding_in(at)
+            there = state.reaction.at(vertices)
+            sizes = (self.tensor(shares) * there.forces).sum(-1, keepdim=True)
+            return replace(there, forces=sizes * self.tensor(at.normal))
         return state.reaction.at(self.body.fixed_in(at) if isinstance(at, str) else at)
 
     def is_held(

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 
 from ..energies.potential import StepTerms
 from ..stepping.inputs import Inputs
@@ -66,9 +67,10 @@ class TimeStep:
             return reaction
         mass, inputs = step.constants.mass, step.inputs
         mass = (mass if inputs.attached_mass is None else mass + inputs.attached_mass)[:, fixed, None]
-        velocity = (reaction.places - step.state.q[:, fixed]) / step.stage.step
+        velocity = (reaction.places[:, : len(fixed)] - step.state.q[:, fixed]) / step.stage.step
         excess = mass * (velocity - step.state.v[:, fixed]) / self.equations.time_step
-        return replace(reaction, forces=reaction.forces - excess)
+        sliding = reaction.forces.shape[1] - len(fixed)
+        return replace(reaction, forces=reaction.forces - F.pad(excess, (0, 0, 0, sliding)))
 
     def solve(self, near: torch.Tensor | None = None) -> State:
         """Returns the new state, differentiable, whose report says whether the solve has converged.

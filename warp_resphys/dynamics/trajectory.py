@@ -44,7 +44,7 @@ class Motion:
         lost: (T + 1, B) bool, whether the simulation has diverged.
         inputs: (T, B, C) commands of a robot, by name.
         units: unit and names of the C parts of the commands that drive actuators, by name.
-        reaction: what holds the fixed vertices in each of the T steps; None where it is not known.
+        reaction: what holds the body, as in `State`, in each of the T steps; None where it is not known.
     """
 
     q: torch.Tensor
@@ -143,7 +143,7 @@ class Motion:
             axis: ``x``, ``y`` or ``z``; by default the one with the largest displacement.
             environment: index of the environment.
             ax: matplotlib axes; a new figure if omitted.
-            reaction: whether the components of the total `reaction` are shown instead [N].
+            reaction: whether the components of the force that holds the fixed vertices are shown instead [N].
 
         Returns:
             The axes.
@@ -191,7 +191,7 @@ class Motion:
             environment: index of the environment.
             half_widths: whether columns with the half-widths of the markers' prediction intervals are added.
             reaction: whether columns ``load.fx [N]`` to ``load.tz [N m]`` are added, with the force that holds the
-                body, and its moment about the origin; empty at the start, to which no step led.
+                fixed vertices, and its moment about the origin; empty at the start, to which no step led.
 
         Raises:
             InputError: an unknown environment, or a motion without reaction.
@@ -253,9 +253,10 @@ class Motion:
 
     def _loads(self, environment: int) -> dict[str, FloatArray]:
         """Returns force [N] and moment about the origin [N m] of the reaction (T + 1,) by header, NaN at the start."""
-        if self.reaction is None:
+        if self.reaction is None or not len(self.body.fixed_vertices):
             raise InputError("this motion has no reaction: nothing holds the body at fixed vertices, or no step did.")
-        values = self._of(torch.cat([self.reaction.force, self.reaction.moment()], -1), environment)
+        clamp = self.reaction.at(self.body.fixed_vertices)
+        values = self._of(torch.cat([clamp.force, clamp.moment()], -1), environment)
         return dict(zip(_LOADS, np.concatenate([np.full((1, 6), np.nan), values]).T, strict=True))
 
     def _of(self, series: torch.Tensor, environment: int) -> FloatArray:

@@ -16,7 +16,7 @@ from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import Rigid
-from .coordinates import Coordinates, SymmetryPlane, dependence, rigid_weights
+from .coordinates import Coordinates, SymmetryPlane, dependence, plane_shares, rigid_weights
 from .integration_points import Discretisation, Points, discretise
 
 MASS_MODES = ("row_sum", "per_vertex")
@@ -246,6 +246,23 @@ class Body:
         if not len(found := np.intersect1d(self.fixed_vertices, named[part])):
             raise InputError(f"no vertex of {part!r} is fixed: fix some, or choose another region.")
         return found
+
+    def sliding_in(self, plane: SymmetryPlane) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Returns vertices (K,) that slide in a symmetry plane, which gives c . f of a force f on them, and c (K, 3).
+
+        Raises:
+            InputError: the body has no such plane, or all of its vertices are fixed.
+        """
+        vertices, shares = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
+        for _, member, first in self.members:
+            if plane in member.symmetry:
+                sliding = member.coordinates.sliding
+                inside = sliding[plane.contains(member.vertices[sliding])]
+                vertices.append(first + inside)
+                shares.append(plane_shares(member.symmetry, plane, member.vertices[inside]))
+        if not sum(map(len, vertices)):
+            raise InputError(f"no vertex slides in a symmetry plane {plane}: choose one of the body's `symmetry`.")
+        return np.concatenate(vertices), np.concatenate(shares)
 
     @cached_property
     def discretisation(self) -> Discretisation:

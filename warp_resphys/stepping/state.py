@@ -94,8 +94,8 @@ class State:
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
     # of the step that led here; None for other states, and for copies by `map`, such as `detach`
     report: SolveReport | None = field(default=None, compare=False)
-    # at the fixed vertices, in the step or equilibrium that led here; None for others. NaN in environments that were
-    # reset (`where`), and meaningless where the solve failed
+    # at the fixed vertices, and normal to symmetry planes at those that slide in them, in the step or equilibrium that
+    # led here; None for others. NaN in environments that were reset (`where`), and meaningless where the solve failed
     reaction: Reaction | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:

@@ -9,7 +9,7 @@ r"""Times the simulator on this machine: medians over repeats that take turns, b
     python scripts/benchmark.py twin RUN engine=reduced              a twin on the trials of a run
     python scripts/benchmark.py gripper
     python scripts/benchmark.py mounts --substeps 1 5               robots on arms, over robots alone
-    python scripts/benchmark.py reactions --repeats 40              forces of clamps, over the same step without
+    python scripts/benchmark.py reactions --repeats 400             forces of clamps, over the same step without
     python scripts/benchmark.py peers --programs newton mujoco        a block in contact, at equal error
 
 Results are printed as tables, and added to a JSON file of the machine, where they replace those of the same subcommand.

@@ -5,7 +5,6 @@ than 0.1 % of a step, are in both.
 """
 
 import argparse
-import gc
 from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from typing import Any, Final
@@ -54,7 +53,6 @@ def _pair(settings: RunSettings, simulator: Simulator, steps: int) -> Callable[[
     device, stiffness = start.q.device, simulator.tensor([settings.simulation.values[modulus]])
 
     def timed() -> dict[str, float]:
-        gc.collect()
         began = now(device)
         with torch.no_grad():
             simulator.rollout(start, steps, inputs)

@@ -192,10 +192,16 @@ def test_a_rigid_clamp_is_held_by_the_name_of_its_region():
     mesh = replace(BEAM, regions={"base": base, "rest": np.setdiff1d(np.arange(len(BEAM.cells)), base)})
     body = Body(mesh, fixed=np.unique(mesh.cells[base]), rigid={"base": Rigid(density=2000.0)})
     simulator = Simulator(body, SILICONE, relative_tolerance=1e-12)
-    state, constants = simulator.static_equilibrium(), simulator.prepare()
+    state = simulator.static_equilibrium()
     reaction = simulator.reaction(state, "base").force[0]
-    weight = 9.80709 * float(constants.load_mass.sum())
+    weight = 9.80709 * 0.1 * 0.03 * 0.02 * (2000.0 + 5.0 * 1070.0) / 6.0  # its own, too
     assert reaction.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-10, abs=1e-10 * weight)
+    moved = simulator.rest_positions[simulator.fixed] + simulator.tensor([1e-3, 0.0, 0.0])
+    after = simulator.step(state, Inputs(fixed_positions=moved[None]))
+    constants = simulator.prepare()
+    rate = (constants.mass[..., None] * (after.v / simulator.time_step + 0.5 * after.v)).sum(1)[0]  # with mass damping
+    pushed = simulator.reaction(after, "base").force[0] - rate
+    assert pushed.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-9, abs=1e-9 * weight)
     tip = replace(mesh, regions={"tip": np.setdiff1d(np.arange(len(BEAM.cells)), base)[-2:]})
     other = Simulator(clamped(tip), SILICONE)
     refuses(InputError, "no vertex of 'tip' is fixed", other.reaction, other.step(other.rest_state()), "tip")

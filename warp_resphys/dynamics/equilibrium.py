@@ -191,8 +191,8 @@ def reaction_of(
 
 def _held(workspace: Workspace, gradient: Any, x: Any, target: Any, inertia: Any, force: Any) -> torch.Tensor:
     """Returns the reaction (B, D + R, 3) [N] from the gradient of the energies there (equation of the module)."""
-    offset = inertia[..., None] * (x - target) - force
-    return _exerted(workspace, gradient + offset.index_select(1, workspace.held))
+    acting = torch.addcmul(force, inertia[..., None], target - x)
+    return _exerted(workspace, gradient - acting.index_select(1, workspace.held))
 
 
 def _exerted(workspace: Workspace, forces: torch.Tensor) -> torch.Tensor:

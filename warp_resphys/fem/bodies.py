@@ -364,5 +364,8 @@ class Body:
 
     @cached_property
     def attached_mass(self) -> NDArray[np.float64]:
-        """(N,) mass of the attached weights [kg]."""
-        return sum((m.per_vertex(self.n_vertices) for m in self.point_masses), np.zeros(self.n_vertices))
+        """(N,) mass of the attached weights, and of rigid parts that are fixed, which only clamps feel [kg]."""
+        mass = sum((m.per_vertex(self.n_vertices) for m in self.point_masses), np.zeros(self.n_vertices))
+        for name in self.rigid.keys() - self.controls.keys():
+            mass = mass + self.rigid[name].density * self.load_volume[:, self.mesh.region(name)].sum(axis=1)
+        return mass

@@ -29,9 +29,9 @@ def measure_reactions(arguments: argparse.Namespace) -> dict[str, Any]:
     """Times a step of every body with and without its reaction.
 
     Returns:
-        Of every body, medians of a step with the reaction [ms]: without gradients (plain), with them, in the backward
-        pass of a loss on the last state, and in that of a loss on the reactions too; what the reaction adds to the
-        first three [%]; and the time of the yardstick.
+        Of every body, medians of a step with the reaction [ms]: without gradients (plain), of the forward pass with
+        them, of it and the backward pass of a loss on the last state (gradient), and of the backward pass of a loss on
+        the reactions too; what the reaction adds to the first three [%]; and the time of the yardstick.
     """
     rows, yardsticks = list[dict[str, Any]](), list[float]()
     for name in arguments.bodies:
@@ -62,7 +62,7 @@ def _pair(settings: RunSettings, simulator: Simulator, steps: int) -> Callable[[
         forward, loss = now(device) - began, motion.q[-1].square().sum() + motion.v[-1].square().sum()
         began = now(device)
         torch.autograd.grad(loss, leaf, retain_graph=True)
-        times = {"plain_ms": plain, "forward_ms": forward, "backward_ms": now(device) - began}
+        times = {"plain_ms": plain, "forward_ms": forward, "gradient_ms": forward + now(device) - began}
         if motion.reaction is not None:
             began = now(device)
             torch.autograd.grad(loss + motion.reaction.forces.square().sum(), leaf)

@@ -31,6 +31,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.learning.residuals.correction import CorrectedSimulator
 from warp_resphys.mesh import find_chambers
 from warp_resphys.settings.body import Rigid
+from warp_resphys.stepping.rollout import rollout
 
 BEAM = box_hexahedra(size=(0.1, 0.03, 0.02), divisions=(6, 2, 2))
 SILICONE = Corotated(264e3, 0.45, density=1070.0, stiffness_damping=5e-3, mass_damping=0.5, prony=[(0.3, 0.05)])
@@ -220,6 +221,10 @@ def test_a_motion_has_the_reaction_of_every_step():
         torch.testing.assert_close(reaction.force[number], now.force)
         torch.testing.assert_close(reaction.moment((0.0, 0.01, 0.0))[number], now.moment((0.0, 0.01, 0.0)))
     assert Simulator(Body(BEAM), SILICONE).rollout(start, 1).reaction is None
+    balance = simulator.static_equilibrium(pull)
+    observed = rollout(lambda now, _: simulator.step(now, pull), balance, range(2), lambda now: now.reaction.force)
+    for force in observed:  # an equilibrium stays
+        torch.testing.assert_close(force, simulator.reaction(balance).force, rtol=0.0, atol=1e-8)
 
 
 def test_gradients_of_an_equilibrium_with_friction_of_a_tendon():

@@ -204,10 +204,21 @@ def inertia_residual(
 
 @wp.kernel
 def project(
+    active: wp.array[int],  # (B) zero: the environment keeps what was removed
     vertices: wp.array[int],  # (R)
     projections: wp.array[wp.mat33d],  # (R)
+    first: int,  # zero: what is removed is added to what was removed before
     vectors_out: wp.array2d[wp.vec3d],  # (B, N)
+    removed_out: wp.array2d[wp.vec3d],  # (B, N)
 ):
     """Removes the components of vectors that are normal to symmetry planes."""
     b, r = wp.tid()
-    vectors_out[b, vertices[r]] = projections[r] * vectors_out[b, vertices[r]]
+    i = vertices[r]
+    vector = vectors_out[b, i]
+    kept = projections[r] * vector
+    vectors_out[b, i] = kept
+    if active[b] != 0:
+        removed = vector - kept
+        if first == 0:
+            removed += removed_out[b, i]
+        removed_out[b, i] = removed

@@ -9,6 +9,7 @@ r"""Times the simulator on this machine: medians over repeats that take turns, b
     python scripts/benchmark.py twin RUN engine=reduced              a twin on the trials of a run
     python scripts/benchmark.py gripper
     python scripts/benchmark.py mounts --substeps 1 5               robots on arms, over robots alone
+    python scripts/benchmark.py reactions --repeats 400             forces of clamps, over the same step without
     python scripts/benchmark.py peers --programs newton mujoco        a block in contact, at equal error
 
 Results are printed as tables, and added to a JSON file of the machine, where they replace those of the same subcommand.
@@ -27,7 +28,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
-from benchmarks import gripper, mounted, peers, steps, twin_rate
+from benchmarks import gripper, mounted, peers, reactions, steps, twin_rate
 
 from warp_resphys.commands import USER_ERROR
 from warp_resphys.dynamics.nonlinear_solver import SOLVERS
@@ -119,6 +120,10 @@ def command_line() -> argparse.ArgumentParser:
     arms.set_defaults(measure=mounted.measure_mounts)
     arms.add_argument("--batches", nargs="+", type=int, default=[1], help="numbers of arms (default: 1)")
     arms.add_argument("--substeps", nargs="+", type=int, default=[1, 5], help="of MuJoCo in a step (default: 1 5)")
+    clamps = parts.add_parser("reactions", parents=[shared], help="forces of clamps, over steps without them")
+    clamps.set_defaults(measure=reactions.measure_reactions)
+    clamps.add_argument("--bodies", nargs="+", choices=reactions.BODIES, default=[*reactions.BODIES])
+    clamps.add_argument("--steps", type=int, default=20, help="of a roll-out (default: %(default)s)")
     other = parts.add_parser("peers", parents=[shared], help="beside Newton and MuJoCo, at equal error")
     other.set_defaults(measure=peers.measure_peers)
     other.add_argument("--programs", nargs="*", choices=["newton", "mujoco"], default=["newton", "mujoco"])

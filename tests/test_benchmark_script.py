@@ -94,6 +94,18 @@ def test_a_twin_follows_the_trials_of_a_run(finished, measured, capsys):
     assert "engine is 'half'" in capsys.readouterr().err
 
 
+def test_a_step_without_its_reaction(measured):
+    words = ("mesh.divisions=[2,1,1]", "--bodies=beam", "--steps=2", "--repeats=1")
+    (row,) = measured("reactions", *words)["a step with the reaction"]
+    assert (row["body"], row["unknowns"], row["fixed_vertices"]) == ("beam", 24, 4)
+    times = {f"{name}_ms" for name in ("plain", "forward", "gradient", "backward_of_reactions")}
+    assert all(row[name] > 0.0 for name in times)
+    assert {name for name in row if name.endswith("cost_percent")} == {
+        f"{name}_cost_percent"
+        for name in ("plain", "forward", "gradient")  # steps without have no reactions
+    }
+
+
 @pytest.mark.slow
 def test_all_grippers_hold_the_ball_and_nothing_crosses(measured):
     result = measured("gripper", "--batches=2", "--repeats=1")

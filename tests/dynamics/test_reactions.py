@@ -31,6 +31,7 @@ from warp_resphys.io.errors import InputError
 from warp_resphys.learning.residuals.correction import CorrectedSimulator
 from warp_resphys.mesh import find_chambers
 from warp_resphys.settings.body import Rigid
+from warp_resphys.stepping.rollout import rollout
 
 BEAM = box_hexahedra(size=(0.1, 0.03, 0.02), divisions=(6, 2, 2))
 SILICONE = Corotated(264e3, 0.45, density=1070.0, stiffness_damping=5e-3, mass_damping=0.5, prony=[(0.3, 0.05)])
@@ -192,10 +193,16 @@ def test_a_rigid_clamp_is_held_by_the_name_of_its_region():
     mesh = replace(BEAM, regions={"base": base, "rest": np.setdiff1d(np.arange(len(BEAM.cells)), base)})
     body = Body(mesh, fixed=np.unique(mesh.cells[base]), rigid={"base": Rigid(density=2000.0)})
     simulator = Simulator(body, SILICONE, relative_tolerance=1e-12)
-    state, constants = simulator.static_equilibrium(), simulator.prepare()
+    state = simulator.static_equilibrium()
     reaction = simulator.reaction(state, "base").force[0]
-    weight = 9.80709 * float(constants.load_mass.sum())
+    weight = 9.80709 * 0.1 * 0.03 * 0.02 * (2000.0 + 5.0 * 1070.0) / 6.0  # its own, too
     assert reaction.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-10, abs=1e-10 * weight)
+    moved = simulator.rest_positions[simulator.fixed] + simulator.tensor([1e-3, 0.0, 0.0])
+    after = simulator.step(state, Inputs(fixed_positions=moved[None]))
+    constants = simulator.prepare()
+    rate = (constants.mass[..., None] * (after.v / simulator.time_step + 0.5 * after.v)).sum(1)[0]  # with mass damping
+    pushed = simulator.reaction(after, "base").force[0] - rate
+    assert pushed.tolist() == pytest.approx([0.0, 0.0, weight], rel=1e-9, abs=1e-9 * weight)
     tip = replace(mesh, regions={"tip": np.setdiff1d(np.arange(len(BEAM.cells)), base)[-2:]})
     other = Simulator(clamped(tip), SILICONE)
     refuses(InputError, "no vertex of 'tip' is fixed", other.reaction, other.step(other.rest_state()), "tip")
@@ -214,6 +221,10 @@ def test_a_motion_has_the_reaction_of_every_step():
         torch.testing.assert_close(reaction.force[number], now.force)
         torch.testing.assert_close(reaction.moment((0.0, 0.01, 0.0))[number], now.moment((0.0, 0.01, 0.0)))
     assert Simulator(Body(BEAM), SILICONE).rollout(start, 1).reaction is None
+    balance = simulator.static_equilibrium(pull)
+    observed = rollout(lambda now, _: simulator.step(now, pull), balance, range(2), lambda now: now.reaction.force)
+    for force in observed:  # an equilibrium stays
+        torch.testing.assert_close(force, simulator.reaction(balance).force, rtol=0.0, atol=1e-8)
 
 
 def test_gradients_of_an_equilibrium_with_friction_of_a_tendon():
@@ -268,7 +279,12 @@ def test_an_environment_that_diverges_has_no_reaction_and_the_other_keeps_its_ow
 
 def test_wrong_places_are_refused():
     simulator = swinging()
-    refuses(InputError, "no step of a body with fixed vertices led to this", simulator.reaction, simulator.rest_state())
+    refuses(
+        InputError,
+        "no step of a body with fixed vertices or symmetry planes led to this",
+        simulator.reaction,
+        simulator.rest_state(),
+    )
     state = simulator.step(simulator.rest_state())
     refuses(InputError, "no region 'roof': its mesh has no regions", simulator.reaction, state, "roof")
     whole, some = simulator.reaction(state), simulator.fixed[[3, 0, 5]]

@@ -44,6 +44,24 @@ def test_a_series_for_paraview_has_every_step(trajectory, tmp_path):
     assert np.allclose(held.sum(0), trajectory.reaction.force[2, 0].numpy())
 
 
+def test_a_table_and_a_plot_have_force_and_moment_of_the_clamp(trajectory, tmp_path):
+    plain = trajectory.write_csv(tmp_path / "beam.csv").read_text().splitlines()[0].split(",")
+    path = trajectory.write_csv(tmp_path / "loads.csv", reaction=True)
+    titles = ["load.fx [N]", "load.fy [N]", "load.fz [N]", "load.tx [N m]", "load.ty [N m]", "load.tz [N m]"]
+    assert path.read_text().splitlines()[0].split(",") == [*plain, *titles]
+    loads = np.genfromtxt(path, delimiter=",", skip_header=1)[:, -6:]
+    assert np.isnan(loads[0]).all()
+    expected = torch.cat([trajectory.reaction.force, trajectory.reaction.moment()], -1)[:, 0].numpy()
+    np.testing.assert_allclose(loads[1:], expected, rtol=1e-11)
+    axes = trajectory.plot(reaction=True)
+    assert axes.get_ylabel() == "reaction [N]"
+    for column, line in enumerate(axes.lines):
+        np.testing.assert_allclose(line.get_ydata()[1:], expected[:, column])
+    plt.close(axes.figure)
+    free = Simulator(Body(MESH))
+    refuses(InputError, "has no reaction", free.rollout(free.rest_state(), 1).write_csv, path, reaction=True)
+
+
 PLATE = Box(position=(0.09, 0.01, -0.015), edges=(0.02, 0.04, 0.02), moves=True)
 BALL = Sphere(position=(0.05, 0.01, -0.05), radius=0.01)
 

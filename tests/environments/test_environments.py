@@ -172,6 +172,21 @@ def test_a_failure_in_any_step_of_an_action_ends_the_episode():
     assert rewards[2][0] == -10.0
     assert rewards[3][0] == 0.0  # The next step resets it.
     np.testing.assert_allclose(infos[3]["error_mm"][0], 1e3 * np.linalg.norm(robots.task.goals[0, 0]))
+    for given, said in ({"forces": True}, "forces need a simulator"), ({"squeeze": 0.1}, "squeeze is for fingers"):
+        refuses(InputError, said, RobotVectorEnv, Brittle(), robots.task, mapping, np.eye(3), 6, **given)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["simulator", "laboratory"])
+def test_the_force_at_the_base_is_the_weight_at_rest_and_observed_last(folder, world):
+    plain, felt = (make_vector("reach", folder, 2, world=world, **QUICK, forces=forces) for forces in (False, True))
+    (seen, rewards, _), (more, same, _) = played(plain), played(felt)
+    np.testing.assert_array_equal(more[..., :-3], seen)
+    np.testing.assert_array_equal(rewards, same)
+    begun = np.linalg.norm(more[[0, 5], :, -3:], axis=-1)  # in the first steps of two episodes
+    np.testing.assert_allclose(begun, 9.80709 / 9.81, rtol=1e-4)
+    assert np.abs(more[1:4, :, -3:] - more[0, :, -3:]).max() > 0.05
+    refuses(InputError, "forces need a simulator", make_vector, "reach", folder, 1, world="reduced", forces=True)
 
 
 class TestPictures:
@@ -309,6 +324,27 @@ def test_a_firm_grasp_lifts_the_ball_and_a_loose_one_does_not(fingers, world):
     firm, loose = errors[-1]
     assert firm < 8.0  # of 20 mm
     assert loose > 18.0
+
+
+@pytest.mark.slow
+def test_fingers_feel_the_ball_and_pay_for_a_squeeze(fingers):
+    plain, felt = (
+        make_vector("grasp", fingers, 1, "sysid", seconds=1.0, noise=0.0, forces=bool(cost), squeeze=cost)
+        for cost in (0.0, 0.2)
+    )
+    policy = ScriptedGrasp(1.0)
+    seen, more = plain.reset(seed=0)[0], felt.reset(seed=0)[0]
+    np.testing.assert_array_equal(more[:, -6:], 0.0)  # no step led to the start
+    for _ in range(plain.actions):
+        action = policy(seen)
+        (seen, reward, *_), (more, paid, *_) = plain.step(action), felt.step(action)
+        np.testing.assert_array_equal(more[:, :-6], seen)
+        left, right = more[0, -6:].reshape(2, 3).astype(np.float64)
+        excess = max(0.5 * (left - right)[0] - 0.5 / 0.8, 0.0)  # friction of 0.8 holds half of the ball
+        np.testing.assert_allclose(paid, reward - 0.2 * excess, atol=1e-5)
+    assert excess > 0.2
+    weight = float(felt.world._scene.constants.load_mass.sum()) / 0.01 * 9.80709 / 9.81
+    assert (left + right)[2] == pytest.approx(weight, rel=0.01)  # of the fingers and the ball in the air
 
 
 @pytest.mark.slow

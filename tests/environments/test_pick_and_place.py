@@ -78,13 +78,17 @@ def test_the_scripted_policy_lifts_the_ball_and_puts_it_down_at_its_goal(fingers
 
 @pytest.mark.slow
 def test_arms_are_what_they_are_alone_and_begin_anew(fingers):
-    together, alone = (make_vector("pick_and_place", fingers, n, "resphys", seconds=0.3, noise=0.0) for n in (3, 1))
+    together, alone = (
+        make_vector("pick_and_place", fingers, n, "resphys", seconds=0.3, noise=0.0, forces=True) for n in (3, 1)
+    )
     random = np.random.default_rng(0)
     first = together.reset(seed=0)[0]
     alone.reset(seed=1)
     for action in random.uniform(-1.0, 1.0, (4, 3, 7)).astype(np.float32):
         seen, own = together.step(action)[0], alone.step(action[1:2])[0]
-    np.testing.assert_allclose(seen[1], own[0], atol=1e-5)
+    np.testing.assert_allclose(seen[1, :-6], own[0, :-6], atol=1e-5)
+    np.testing.assert_allclose(seen[1, -6:], own[0, -6:], atol=1e-3 * np.abs(own[0, -6:]).max())
+    assert np.abs(own[0, -6:]).max() > 0.1
     assert np.abs(seen - first).max() > 0.1
     np.testing.assert_array_equal(together.reset(seed=0)[0], first)
 

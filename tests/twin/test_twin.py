@@ -315,6 +315,24 @@ def test_a_command_that_cannot_be_done_is_left_out(robot, swing):
     assert torch.equal(twin.now.state.q, same.now.state.q)
 
 
+def test_the_clamp_holds_the_estimated_body(robot, swing):
+    """As in the swing that is seen, of which the twin knows nothing but the markers."""
+    frames, _, motion = swing
+    rest = Twin(robot)
+    rest.take(0.0)
+    weight = robot.simulator.prepare().load_mass.sum() * torch.tensor(robot.simulator.gravity, dtype=torch.float64)
+    torch.testing.assert_close(rest.now.state.reaction.force[0], -weight, rtol=1e-5, atol=1e-7)
+    twin, true, seen = Twin(robot, noise=NOISE), motion.reaction.force[:, 0], []
+    for number, frame in enumerate(frames):
+        twin.take(number * robot.time_step, frame)
+        seen.append(robot.simulator.reaction(twin.now.state).force[0])
+    off = (torch.stack(seen)[31:] - true[30:]).norm(dim=1).mean()
+    assert float(off) < 0.1 * float((true[30:] - true.mean(0)).norm(dim=1).mean())
+    ahead = twin.ahead(3 * robot.time_step)
+    following = robot.rollout(motion.final, 3).reaction.force[-1, 0]
+    assert float((ahead.state.reaction.force[0] - following).norm()) < 0.1 * float(following.norm())
+
+
 def test_predictions_follow_a_plan_of_commands(robot):
     h, lifted = robot.time_step, [0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]
     fixed, rest = robot.simulator.body.fixed_vertices, robot.simulator.rest_positions

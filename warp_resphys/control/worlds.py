@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from ..coupling.mount import MountedState
 from ..data.registration import kabsch
+from ..dynamics.simulator import Simulator
 from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..experiment.build import build_body, simulation_device
 from ..experiment.files import REGISTRATION
@@ -36,6 +37,7 @@ _LEAST: Final = 1e-3  # lower bound of drawn positive parameters, relative to th
 _STREAM: Final = 7  # of the random number generator
 _BEFORE: Final = 1_000_000  # number of the first of the frames taken before the first step
 _LABORATORY: Final = "laboratory"
+G: Final = 9.81  # of the weights that are units of forces [m/s^2]
 
 
 S = TypeVar("S", State, ReducedState, MountedState)
@@ -68,6 +70,18 @@ class World(ABC, Generic[S]):
         moving = state.robot if isinstance(state, MountedState) else state
         return np.asarray(torch.as_tensor(moving.lost).cpu().numpy())
 
+    def forces(self, state: S) -> FloatArray:
+        """Forces (B, K) that hold the bodies at their fixed vertices over a weight; zero where no step led to a state.
+
+        Raises:
+            InputError: nothing in this world knows them.
+        """
+        raise InputError("forces need a simulator and fixed vertices: choose another world or robot.")
+
+    def squeeze(self, state: S) -> FloatArray:
+        """Forces (B,) of fingers beyond the least that holds a ball, over its weight, or raises InputError."""
+        raise InputError("squeeze is for fingers that hold a ball: choose grasp or pick_and_place.")
+
     def vary(self, random: Sequence[np.random.Generator]) -> None:
         """Draws new parameters, by a generator for each body; all bodies begin again afterwards."""
         del random
@@ -84,6 +98,13 @@ class World(ABC, Generic[S]):
     def obstacles(self) -> ObstacleSurface:
         """Surfaces of the obstacles that the bodies touch."""
         return ObstacleSurface()
+
+
+def total_force(simulator: Simulator, state: State, at: str | None = None) -> FloatArray:
+    """Returns the force (B, 3) on fixed vertices, of a body of a scene if it is named [N]; zero where it is unknown."""
+    if state.reaction is None:
+        return np.zeros((state.batch, 3))
+    return np.nan_to_num(simulator.reaction(state, at or simulator.fixed).force.detach().double().cpu().numpy())
 
 
 class RobotWorld(World[State]):
@@ -163,6 +184,13 @@ class RobotWorld(World[State]):
         return np.asarray(markers.double().cpu().numpy())
 
     @override
+    def forces(self, state: State) -> FloatArray:
+        simulator = self._nominal.simulator
+        if self._nominal.is_data_driven or not len(simulator.fixed):
+            return super().forces(state)
+        return total_force(simulator, state) / (G * float(simulator.prepare().load_mass.sum()))
+
+    @override
     def bodies(self, state: State) -> tuple[IntArray, FloatArray]:
         return boundary_triangles(self.robot.simulator.body.mesh), state.q.double().cpu().numpy()
 
@@ -234,6 +262,10 @@ class Laboratory(RobotWorld):
     @override
     def markers(self, state: State) -> FloatArray:
         return np.asarray(self._frame.apply(super().markers(state)))
+
+    @override
+    def forces(self, state: State) -> FloatArray:
+        return np.asarray(super().forces(state) @ self._frame.rotation.T)
 
     @override
     def bodies(self, state: State) -> tuple[IntArray, FloatArray]:

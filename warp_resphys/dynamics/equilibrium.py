@@ -1,12 +1,13 @@
 """Differentiable minimisation of an incremental potential, with an implicit adjoint, and the reactions there.
 
-At a fixed vertex i the potential (``energies.potential``) does not balance. Its gradient there,
+At a vertex i that is fixed, or slides in a symmetry plane, the potential (``energies.potential``) does not balance. Its
+gradient there, normal to the planes in the latter case,
 
     r_i = k_i (x_i - y_i) - f_i + sum_e dE_e / dx_i,
 
-is the force with which the clamp holds the vertex: that of the energies, damping included, the rate of change of the
-vertex's momentum, less its share of the loads and what energies add there (`BoundEnergy.load_at_fixed`). In a midpoint
-step, forces and places are those of its middle. What planes of symmetry, obstacles and guides in the world exert is not
+is the force with which the clamp or the planes hold the vertex: that of the energies, damping included, the rate of
+change of the vertex's momentum, less its share of the loads and what energies add there (`BoundEnergy.load_at_fixed`).
+In a midpoint step, forces and places are those of its middle. What obstacles and guides in the world exert is not
 included.
 """
 
@@ -58,7 +59,7 @@ def equilibrium(
 
     Returns:
         The last iterate, the solver's report, which says whether it converged (`check_converged`), and the gradient
-        (B, D, 3) of the energies at the fixed vertices, as numbers for `reaction_of` [N].
+        (B, D + R, 3) of the energies at the held vertices, as numbers for `reaction_of` [N].
     """
     problem = _Minimisation(workspace, purpose, settings, follows, workspace.potential.value_names)
     values = (terms.values[energy][name] for energy, name in problem.names)
@@ -68,8 +69,8 @@ def equilibrium(
     through_graph = needs_grad or forward_ad._current_level >= 0
     x: torch.Tensor = _Equilibrium.apply(problem, *tensors) if through_graph else problem.minimise(tensors)
     assert problem.report is not None
-    assert problem.fixed_gradient is not None
-    return x, problem.report, problem.fixed_gradient
+    assert problem.held_gradient is not None
+    return x, problem.report, problem.held_gradient
 
 
 @dataclass
@@ -82,10 +83,10 @@ class _Minimisation:
     follows: torch.Tensor | None
     names: Names  # of the values
     report: SolveReport | None = None
-    fixed_gradient: torch.Tensor | None = None  # (B, D, 3) of the energies, at the minimiser [N]
+    held_gradient: torch.Tensor | None = None  # (B, D + R, 3) of the energies, at the minimiser [N]
 
     def minimise(self, tensors: Sequence[torch.Tensor | None]) -> torch.Tensor:
-        """Returns the minimiser for a start, fixed positions and terms, and sets `report` and `fixed_gradient`."""
+        """Returns the minimiser for a start, fixed positions and terms, and sets `report` and `held_gradient`."""
         start, *others = (None if tensor is None else tensor.detach() for tensor in tensors)
         assert start is not None
 
@@ -101,7 +102,7 @@ class _Minimisation:
         results = _in_shards(self.workspace, prepare, work, start[0].numel())
         solutions, reports, gradients = zip(*results, strict=True)
         self.report = _joined(reports)
-        self.fixed_gradient = gradients[0] if len(results) == 1 else torch.cat(gradients)
+        self.held_gradient = gradients[0] if len(results) == 1 else torch.cat(gradients)
         return solutions[0] if len(results) == 1 else torch.cat(solutions)
 
     def differentiate(
@@ -170,32 +171,44 @@ class _Equilibrium(AdjointFunction):
 def reaction_of(
     workspace: Workspace, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor, loads: torch.Tensor | None = None
 ) -> Reaction | None:
-    """Returns the reaction at the fixed vertices in a solve, differentiable; None without such vertices.
+    """Returns the reaction at the held vertices in a solve, differentiable; None without such vertices.
 
     Args:
         workspace: of the batch.
         terms: of the solve.
         x: (B, N, 3) its solution [m].
-        gradient: (B, D, 3) of the energies at the fixed vertices, from `equilibrium` [N].
-        loads: (B, N, 3) further loads on the fixed vertices, from `EnergySet.loads_at_fixed` [N].
+        gradient: (B, D + R, 3) of the energies at the held vertices, from `equilibrium` [N].
+        loads: (B, N, 3) further loads on the held vertices, from `EnergySet.loads_at_fixed` [N].
     """
-    if not len(fixed := workspace.fixed):
+    if not len(held := workspace.held):
         return None
-    gradient = gradient.to(x)
-    if torch.is_grad_enabled():
-        values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
-        gradient = _FixedGradient.apply(workspace, gradient, x, terms.target, terms.inertia, terms.force, *values)
-    places = x[:, fixed]
-    inertia = terms.inertia[:, fixed, None] * (places - terms.target[:, fixed])
     force = terms.force if loads is None else terms.force + loads
-    return Reaction(fixed, gradient + inertia - force[:, fixed], places)
+    values = (terms.values[energy][name] for energy, name in workspace.potential.value_names)
+    tensors = gradient.to(x), x, terms.target, terms.inertia, force
+    forces = _HeldForces.apply(workspace, *tensors, *values) if torch.is_grad_enabled() else _held(workspace, *tensors)
+    return Reaction(held, forces, x.index_select(1, held))
 
 
-class _FixedGradient(AdjointFunction):
-    """g = sum_e dE_e / dx at the fixed vertices, known from the solve, and its adjoint.
+def _held(workspace: Workspace, gradient: Any, x: Any, target: Any, inertia: Any, force: Any) -> torch.Tensor:
+    """Returns the reaction (B, D + R, 3) [N] from the gradient of the energies there (equation of the module)."""
+    acting = torch.addcmul(force, inertia[..., None], target - x)
+    return _exerted(workspace, gradient - acting.index_select(1, workspace.held))
 
-    For a loss with derivatives z by g, zero at other vertices, dL/dx = K z and dL/dtheta = z . dg/dtheta, with the
-    stiffness K at x and the values theta of the energies.
+
+def _exerted(workspace: Workspace, forces: torch.Tensor) -> torch.Tensor:
+    """Returns what clamps and planes can exert of forces (B, D + R, 3): at vertices in planes the normal part."""
+    if not (coordinates := workspace.potential.coordinates).slides:
+        return forces
+    count = len(workspace.fixed)
+    return torch.cat([forces[:, :count], coordinates.normal(forces[:, count:])], 1)
+
+
+class _HeldForces(AdjointFunction):
+    """r = k (x - y) - f + sum_e dE_e / dx at the held vertices, whose last part is known from the solve; its adjoint.
+
+    For a loss with derivatives z by r, along planes and at other vertices zero, dL/dx = K z + k z, dL/dy = -k z,
+    dL/dk = z . (x - y), dL/df = -z and dL/dtheta = z . dg/dtheta, with the stiffness K at x, the gradient g of the
+    energies, and their values theta.
     """
 
     @override
@@ -203,7 +216,7 @@ class _FixedGradient(AdjointFunction):
     def forward(ctx: Any, workspace: Workspace, known: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
         ctx.workspace = workspace
         ctx.save_for_backward(*tensors)
-        return known.clone()
+        return _held(workspace, known, *tensors[:4])
 
     @override
     @staticmethod
@@ -211,6 +224,7 @@ class _FixedGradient(AdjointFunction):
     def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         tensors: list[Any] = [None if tensor is None else tensor.detach() for tensor in ctx.saved_tensors]
         x, *terms = tensors
+        z = torch.zeros_like(x).index_copy(1, ctx.workspace.held, _exerted(ctx.workspace, gradient))
         by_position, _, _, _, *by_values = ctx.needs_input_grad[2:]
         names = ctx.workspace.potential.value_names
 
@@ -218,8 +232,7 @@ class _FixedGradient(AdjointFunction):
             potential, mine = workspace.potential, StepTerms.of(names, *(_rows(tensor, rows) for tensor in terms))
             potential.set_terms(mine)
             potential.positions.copy_(x[rows])
-            along = torch.zeros_like(potential.positions)
-            along[:, workspace.fixed] = gradient[rows].double()
+            along = z[rows].double()
             if by_position:
                 potential.update_tangent()
             slopes = _by_values(potential, names, mine, by_values, along)
@@ -230,7 +243,10 @@ class _FixedGradient(AdjointFunction):
         product, *slopes = (
             _join_gradients(*pair) for pair in zip((x, *terms[3:]), zip(*found, strict=True), strict=True)
         )
-        return None, None, product, None, None, None, *slopes
+        target, inertia, *_ = terms
+        stiff = inertia[..., None] * z
+        product = None if product is None else product + stiff
+        return None, None, product, -stiff, (z * (x - target)).sum(-1), -z, *slopes
 
 
 def _rows(values: torch.Tensor | None, rows: slice) -> torch.Tensor | None:
@@ -263,7 +279,7 @@ def _minimise(
     fixed_positions: Any,
     *terms: Any,
 ) -> tuple[torch.Tensor, SolveReport, torch.Tensor]:
-    """Returns the minimiser, the report, and the gradient at fixed vertices of one shard.
+    """Returns the minimiser, the report, and the gradient at held vertices of one shard.
 
     Where bodies bar the way of fixed vertices, these go as far as they can, and the others give way to them by a solve,
     again and again; the last solve has every fixed vertex in its place. A batch of which that holds agrees with its
@@ -282,7 +298,8 @@ def _minimise(
         start[:, fixed] = fixed_positions
     report = minimiser.solve(potential.improved_start(start).to(start), None if parts else follows)
     work = {name: sum(getattr(part, name) for part in [*parts, report]) for name in ("iterations", "factorisations")}
-    return potential.positions.to(start.dtype, copy=True), replace(report, **work), potential.fixed_gradient[:, fixed]
+    gradient = potential.held_gradient[:, workspace.held]
+    return potential.positions.to(start.dtype, copy=True), replace(report, **work), gradient
 
 
 def _adjoint(

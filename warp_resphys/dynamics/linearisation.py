@@ -60,7 +60,7 @@ class Linearisation:
         """Returns the new state, with its reaction, as if x (B, N, 3) [m] solved the step, differentiable by x."""
         self._potential.positions.copy_(x.detach())
         self._potential.evaluate()
-        gradient = self._potential.fixed_gradient[:, self._workspace.fixed]
+        gradient = self._potential.held_gradient[:, self._workspace.held]
         return replace(self.finish(x), reaction=self._reaction(self._terms, x, gradient))
 
     def factorise(self, x: torch.Tensor) -> None:
@@ -77,7 +77,7 @@ class Linearisation:
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """Returns the solutions (B, 3 N, m) of H y = r for (B, 3 N, m) right-hand sides, zero at fixed vertices."""
         hessian = self._workspace.hessian(self._name)
-        fields = self._coordinates.reduce(right.unflatten(1, (-1, 3)))
+        fields = self._coordinates.restrict(self._coordinates.reduce(right.unflatten(1, (-1, 3))))
         with threads_for(self._unknowns):
             solution = None
             if hessian.kept is not None and not self._has_factor:

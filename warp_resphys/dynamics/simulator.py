@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ..energies.contact.barrier import ContactForces
 from ..energies.materials import Corotated, Material
 from ..fem.bodies import Body
+from ..fem.coordinates import SymmetryPlane
 from ..io.errors import InputError
 from ..io.machine import find_device
 from ..io.settings import parse
@@ -112,9 +113,7 @@ class Simulator:
 
     def __repr__(self) -> str:
         """Body, names of the materials' laws, time step, integrator, dtype and device."""
-        laws = ", ".join(
-            f"{name}: {type(m).__name__}" if name else type(m).__name__ for name, m in self.materials.items()
-        )
+        laws = ", ".join(f"{name}: {type(m).__name__}".removeprefix(": ") for name, m in self.materials.items())
         numbers = f"{1e3 * self.time_step:g} ms, {self.integrator}, {self.dtype}, {self.device}"
         return f"Simulator({self.body!r}, {laws or 'no material'}, {numbers})"
 
@@ -165,8 +164,7 @@ class Simulator:
         """
         positions = self.tensor(q)
         velocities = torch.zeros_like(positions) if v is None else self.tensor(v)
-        q_batch, v_batch = (x[None] if x.ndim == 2 else x for x in (positions, velocities))
-        state = State(q_batch, v_batch)
+        state = State(*(x[None] if x.ndim == 2 else x for x in (positions, velocities)))
         state.check(self.body.n_vertices, self.rest_positions)
         return state
 
@@ -242,7 +240,7 @@ class Simulator:
     def reaction(
         self,
         state: State | Motion,
-        at: str | ArrayLike | None = None,
+        at: str | SymmetryPlane | ArrayLike | None = None,
         before: State | None = None,
         inputs: Inputs | None = None,
         parameters: Parameters | Constants | None = None,
@@ -251,9 +249,9 @@ class Simulator:
 
         Args:
             state: state from `step` or `static_equilibrium`, or a motion from `rollout`, of which it is for every step.
-            at: a region of the mesh or a body of a scene, with vertices that it shares with others, or numbers of fixed
-                vertices; None: all of these. An obstacle, of which it presses on the body, needs what follows, too.
-            before: state at the start of the step; None: the state is an equilibrium.
+            at: fixed vertices: a region of the mesh or a body of a scene, with vertices that it shares with others, or
+                numbers; a symmetry plane, without fixed vertices in it; None: all of these; or an obstacle.
+            before: for an obstacle, the state at the start of the step; None: the state is an equilibrium.
             inputs: inputs during the step.
             parameters: parameters or prepared constants (`prepare`).
 
@@ -265,7 +263,9 @@ class Simulator:
             return Reaction.join([contact.reaction(at) for contact in contacts if at in contact.obstacles])
         if state.reaction is None:
             copied = "or it is a copy, as by `detach`: it has no reaction."
-            raise InputError(f"no step of a body with fixed vertices led to this state, {copied}")
+            raise InputError(f"no step of a body with fixed vertices or symmetry planes led to this, {copied}")
+        if isinstance(at, SymmetryPlane):
+            return state.reaction.along(at.normal, *self.body.sliding_in(at))
         at = self.body.fixed_in(at) if isinstance(at, str) else at
         return state.reaction if at is None else state.reaction.at(at)
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 
 from ..energies.potential import StepTerms
 from ..stepping.inputs import Inputs
@@ -56,12 +57,12 @@ class TimeStep:
         return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
 
     def reaction(self, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor) -> Reaction | None:
-        """Returns the reaction at the fixed vertices, differentiable; None without such vertices.
+        """Returns the reaction at the held vertices, differentiable; None without such vertices.
 
         Args:
             terms: of the potential.
             x: (B, N, 3) solution of the stage [m].
-            gradient: (B, D, 3) of the energies at the fixed vertices there, as numbers [N].
+            gradient: (B, D + R, 3) of the energies at the held vertices there, as numbers [N].
         """
         loads = self.equations.energies.loads_at_fixed(terms, x)
         return self._at_known_velocity(reaction_of(self.workspace, terms, x, gradient, loads))
@@ -77,9 +78,10 @@ class TimeStep:
             return reaction
         mass, inputs = step.constants.mass, step.inputs
         mass = (mass if inputs.attached_mass is None else mass + inputs.attached_mass)[:, fixed, None]
-        velocity = (reaction.places - step.state.q[:, fixed]) / step.stage.step
+        velocity = (reaction.places[:, : len(fixed)] - step.state.q[:, fixed]) / step.stage.step
         excess = mass * (velocity - step.state.v[:, fixed]) / self.equations.time_step
-        return replace(reaction, forces=reaction.forces - excess)
+        sliding = reaction.forces.shape[1] - len(fixed)
+        return replace(reaction, forces=reaction.forces - F.pad(excess, (0, 0, 0, sliding)))
 
     def solve(self, near: torch.Tensor | None = None) -> State:
         """Returns the new state, differentiable, whose report says whether the solve has converged.

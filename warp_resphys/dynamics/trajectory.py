@@ -20,6 +20,8 @@ from ..stepping.inputs import shapes
 from ..stepping.rollout import sample
 from ..stepping.state import Reaction, SolveReport, State
 
+_LOADS = tuple(f"load.{kind}{axis} [{unit}]" for kind, unit in (("f", "N"), ("t", "N m")) for axis in "xyz")
+
 
 @dataclass(frozen=True, repr=False)
 class Motion:
@@ -42,7 +44,7 @@ class Motion:
         lost: (T + 1, B) bool, whether the simulation has diverged.
         inputs: (T, B, C) commands of a robot, by name.
         units: unit and names of the C parts of the commands that drive actuators, by name.
-        reaction: what holds the fixed vertices in each of the T steps; None where it is not known.
+        reaction: what holds the body, as in `State`, in each of the T steps; None where it is not known.
     """
 
     q: torch.Tensor
@@ -125,9 +127,14 @@ class Motion:
         return Path(path)
 
     def plot(
-        self, vertices: ArrayLike | None = None, axis: str | None = None, environment: int = 0, ax: Any = None
+        self,
+        vertices: ArrayLike | None = None,
+        axis: str | None = None,
+        environment: int = 0,
+        ax: Any = None,
+        reaction: bool = False,
     ) -> Any:
-        """Plots displacements over time.
+        """Plots displacements over time, or the force that holds the body.
 
         Args:
             vertices: vertex numbers, for example from `select_vertices`, or a single number: their mean displacement
@@ -136,15 +143,22 @@ class Motion:
             axis: ``x``, ``y`` or ``z``; by default the one with the largest displacement.
             environment: index of the environment.
             ax: matplotlib axes; a new figure if omitted.
+            reaction: whether the components of the force that holds the fixed vertices are shown instead [N].
 
         Returns:
             The axes.
 
         Raises:
-            InputError: an unknown axis, vertex or environment.
+            InputError: an unknown axis, vertex or environment, or a motion without reaction.
         """
         import matplotlib.pyplot as plt
 
+        if reaction:
+            loads = self._loads(environment)
+            ax = plt.subplots(layout="constrained")[1] if ax is None else ax
+            ax.legend(ax.plot(self.times, np.stack([*loads.values()][:3], axis=1)), ["x", "y", "z"])
+            ax.set(xlabel="time [s]", ylabel="reaction [N]")
+            return ax
         q, labels = self._of(self.q, environment) - self.body.vertices, self.labels if vertices is None else ()
         if labels:
             markers = self._of(self.markers, environment)
@@ -165,18 +179,22 @@ class Motion:
             ax.legend(lines, labels)
         return ax
 
-    def write_csv(self, path: str | Path, environment: int = 0, half_widths: bool = False) -> Path:
+    def write_csv(
+        self, path: str | Path, environment: int = 0, half_widths: bool = False, reaction: bool = False
+    ) -> Path:
         """Writes a table of times, markers, and the commands of the step that led there, in SI units.
 
-        Its headers have names and units. `read_recording` reads tables without half-widths.
+        Its headers have names and units. `read_recording` reads tables without half-widths and reactions.
 
         Args:
             path: path of the file.
             environment: index of the environment.
             half_widths: whether columns with the half-widths of the markers' prediction intervals are added.
+            reaction: whether columns ``load.fx [N]`` to ``load.tz [N m]`` are added, with the force that holds the
+                fixed vertices, and its moment about the origin; empty at the start, to which no step led.
 
         Raises:
-            InputError: an unknown environment.
+            InputError: an unknown environment, or a motion without reaction.
             DataFileError: the file cannot be written.
         """
         markers, columns = self._of(self.markers, environment), dict[str, FloatArray]()
@@ -186,6 +204,8 @@ class Motion:
         for name, (unit, parts) in self.units.items():
             if name in self.inputs:
                 columns |= input_columns(name, parts, unit, self._of(self.inputs[name], environment))
+        if reaction:
+            columns |= self._loads(environment)
         return write_csv(Path(path), self.times, self.labels, markers, columns)
 
     def write_vtk(self, path: str | Path, environment: int = 0) -> Path:
@@ -230,6 +250,14 @@ class Motion:
     def _labelled(self) -> torch.Tensor:
         """Markers (T + 1, B, M, 3); M = 0 if these are the vertices."""
         return self.markers if self.labels else self.markers[:, :, :0]
+
+    def _loads(self, environment: int) -> dict[str, FloatArray]:
+        """Returns force [N] and moment about the origin [N m] of the reaction (T + 1,) by header, NaN at the start."""
+        if self.reaction is None or not len(self.body.fixed_vertices):
+            raise InputError("this motion has no reaction: nothing holds the body at fixed vertices, or no step did.")
+        clamp = self.reaction.at(self.body.fixed_vertices)
+        values = self._of(torch.cat([clamp.force, clamp.moment()], -1), environment)
+        return dict(zip(_LOADS, np.concatenate([np.full((1, 6), np.nan), values]).T, strict=True))
 
     def _of(self, series: torch.Tensor, environment: int) -> FloatArray:
         """Values (T, ...) of an environment, from those of all (T, B, ...)."""

@@ -58,6 +58,8 @@ class Workspace:
         dtype: dtype of states and factors; the potential is evaluated in float64.
 
     Attributes:
+        fixed: (D,) fixed vertices.
+        held: (D + R,) fixed vertices, and those that slide in symmetry planes.
         shards: slices of the batch with a workspace each, if several threads share it, else empty.
     """
 
@@ -76,6 +78,7 @@ class Workspace:
         start_quietly()
         compile_together(_kernels(energies, device, dtype), device, BLOCK)
         self.potential = IncrementalPotential(energies, coordinates, eliminated, batch, device)
+        self.held = torch.cat([fixed, self.potential.coordinates.sliding])
         self.pattern, self.dtype = pattern, dtype
         self._cache: dict[Any, Any] = {}
         self.shards: list[Shard] = []

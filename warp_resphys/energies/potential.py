@@ -67,9 +67,10 @@ class IncrementalPotential(Launcher):
         free_mask: (N,) one at free vertices, zero at fixed ones.
         coordinates: the map on the potential's device, in float64.
         evaluation: launches that evaluate at ``positions`` and set ``residual`` and what follows here. Environments
-            that are not ``active`` keep energies, norm of the residual and ``fixed_gradient``, and have no valid
+            that are not ``active`` keep energies, norm of the residual and ``held_gradient``, and have no valid
             ``residual``.
-        fixed_gradient: (B, N, 3) gradient of the energies at fixed vertices, zero at others [N].
+        held_gradient: (B, N, 3) gradient of the energies at fixed vertices, and its part normal to symmetry planes at
+            vertices that slide in them; zero at others [N].
         energy: (B,) [J].
         energy_size: (B,) sum of the absolute values of the energies [J].
         balance: (B,) norm of inertia less all loads [N].
@@ -120,7 +121,7 @@ class IncrementalPotential(Launcher):
         self.stiffness = self.zeros()
         self.positions = self.zeros(n_vertices, 3)
         self._position_view = warp_view(self.positions, wp.vec3d)
-        self.residual, self.fixed_gradient = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
+        self.residual, self.held_gradient = self.zeros(n_vertices, 3), self.zeros(n_vertices, 3)
         self._point_energy = self.zeros(self._n_points)
         self._vertex_energy = self.zeros(n_vertices)
         self.energy, self.energy_size, self.balance, self.residual_norm = (self.zeros() for _ in range(4))
@@ -129,6 +130,7 @@ class IncrementalPotential(Launcher):
         self.tangent_active, self.clamp = (torch.zeros(batch, device=device, dtype=torch.int32) for _ in range(2))
         self.all_active = True
         self.low_rank: torch.Tensor | None = None
+        self._stiff_columns: torch.Tensor | None = None  # the same, with components normal to symmetry planes
         self._direction = self.zeros(n_vertices, 3)
         self._adjoints: list[Callable[[], dict[str, torch.Tensor]]] = []
 
@@ -164,18 +166,17 @@ class IncrementalPotential(Launcher):
                     self.gather(s, stress, self.residual),
                 ]
         free, residual = warp_view(self.free_mask, wp.float64), warp_view(self.residual, wp.vec3d)
-        project, c = [], self.coordinates
+        sums, c = [warp_view(self.held_gradient, wp.vec3d)], self.coordinates
         if c.slides:  # removes the residual normal to symmetry planes
             planes = [self.upload(c.sliding.cpu().numpy().astype(np.int32), int), warp_view(c.projections, wp.mat33d)]
-            project = [self.record(kernels.project, (b, len(c.sliding)), planes, [residual])]
-        self._load_commands += project
+            for first, commands in enumerate((self._internal_commands, self._load_commands)):
+                inputs = [active, *planes, first]
+                commands.append(self.record(kernels.project, (b, len(c.sliding)), inputs, [residual, *sums]))
         self._load_commands.append(
             self.record_blocks(reductions.masked_norm, b, [free, residual], [warp_view(self.balance, wp.float64)])
         )
         energies = [warp_view(values, wp.float64) for values in (self._vertex_energy, self._point_energy)]
-        sums = [warp_view(self.fixed_gradient, wp.vec3d)]
         sums += [warp_view(values, wp.float64) for values in (self.energy, self.energy_size, self.residual_norm)]
-        self._internal_commands += project
         self._internal_commands.append(
             self.record_blocks(reductions.totals, b, [active, free, *energies, residual], sums)
         )
@@ -194,7 +195,7 @@ class IncrementalPotential(Launcher):
         if self.coordinates.slides:
             mine.target.copy_(self.coordinates.hold(mine.target))
         torch.mul(terms.inertia.detach(), self.free_mask, out=mine.inertia)
-        torch.mul(terms.force.detach(), self.free_mask[:, None], out=mine.force)
+        torch.mul(self.coordinates.restrict(terms.force.detach().double()), self.free_mask[:, None], out=mine.force)
         for term, values in zip(self.energies, terms.values, strict=True):
             for name, buffer in term.values.items():
                 if (value := values[name]) is not None:
@@ -235,7 +236,7 @@ class IncrementalPotential(Launcher):
         self.last_pair_tangents = self.pair_tangents()
         parts = (term.low_rank(self._position_view) for term in self.energies)
         columns = [part for part in parts if part is not None]
-        self.low_rank = torch.cat(columns, 2) if columns else None
+        self.low_rank = self._stiff_columns = torch.cat(columns, 2) if columns else None
         if self.low_rank is not None and self.coordinates.slides:
             whole = self.low_rank.unflatten(1, (self.n_vertices, 3))
             self.low_rank = self.coordinates.restrict(whole).flatten(1, 2)
@@ -363,9 +364,9 @@ class IncrementalPotential(Launcher):
         self._product.zero_()
         self.launch(self._product_commands)
         product = self._product.clone()
-        if self.low_rank is not None:
-            along = torch.einsum("bnr,bn->br", self.low_rank, self._direction.flatten(1))
-            product += torch.einsum("bnr,br->bn", self.low_rank, along).view_as(product)
+        if (columns := self._stiff_columns) is not None:
+            along = torch.einsum("bnr,bn->br", columns, self._direction.flatten(1))
+            product += torch.einsum("bnr,br->bn", columns, along).view_as(product)
         if self.last_pair_tangents:
             whole, between = self.coordinates.expand(self._direction), torch.zeros_like(product)
             for part in self.last_pair_tangents:

@@ -18,7 +18,7 @@ from ..io.arrays import FloatArray, IntArray
 from ..mesh.volume_mesh import boundary_triangles
 from ..robot.robot import Robot
 from ..stepping.rollout import states
-from .grippers import BALL, FINGERS, gripper
+from .grippers import BALL, FINGERS, finger_forces, gripper, squeeze_of
 
 ARM: Final = Path(__file__).with_name("arm.xml")
 FLANGE: Final = "flange"
@@ -86,6 +86,14 @@ class ArmWorld(World[MountedState]):
         held = state.pose[:, :3] + Rotation.from_rotvec(state.pose[:, 3:]).apply(self.held)
         ball = state.robot.q[:, self.ball].mean(1).double().cpu().numpy()
         return np.concatenate([fingers, held[:, None], ball[:, None]], axis=1)
+
+    @override
+    def forces(self, state: MountedState) -> FloatArray:
+        return finger_forces(self._scene, state.robot).reshape(self.count, -1)
+
+    @override
+    def squeeze(self, state: MountedState) -> FloatArray:
+        return squeeze_of(self._scene, state.robot)
 
     @override
     def bodies(self, state: MountedState) -> tuple[IntArray, FloatArray]:

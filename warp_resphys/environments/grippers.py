@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from ..control.worlds import World
+from ..control.worlds import G, World, total_force
 from ..energies.contact.obstacle_contact import Contact
 from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..energies.contact.surface_contact import SurfaceContact
@@ -62,6 +62,25 @@ def ball_mesh(radius: float, divisions: int, nodes: int = 8) -> Mesh:
     return Mesh(radius * x * np.sqrt(1.0 - y2 / 2.0 - z2 / 2.0 + y2 * z2 / 3.0), cube.cells)
 
 
+def finger_forces(scene: RobotScene, state: State) -> FloatArray:
+    """Returns the forces (B, 2, 3) that hold the fingers at their bases, over the weight of the ball."""
+    return np.stack([total_force(scene.simulator, state, name) for name in FINGERS], axis=1) / (G * _MASS)
+
+
+def squeeze_of(scene: RobotScene, state: State) -> FloatArray:
+    """Returns the force (B,) of the fingers beyond the least that holds the ball, over its weight.
+
+    In equilibrium a finger presses with what holds its base along the line between both bases. The least is half the
+    weight over the coefficient of friction.
+    """
+    fixed = (scene.simulator.body.fixed_in(name) for name in FINGERS)
+    left, right = (state.q[:, at].mean(1).double().cpu().numpy() for at in fixed)
+    along = (right - left) / np.linalg.norm(right - left, axis=1, keepdims=True)
+    held = finger_forces(scene, state)
+    pressing = 0.5 * ((held[:, 0] - held[:, 1]) * along).sum(axis=1)
+    return np.asarray(np.maximum(pressing - 0.5 / _FRICTION, 0.0))
+
+
 class GraspWorld(World[State]):
     """B grippers, which take the command of both fingers, and their own height.
 
@@ -104,6 +123,14 @@ class GraspWorld(World[State]):
         fingers = torch.cat(list(self._scene.observe(state).values()), 1)
         ball = state.q[:, self._scene.scene.vertex_slice(BALL)].mean(1, keepdim=True)
         return np.asarray(torch.cat([fingers, ball], 1).double().cpu().numpy())
+
+    @override
+    def forces(self, state: State) -> FloatArray:
+        return finger_forces(self._scene, state).reshape(self.count, -1)
+
+    @override
+    def squeeze(self, state: State) -> FloatArray:
+        return squeeze_of(self._scene, state)
 
     @override
     def bodies(self, state: State) -> tuple[IntArray, FloatArray]:

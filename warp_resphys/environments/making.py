@@ -51,6 +51,8 @@ def make_vector(
     device: str = "cpu",
     seed: int = 0,
     reach: Reach | None = None,
+    forces: bool = False,
+    squeeze: float = 0.0,
 ) -> RobotVectorEnv:
     """Makes a vector environment of robots of a run, or of a file, with a task.
 
@@ -74,9 +76,11 @@ def make_vector(
         seed: of the sampled inputs whose equilibria are the reachable places.
         reach: ``task.reach`` of another environment, so that both have the same goals and the same units; sampled from
             this robot if omitted.
+        forces: whether the force that holds each robot or finger at its base is observed.
+        squeeze: penalty on the force of fingers beyond the least that holds the ball, over its weight.
 
     Raises:
-        InputError: an unknown task or world, or a robot without the input that the task needs.
+        InputError: an unknown task or world, or a robot without the input or the forces that the task needs.
         DataFileError: the run is missing, unfinished or changed.
     """
     robot, frames = _loaded(task, run, model, world, device, action_time)
@@ -97,7 +101,8 @@ def make_vector(
         reach = _reach(robot, mapping, point, shown, seed) if reach is None else reach
         follows = task == "follow"
         goals = FollowTask(num_envs, actions, reach, action_time) if follows else ReachTask(num_envs, actions, reach)
-    return RobotVectorEnv(bodies, goals, mapping, point, actions, noise, autoreset_mode, render_mode, up)
+    options = (noise, autoreset_mode, render_mode, up, forces, squeeze)
+    return RobotVectorEnv(bodies, goals, mapping, point, actions, *options)
 
 
 def _lift(robot: Robot, count: int, up: FloatArray, place: FloatArray, grasps: bool) -> SwingTask:

@@ -49,8 +49,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """B robots with one task, whose episodes end and begin independently.
 
     An observation contains the displacements of the M markers from rest, divided by the size of the task; their changes
-    since the last action; the current inputs, from -1 to 1; and the observed values of the task. An action gives target
-    values of the inputs, from -1 to 1, which are approached at their largest rate.
+    since the last action; the current inputs, from -1 to 1; the observed values of the task; and forces, if they are
+    observed. An action gives target values of the inputs, from -1 to 1, which are approached at their largest rate.
 
     Args:
         world: the simulated bodies.
@@ -62,6 +62,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         autoreset_mode: when episodes are reset, as in Gymnasium.
         render_mode: ``rgb_array`` for pictures, or None.
         up: (3,) upward direction of the pictures.
+        forces: whether the forces at the bases are observed (`World.forces`).
+        squeeze: penalty on the force of fingers beyond what they need (`World.squeeze`).
 
     Attributes:
         actions: A.
@@ -73,7 +75,7 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         rests: (B, M, 3) markers at the beginning of the episodes [m].
 
     Raises:
-        InputError: an unknown render mode.
+        InputError: an unknown render mode, or forces that the world does not have.
     """
 
     def __init__(
@@ -87,6 +89,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         up: ArrayLike = (0.0, 0.0, 1.0),
+        forces: bool = False,
+        squeeze: float = 0.0,
     ) -> None:
         if render_mode not in (None, *RENDER_MODES):
             raise InputError(f"render_mode is {render_mode!r}: choose rgb_array, for pictures as arrays.")
@@ -102,7 +106,11 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._mode = mode
         self.state = world.rest
         self.rests = world.markers(self.state)
+        self._forces, self._squeeze = forces, squeeze
         width = 2 * self.rests[0].size + world.parts + task.width
+        width += world.forces(self.state).shape[1] if forces else 0
+        if squeeze:
+            world.squeeze(self.state)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (world.parts,), np.float32)
         self.observation_space = gym.vector.utils.batch_space(self.single_observation_space, world.count)
@@ -210,7 +218,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         mapping = self._mapping
         commands = 2.0 * (self._commands - mapping.low) / (mapping.high - mapping.low) - 1.0
         task = self.task.observed(self._seen.reshape(count, -1) @ self.tracked.T, self._number)
-        return np.concatenate([off, 5.0 * moved, commands, task], axis=1).astype(np.float32)
+        parts = [off, 5.0 * moved, commands, task, *([self.world.forces(self.state)] if self._forces else [])]
+        return np.concatenate(parts, axis=1).astype(np.float32)
 
     @override
     def step(
@@ -246,6 +255,8 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         self._before, self._seen = self._seen, self._cameras(np.ones_like(lost))
         changed = (self._commands - last) / (mapping.high - mapping.low)
         rewards = self.task.reward(self._points, self._number) - _SMOOTH * np.square(changed).mean(axis=1)
+        if self._squeeze:
+            rewards = rewards - self._squeeze * self.world.squeeze(self.state)
         rewards = np.where(lost, _LOST, rewards)
         terminated, truncated = lost.copy(), (self._number >= self.actions) & ~lost
         infos: dict[str, Any] = {"error_mm": self._errors()}

@@ -16,7 +16,7 @@ from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import Rigid
-from .coordinates import Coordinates, SymmetryPlane, dependence, rigid_weights
+from .coordinates import Coordinates, SymmetryPlane, dependence, plane_shares, rigid_weights
 from .integration_points import Discretisation, Points, discretise
 
 MASS_MODES = ("row_sum", "per_vertex")
@@ -247,6 +247,23 @@ class Body:
             raise InputError(f"no vertex of {part!r} is fixed: fix some, or choose another region.")
         return found
 
+    def sliding_in(self, plane: SymmetryPlane) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Returns vertices (K,) that slide in a symmetry plane, which gives c . f of a force f on them, and c (K, 3).
+
+        Raises:
+            InputError: the body has no such plane, or all of its vertices are fixed.
+        """
+        vertices, shares = list[NDArray[np.int64]](), list[NDArray[np.float64]]()
+        for _, member, first in self.members:
+            if plane in member.symmetry:
+                sliding = member.coordinates.sliding
+                inside = sliding[plane.contains(member.vertices[sliding])]
+                vertices.append(first + inside)
+                shares.append(plane_shares(member.symmetry, plane, member.vertices[inside]))
+        if not sum(map(len, vertices)):
+            raise InputError(f"no vertex slides in a symmetry plane {plane}: choose one of the body's `symmetry`.")
+        return np.concatenate(vertices), np.concatenate(shares)
+
     @cached_property
     def discretisation(self) -> Discretisation:
         """Integration points and volumes of the whole mesh."""
@@ -347,5 +364,8 @@ class Body:
 
     @cached_property
     def attached_mass(self) -> NDArray[np.float64]:
-        """(N,) mass of the attached weights [kg]."""
-        return sum((m.per_vertex(self.n_vertices) for m in self.point_masses), np.zeros(self.n_vertices))
+        """(N,) mass of the attached weights, and of rigid parts that are fixed, which only clamps feel [kg]."""
+        mass = sum((m.per_vertex(self.n_vertices) for m in self.point_masses), np.zeros(self.n_vertices))
+        for name in self.rigid.keys() - self.controls.keys():
+            mass = mass + self.rigid[name].density * self.load_volume[:, self.mesh.region(name)].sum(axis=1)
+        return mass

@@ -64,6 +64,19 @@ def tangential_projections(normals: FloatArray, touched: BoolArray) -> FloatArra
     return np.asarray(by_combination)[which.reshape(-1)]
 
 
+def plane_shares(planes: Sequence[SymmetryPlane], plane: SymmetryPlane, vertices: FloatArray) -> FloatArray:
+    """Returns (R, 3) c: of a force f with which planes hold a vertex, one of them gives c . f along its normal.
+
+    Args:
+        planes: the planes.
+        plane: one of them.
+        vertices: (R, 3) rest positions of vertices that slide in them [m]; c is zero for those outside of the plane.
+    """
+    normals, touched = np.array([one.normal for one in planes]), [one.contains(vertices) for one in planes]
+    inside = np.stack(touched, axis=1)[:, :, None]
+    return np.asarray(np.linalg.pinv((inside * normals).swapaxes(1, 2))[:, [*planes].index(plane)])
+
+
 @dataclass(frozen=True)
 class Coordinates:
     """The map W of a body; the identity without dependent vertices."""
@@ -242,15 +255,19 @@ class DeviceCoordinates:
     def _project(self, field: torch.Tensor) -> torch.Tensor:
         return torch.einsum("rij,brj...->bri...", self.projections, field.index_select(1, self.sliding))
 
+    def normal(self, forces: torch.Tensor) -> torch.Tensor:
+        """Returns the part of forces (B, R, 3) on the sliding vertices that is normal to their planes, f - P f."""
+        return forces - torch.einsum("rij,brj->bri", self.projections.to(forces), forces)
+
     def reduce(self, forces: torch.Tensor) -> torch.Tensor:
-        """Returns P W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
+        """Returns W^T f of forces (B, N, 3, ...): those at dependent vertices are moved to their control vertices."""
         if not self.depends:
-            return self.restrict(forces)
+            return forces
         rows = forces.index_select(1, self._carried).movedim(1, 0).flatten(1) * self._shares
         sums = torch.segment_reduce(rows, "sum", lengths=self._counts, axis=0, unsafe=True)
         sums = sums.view(-1, forces.shape[0], *forces.shape[2:]).movedim(0, 1)
         kept = forces.index_fill(1, self.dependent, 0.0)
-        return self.restrict(kept.index_copy(1, self._moved, kept.index_select(1, self._moved) + sums))
+        return kept.index_copy(1, self._moved, kept.index_select(1, self._moved) + sums)
 
 
 def control_vertices(

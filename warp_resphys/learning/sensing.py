@@ -37,7 +37,8 @@ def readings(
     """
     found = list[torch.Tensor]()
     for sensor in sensors:
-        reaction = simulator.reaction(after, sensor.at, before, inputs, constants)
+        at = simulator.fixed if sensor.at is None else sensor.at
+        reaction = simulator.reaction(after, at, before, inputs, constants)
         stands = isinstance(sensor.at, str) and sensor.at in simulator.energies.obstacle_names
         found.append(sensor(reaction, None if stands else simulator.rest_positions[reaction.vertices]))
     return torch.stack(found, 1) if found else after.q.new_zeros(after.batch, 0, 6)

@@ -67,6 +67,12 @@ class Reaction(Brief):
         arms = self.places - torch.as_tensor(about, dtype=self.places.dtype, device=self.places.device)[..., None, :]
         return torch.linalg.cross(arms, self.forces).sum(-2)
 
+    def along(self, normal: ArrayLike, vertices: ArrayLike, shares: ArrayLike) -> "Reaction":
+        """Returns the parts c . f along a normal (3,) of forces f at vertices (K,), with shares c (K, 3)."""
+        there = self.at(vertices)
+        c, n = (torch.as_tensor(x, dtype=there.forces.dtype, device=there.forces.device) for x in (shares, normal))
+        return Reaction(there.vertices, (c * there.forces).sum(-1, keepdim=True) * n, there.places)
+
     def at(self, vertices: ArrayLike | torch.Tensor | slice) -> "Reaction":
         """Returns those at some of the vertices: by number (K,), in that order, or all in a range such as of a body.
 
@@ -84,6 +90,11 @@ class Reaction(Brief):
         rows = [place[vertex] for vertex in chosen]
         return Reaction(self.vertices[rows], self.forces[..., rows, :], self.places[..., rows, :])
 
+    def select(self, environments: Sequence[int]) -> "Reaction":
+        """Returns those of some environments, by number, as constants."""
+        rows = [*environments]
+        return Reaction(self.vertices, *(x.detach()[..., rows, :, :] for x in (self.forces, self.places)))
+
 
 @dataclass(frozen=True)
 class State:
@@ -97,8 +108,8 @@ class State:
     memory: Mapping[str, torch.Tensor] = field(default_factory=dict)
     # of the step that led here; None for other states, and for copies by `map`, such as `detach`
     report: SolveReport | None = field(default=None, compare=False)
-    # at the fixed vertices, in the step or equilibrium that led here; None for others. NaN in environments that were
-    # reset (`where`), and meaningless where the solve failed
+    # at the fixed vertices, and normal to symmetry planes at those that slide in them, in the step or equilibrium that
+    # led here; None for others. NaN in environments that were reset (`where`), and meaningless where the solve failed
     reaction: Reaction | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:

@@ -22,7 +22,8 @@ class Estimate:
 
     Attributes:
         time: of the clock of the packets [s].
-        state: of the robot, one environment.
+        state: of the robot, one environment; its reaction, if there is a simulator, is that of the step that predicted
+            it, without the correction by markers.
         markers: (M, 3) [m].
         deviations: (M, 3) of their coordinates [m].
         parameters: refined values and their standard deviations, by name.

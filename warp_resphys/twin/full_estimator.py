@@ -5,7 +5,7 @@ state. For each refined parameter a robot with another value runs beside, so tha
 parameters follow by differences (a filter with separate bias: Friedland, IEEE Trans. Autom. Control 14 (1969) 359).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -24,7 +24,7 @@ from ..learning.parameters import check_names, identifiable_parameters
 from ..robot.actuation import Given
 from ..robot.robot import Robot
 from ..stepping.quantity import Quantity
-from ..stepping.state import State
+from ..stepping.state import Reaction, State
 from .belief import Belief
 from .estimator import TwinEstimator
 from .tangent import StepTangent, pulled_by, shifted
@@ -43,6 +43,7 @@ class FullBelief(Belief):
 
     state: State  # of 2 + P environments: the estimate, the P with another parameter, and the one without markers
     transition: FloatArray  # (2 r, 3 r) of the errors (z, w) by (z, w, b) in a step
+    reaction: Reaction | None  # in the step or equilibrium that predicted the state, without corrections
     turn: int = 0  # number of the column of it that is renewed next
     pause: int = 1  # steps between two renewals: few while they change the transition
     wait: int = 0  # steps until the next one
@@ -113,8 +114,11 @@ class FullEstimator(TwinEstimator[FullBelief]):
         self._known = self._values(inputs)
         values = self._known if refined is None else refined
         robot, acting = self._at(values, inputs)
-        state = at_rest(robot, self._count, acting).detach()
-        return FullBelief(**vars(self._first(values)), state=state, transition=self.tangent.transition)
+        state = at_rest(robot, self._count, acting)
+        first = vars(self._first(values))
+        return FullBelief(
+            **first, state=state.detach(), transition=self.tangent.transition, reaction=_of(state, range(self._count))
+        )
 
     @property
     def _count(self) -> int:
@@ -152,8 +156,9 @@ class FullEstimator(TwinEstimator[FullBelief]):
             moved, faster, pulled = (F.pad(change, (0, 0, 0, 0, self._count, 0)) for change in changes)
             state = shifted(robot, state.select([*range(self._count), 0, 0]), moved, faster)
             forces += pulled
-        state = robot.step(state, **pulled_by(robot, acting, forces)).detach()
-        belief = replace(belief, wait=max(belief.wait - 1, 0))
+        after = robot.step(state, **pulled_by(robot, acting, forces))
+        state = after.detach()
+        belief = replace(belief, wait=max(belief.wait - 1, 0), reaction=_of(after, range(self._count)))
         if renew:
             belief = self._renewed(belief, state)
             state = state.select(range(self._count))
@@ -161,7 +166,7 @@ class FullEstimator(TwinEstimator[FullBelief]):
 
     @override
     def robot_state(self, belief: FullBelief) -> State:
-        return belief.state.select([0])
+        return replace(belief.state.select([0]), reaction=_of(belief, [0]))
 
     def _renewed(self, belief: FullBelief, after: State) -> FullBelief:
         """Renews a column of the transition from a step of which the last two environments began with its changes."""
@@ -191,7 +196,8 @@ class FullEstimator(TwinEstimator[FullBelief]):
 
     @override
     def _free(self, belief: FullBelief) -> FullBelief:
-        return replace(belief, state=belief.state.select([self._count - 1] * self._count))
+        last = [self._count - 1] * self._count
+        return replace(belief, state=belief.state.select(last), reaction=_of(belief, last))
 
     @override
     def _moved(self, belief: FullBelief, z: FloatArray, w: FloatArray, parameters: FloatArray) -> FullBelief:
@@ -228,6 +234,11 @@ def at_rest(robot: Robot, batch: int, inputs: Mapping[str, Given]) -> State:
         return robot.settle(batch, **inputs)
     except ConvergenceError:
         return robot.begin(batch, **inputs)
+
+
+def _of(one: State | FullBelief, environments: Sequence[int]) -> Reaction | None:
+    """The reaction of some environments, by number."""
+    return None if one.reaction is None else one.reaction.select(environments)
 
 
 def _along(rows: torch.Tensor, share: torch.Tensor) -> torch.Tensor:

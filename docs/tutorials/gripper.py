@@ -178,29 +178,38 @@ axes[0].set(ylabel="z [mm]")
 plt.show()
 
 # %% [markdown]
-# ## Contact forces
+# ## Forces on the ball over time
 #
-# `Simulator.contacts` returns gaps, normal forces and friction of every vertex in a step. While the ball hangs between
-# the fingers, they carry its weight of 75 mN, mostly by friction:
+# `Simulator.contacts` returns gaps, normal forces and friction of every vertex in a step. A finger presses on the ball
+# from the side, and both carry its weight of 75 mN, mostly by friction. As the base rises they lift it, which takes
+# more than its weight and then less; until then, the table carries a part.
 
 # %%
-state, forces = simulator.rest_state(), None
+state, shown = simulator.rest_state(), []
 pull = tensions(course)
 with torch.no_grad():
-    for step in range(57):
+    for step in range(STEPS):
         own = scene.inputs({name: Inputs(tendon_tension=pull[step]) for name in ("left", "right")})
         inputs = Inputs(fixed_positions=base[step], **own.fields)
         before, state = state, simulator.step(state, inputs)
-    forces = simulator.contacts(before, state, inputs)["surfaces"]
-on_ball = forces.vertices >= ball.start
-press = forces.normal[0, on_ball, 1].abs().sum() / 2.0
-carried = (forces.normal + forces.friction)[0, on_ball, 2].sum()
-friction = forces.friction[0, on_ball, 2].sum()
-shares = [f"{1e3 * value:.0f} mN" for value in (press, carried, friction)]
-print("A finger presses with {}. Of {} upwards, {} are friction.".format(*shares))
+        forces = simulator.contacts(before, state, inputs)["surfaces"]
+        on_ball = forces.vertices >= ball.start
+        press = forces.normal[0, on_ball, 1].abs().sum() / 2.0
+        friction = forces.friction[0, on_ball, 2].sum()
+        shown.append((press, forces.normal[0, on_ball, 2].sum() + friction, friction))
+presses, carried, rubbed = 1e3 * torch.tensor(shown).mT
+figure, axis = plt.subplots(figsize=(6, 3), layout="constrained")
+for label, force in (("pressed by a finger", presses), ("carried by both", carried), ("of that by friction", rubbed)):
+    axis.plot(times, force, label=label)
+axis.set(xlabel="time [s]", ylabel="force on the ball [mN]")
+axis.legend(frameon=False)
+plt.show()
+hanging = 56  # the step at which the base stands above the table
+print(f"At {times[hanging]:.2f} s a finger presses with {presses[hanging]:.0f} mN.", end=" ")
+print(f"Of {carried[hanging]:.0f} mN upwards, {rubbed[hanging]:.0f} mN are friction.")
 
 # %%
 weight = 9.80709 * float(simulator.prepare().mass[0, ball].sum())
 assert heights[0] < HELD <= heights[-1]
 assert mean < 0.93 * float(efforts[least])
-assert abs(float(carried) - weight) < 0.1 * weight
+assert abs(float(carried[hanging]) - 1e3 * weight) < 100.0 * weight

@@ -184,7 +184,8 @@ class Motion:
     ) -> Path:
         """Writes a table of times, markers, and the commands of the step that led there, in SI units.
 
-        Its headers have names and units. `read_recording` reads tables without half-widths and reactions.
+        Its headers have names and units. `read_recording` reads tables without half-widths; the reaction is that of a
+        force sensor ``load`` whose readings are on the body.
 
         Args:
             path: path of the file.

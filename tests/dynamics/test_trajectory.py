@@ -9,7 +9,18 @@ import torch
 
 from support.clamped import clamped
 from support.refusals import refuses
-from warp_resphys import Body, Corotated, InputError, Inputs, Scene, Simulator, Tendons, box_hexahedra, select_vertices
+from warp_resphys import (
+    Body,
+    Corotated,
+    InputError,
+    Inputs,
+    Scene,
+    Simulator,
+    Tendons,
+    box_hexahedra,
+    read_recording,
+    select_vertices,
+)
 from warp_resphys.energies import Box, Sphere
 from warp_resphys.energies.contact.obstacle_contact import Contact
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
@@ -53,6 +64,7 @@ def test_a_table_and_a_plot_have_force_and_moment_of_the_clamp(trajectory, tmp_p
     assert np.isnan(loads[0]).all()
     expected = torch.cat([trajectory.reaction.force, trajectory.reaction.moment()], -1)[:, 0].numpy()
     np.testing.assert_allclose(loads[1:], expected, rtol=1e-11)
+    np.testing.assert_allclose(read_recording(path).loads["load"][1:], expected, rtol=1e-11)
     axes = trajectory.plot(reaction=True)
     assert axes.get_ylabel() == "reaction [N]"
     for column, line in enumerate(axes.lines):

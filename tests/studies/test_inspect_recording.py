@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,14 @@ def test_table_and_files(tmp_path, path):
     assert written["release_frame"] == pytest.approx(60.4, abs=0.25)
     assert written["markers"][1]["jumps"] == [{"frame": 90, "mm": pytest.approx(1.73, abs=0.02)}]
     assert (tmp_path / "out" / "quality.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_ranges_of_force_sensors_are_printed(tmp_path):
+    loads = np.full((200, 6), np.nan)
+    loads[:, 2], loads[5:, 4] = np.linspace(-0.5, 0.25, 200), 0.125
+    write_recording(tmp_path / "push.h5", replace(held_then_initial_motion(), loads={"plate": loads}))
+    said = inspect_recording(configured(f"files=[{tmp_path / 'push.h5'}]"), tmp_path)
+    assert "\nForce sensor plate: fz -0.5 to 0.25 N, ty 0.125 to 0.125 N m.\n" in f"{said}\n"
 
 
 def test_trials_are_compared(tmp_path, path):

@@ -164,7 +164,8 @@ class Simulator:
         """
         positions = self.tensor(q)
         velocities = torch.zeros_like(positions) if v is None else self.tensor(v)
-        state = State(*(x[None] if x.ndim == 2 else x for x in (positions, velocities)))
+        q_batch, v_batch = (x[None] if x.ndim == 2 else x for x in (positions, velocities))
+        state = State(q_batch, v_batch)
         state.check(self.body.n_vertices, self.rest_positions)
         return state
 
@@ -221,14 +222,13 @@ class Simulator:
     ) -> dict[str, ContactForces]:
         """Returns gaps, forces, slides and sticking at the end of a step, differentiable.
 
+        Contact is with ``obstacles`` and between ``surfaces``, ``NAME_obstacles`` of the body NAME of a scene.
+
         Args:
             state: state at the start of the step.
             after: state at its end.
             inputs: inputs during the step.
             parameters: parameters or prepared constants (`prepare`).
-
-        Returns:
-            Contact with ``obstacles`` and between ``surfaces``; ``NAME_obstacles`` of the body NAME of a scene.
 
         Raises:
             InputError: wrong shapes, or values that are not finite.

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from ..data.force_sensors import AXES, UNITS
 from ..data.recordings.bag import is_bag
 from ..data.recordings.marker_quality import (
     QUALITY_COLUMNS,
@@ -26,6 +27,7 @@ from ..data.recordings.marker_quality import (
 from ..data.recordings.processing import fill_gaps, release_of
 from ..data.recordings.recording import Recording
 from ..data.recordings.recording_files import READERS, read_recording, write_recording
+from ..io.arrays import FloatArray
 from ..io.atomic import atomic_path
 from ..io.errors import DataFileError, InputError, listed
 from ..io.progress import aligned
@@ -159,6 +161,7 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     lines = [aligned([heads, *([label, *cells] for label, cells in table.items())])]
     seconds = result.frames / result.rate_hz
     lines.append(f"{result.source}: {result.frames} frames, {seconds:.2f} s at {result.rate_hz:g} Hz")
+    lines += [f"Force sensor {name}: {_ranges(loads)}." for name, loads in recording.loads.items()]
     if release is not None:
         rest = release.rest
         lines.append(f"Released in frame {release.frame:.2f}; held still in frames {rest[0]} to {rest[1] - 1}.")
@@ -169,6 +172,13 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
         for source, shift, distortion in motions
     ]
     return "\n".join(lines)
+
+
+def _ranges(loads: FloatArray) -> str:
+    """Returns the range of each measured axis of readings (T, 6)."""
+    read = {axis: column[np.isfinite(column)] for axis, column in zip(AXES, loads.T, strict=True)}
+    known = [f"{axis} {x.min():.3g} to {x.max():.3g} {UNITS[axis]}" for axis, x in read.items() if len(x)]
+    return ", ".join(known) or "no reading"
 
 
 def _draw_seen(axes: Axes, recording: Recording, bridged: Recording, result: Quality) -> None:

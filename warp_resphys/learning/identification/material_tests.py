@@ -90,13 +90,13 @@ class MeasuredLaw(Brief):
             return stress(test.kind, strain, self.parameters)
         return test.response(strain, self.columns)[0]
 
-    def interval(self, kind: str, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def interval(self, kind: str, strain: FloatArray, beyond: float = BEYOND) -> tuple[FloatArray, FloatArray]:
         """Returns the nominal stress (N,) in slow loading, and the half-width (N,) of its 90 % interval [Pa].
 
         In the range of the tests the interval covers the posterior of the coefficients and the misfit of the law.
         Beyond, laws err in ways that no test within the range shows: over 19 silicones of a public database, and tests
         up to 50 to 200 % of strain, about nine of ten errors up to twice that strain were below 0.25 log2 of the ratio
-        of strains (docs/results/silicones.md).
+        of strains, which is ``beyond`` (docs/results/silicones.md).
         """
         columns = stress_columns(kind, strain, tuple(self.deviation))
         slopes = np.stack([*columns.values()], 1)
@@ -104,7 +104,7 @@ class MeasuredLaw(Brief):
         ratio = np.maximum(np.abs(strain) / self.largest, 1.0)
         known = np.einsum("np,pq,nq->n", slopes, self.covariance, slopes)
         misfit = _QUANTILE * max(self.errors.values()) * value
-        return value, np.sqrt(_QUANTILE**2 * known + misfit**2 + (BEYOND * np.log2(ratio) * value) ** 2)
+        return value, np.sqrt(_QUANTILE**2 * known + misfit**2 + (beyond * np.log2(ratio) * value) ** 2)
 
     @property
     def shear_deviation(self) -> float:

@@ -48,8 +48,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("numerics")
         elif folder == "validation":
             item.add_marker("validation")
-        # With --dist loadgroup, one process runs a module, or the environments, whose modules share their runs.
-        item.add_marker(pytest.mark.xdist_group(folder if folder == "environments" else item.path.stem))
 
 
 @pytest.fixture(params=DEVICES)

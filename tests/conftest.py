@@ -32,6 +32,7 @@ wp.init()
 torch.set_num_threads(1)
 
 NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
+STRUCTURAL = {"test_arguments", "test_modules", "test_threads"}  # of these folders, without numbers of libraries
 # folders and modules of tests
 LOOK_AT_PICTURES = {"report", "test_environments", "test_film", "test_control_run", "test_inspect_mesh"}
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
@@ -44,7 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         folder = item.path.parent.name
-        if folder in NUMERICAL:
+        if folder in NUMERICAL and item.path.stem not in STRUCTURAL:
             item.add_marker("numerics")
         elif folder == "validation":
             item.add_marker("validation")

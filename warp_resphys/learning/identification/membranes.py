@@ -44,7 +44,7 @@ _SHARES: Final = (0.1, 0.4, 0.7, 1.0)  # of the force at the first height
 _SOLVES: Final = 99  # of Newton's method for the positions; more are needed only where there is no equilibrium
 _ITERATIONS: Final = 20  # of Newton's method for the pressure
 _EXACT: Final = 1e-4  # relative error of the force
-_FAR: Final = 1.3  # ratio of a parameter to the last one beyond which a solution starts anew
+_FAR: Final = 1.1  # ratio of a parameter to the last one beyond which a solution starts anew
 _RING_RATIO: Final = 0.499  # Poisson's ratio of the rings
 _RINGS: Final = "rings"  # their region
 
@@ -158,8 +158,9 @@ class Membrane(Brief):
         levels = np.linspace(low, max(high, low * (1.0 + 1e-6)), _HEIGHTS) * self.radius
         problem = _Problem(self, self._simulator(tuple(law)), law)
         near = self._last[-1] if self._last and self._last[-1].is_near(levels, problem.moduli) else None
+        self._last.clear()
         try:
-            solution = problem.followed(levels) if near is None else problem.solved(levels, near.pressure, near.q)
+            solution = problem.followed(levels) if near is None else problem.continued(near)
             by_name = problem.slopes(solution)
         except ConvergenceError as error:
             raise ConvergenceError(
@@ -168,7 +169,7 @@ class Membrane(Brief):
                 error.positions,
                 error.report,
             ) from error
-        self._last[:] = [solution]
+        self._last.append(solution)
 
         def curve(values: FloatArray, order: int = 0) -> FloatArray:
             return np.asarray(CubicSpline(levels / self.radius, values)(strain, order))
@@ -285,6 +286,13 @@ class _Problem:
             pressure, q = found[-1].pressure, found[-1].q
         pressure, q = torch.cat([one.pressure for one in found]), torch.cat([one.q for one in found])
         return _Solution(heights, pressure, q, self.moduli)
+
+    def continued(self, near: _Solution) -> _Solution:
+        """Returns the equilibria at the heights of a solution with other moduli."""
+        try:
+            return self.solved(near.heights, near.pressure, near.q)
+        except ConvergenceError:  # The solution is too far away.
+            return self.followed(near.heights)
 
     def slopes(self, solution: _Solution) -> dict[str, FloatArray]:
         """Returns the derivatives (S,) of the pressure by the coefficients."""

@@ -130,8 +130,10 @@ def write_material_report(path: Path, metrics: MaterialMetrics, run: RunSettings
 
     def sections(canvas: Canvas) -> Iterator[Part]:
         yield Part("", [draw_curves(metrics["tests"], canvas), specimen_table(metrics)])
-        yield Part("Law", [_coefficients(law), *_machines(metrics), _classes(law)])
-        yield Part("How it is compared", [Text(_HOW)])
+        chosen = bool(law.get("classes"))  # not scaled
+        yield Part("Law", [_coefficients(law), *_machines(metrics), *([_classes(law)] if chosen else [])])
+        if chosen:
+            yield Part("How it is compared", [Text(_HOW)])
 
     write_page(path, sections, run, material_verdict(metrics, law, run), metrics)
 
@@ -142,8 +144,8 @@ _NOTE: Final = (
 )
 _SCALED: Final = (
     "Relative root mean squares of the stress, or of the pressure of a membrane. The law is the given one times a "
-    "factor; Neo-Hookean is c10 alone, scaled alike. Without a number, the model has no stable equilibrium under that "
-    "load."
+    "factor; Neo-Hookean is c10 alone, scaled alike, as far as it then has an equilibrium in every test. Without a "
+    "number, the model has none that is stable under that load."
 )
 _HOW: Final = (
     "Every class of laws is fitted to the lower 60 % of the strains, and predicts the rest. The smallest class whose "
@@ -199,7 +201,9 @@ def _in_kilopascals(values: list[float] | None) -> FloatArray | None:
 
 _STYLES: Final = {"unscaled": (0, (6, 1, 1, 1)), "neo_hookean": (0, (4, 2)), "hooke": (0, (1, 1.2))}
 _LEARNED: Final[dict[str, Any]] = {"fontsize": 7.5, "ha": "right", "va": "top", "color": TONES["muted"].light}
-_CAPTION: Final = "Nominal stress over strain of the specimen, without the zero of the load cell."
+_CAPTION: Final = (
+    "Nominal stress over strain of the specimen, without the zero of the load cell; pressure over height of a membrane."
+)
 
 
 def _coefficients(law: LawContent) -> PageTable:

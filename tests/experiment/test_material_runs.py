@@ -14,7 +14,7 @@ from warp_resphys.energies.isochoric import stress
 from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.io.safe_files import read_json
 from warp_resphys.io.settings import parse
-from warp_resphys.learning import MaterialTest, identify_from_tests
+from warp_resphys.learning import MaterialTest, Membrane, identify_from_tests
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.data_kinds import TableSettings
 from warp_resphys.settings.run import RunSettings
@@ -126,11 +126,48 @@ def test_refused_tables(tmp_path):
         ("law.file=foo", "there is no law foo"),
         ("law.trials=2", "law.trials is for laws from trials"),
         ("+simulation.youngs_modulus=1e5", "simulation has youngs_modulus, which tests of specimens identify"),
+        ("data.scaled=true", "law.file is null, but data.scaled multiplies a law"),
+        ("+data.tests.tension.held_out=true", "all tests are held out"),
+        ("data.tests.tension.kind=bulge", "a bulge test has a membrane, all others have a specimen"),
+        ("data.tests={lift: {kind: bulge, file: a.csv, membrane: {radius: 0.04}}}", "bulge tests scale a law"),
+        ("data.tests={lift: {kind: bulge, membrane: {radius: 0.04}}}", "bulge tests are not simulated"),
     ],
 )
 def test_refused_configurations(tmp_path, change, said):
     written(tmp_path)
     assert said in refusal(*arguments(tmp_path, change))
+
+
+def lifted(folder, name, rings, factor):
+    """A table of a membrane of a law with twice the moduli of Ecoflex 00-30, under two weights."""
+    law = {"c10": factor * warp_resphys.silicone("Ecoflex 00-30").values["c10"]}
+    head = "thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm"
+    rows = [f"# {head} = [2.0, 15.0, {rings}, nan, nan]", "height_mm,pressure_Pa,lifted_force_N", "2,5000,4"]
+    for force in (3.0, 4.0):
+        ring = () if "nan" in rings else (tuple(1e-3 * float(size) for size in rings.split(",")),)
+        heights = np.linspace(10.0, 20.0, 11)
+        pressures = Membrane(0.04, 0.002, 0.015, force, ring).response(heights / 40.0, law)[0]
+        rows += [f"{height:.1f},{p:.2f},{force:g}" for height, p in zip(heights, pressures, strict=True)]
+    (folder / name).write_text("\n".join(rows), encoding="utf-8")
+
+
+def test_a_law_that_is_scaled_on_one_membrane_predicts_another(tmp_path):
+    lifted(tmp_path, "membrane_0.csv", "nan, nan", 2.0)
+    lifted(tmp_path, "membrane_5.csv", "27.0, 3.0", 2.0)
+    sizes = [f"data.tests.{name}.membrane.radius=0.04" for name in ("membrane_0", "others")]
+    given = ("experiment=membrane", f"data.folder={tmp_path}", "law.file=ecoflex_00_30", *sizes)
+    said = outcome(*given, "data.range=[0.2, 0.55]", f"hydra.run.dir={tmp_path}/run").out
+    metrics = read_json(tmp_path / "run" / "metrics.json")
+    assert metrics["factor"] == pytest.approx(2.0, rel=2e-3)
+    held = {name: one["held_out"] for name, one in metrics["tests"].items()}
+    names = [f"membrane_{number}, {force} N" for number in (0, 5) for force in (3, 4)]
+    assert held == dict(zip(names, (False, False, True, True), strict=True))
+    for one in metrics["tests"].values():
+        assert one["errors"]["range"]["law"] < 0.005
+        assert one["errors"]["range"]["unscaled"] > 0.1
+    assert "The law is the given one times 2. It predicts 2 tests" in " ".join(said.split())
+    assert (tmp_path / "run" / "figures" / "curves.png").stat().st_size > 1_000
+    assert "data.range leaves 4 samples under 3 N" in refusal(*given, "data.range=[0.2, 0.34]")
 
 
 def test_silicones_by_name():

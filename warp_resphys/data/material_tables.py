@@ -1,15 +1,16 @@
-"""Tables of material tests: columns of time, strain or displacement, and stress or force, as text."""
+"""Tables of material tests: columns of time, strain or displacement, and stress or force; of membranes."""
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from ..io.arrays import FloatArray
+from ..io.arrays import Brief, FloatArray
 from ..io.errors import DataFileError, did_you_mean, listed
-from ..io.text import Rows, number, read_rows
+from ..io.text import Rows, number, read_rows, read_text
 from ..settings.data_kinds import TableSettings
 from .recordings.recording import METRES_PER_UNIT
 
@@ -63,6 +64,60 @@ def read_test(path: Path, table: TableSettings | None = None) -> dict[str, Float
     values = [[number(row[column]) if column < len(row) else None for column in names] for row in rows[first:]]
     kept = np.array([one for one in values if None not in one], dtype=np.float64).reshape(-1, len(names))
     return {name: kept[:, k] * factors[column] for k, (column, name) in enumerate(names.items())}
+
+
+_MEMBRANE: Final = ("thickness", "contact_radius", "ring1_radius", "ring1_width", "ring2_radius", "ring2_width")
+_LIFTED: Final = ("height_mm", "pressure_Pa", "lifted_force_N")
+
+
+@dataclass(frozen=True)
+class MembraneTable(Brief):
+    """Pressures at which an inflated membrane lifts a cap, in SI units."""
+
+    thickness: float  # [m]
+    cap: float  # radius of the cap [m]
+    rings: tuple[tuple[float, float], ...]  # mean radius and half-width of each stiff ring [m]
+    height: FloatArray  # (N,) of the cap above its place at rest [m]
+    pressure: FloatArray  # (N,) [Pa]
+    force: FloatArray  # (N,) weight of the cap [N]
+
+
+def read_membrane(path: Path) -> MembraneTable:
+    """Returns a table of membranes as published with arXiv 2504.01156.
+
+    The first line, ``# thickness_mm,... = [2.0, ...]``, has thickness, radius of the cap, and mean radius and
+    half-width of two rings, nan without them; the second one names the columns, height, pressure and force.
+
+    Raises:
+        DataFileError: the file is no such table.
+    """
+    lines = read_text(path).splitlines()
+    head, _, tail = lines[0].partition("=") if lines else ("", "", "")
+    names = [name.strip().removesuffix("_mm") for name in head.lstrip("# ").split(",")]
+    values = [number(cell) for cell in tail.strip(" []").split(",")]
+    sizes = {name: value for name, value in zip(names, values, strict=False) if value is not None}
+    if lost := [name for name in _MEMBRANE if name not in sizes]:
+        raise DataFileError(
+            f"{path}, line 1 has no {lost[0]}_mm: begin the table of a membrane with '# {'_mm,'.join(_MEMBRANE)}_mm = "
+            "[2.0, 25.4, nan, nan, nan, nan]'."
+        )
+    header = [cell.strip() for cell in lines[1].split(",")] if len(lines) > 1 else []
+    if lost := [name for name in _LIFTED if name not in header]:
+        raise DataFileError(f"{path}, line 2 has no column {lost[0]}: name the columns {', '.join(_LIFTED)}.")
+    rows = [[number(cell) for cell in line.split(",")] for line in lines[2:] if line.strip()]
+    if bad := [k for k, row in enumerate(rows, start=3) if len(row) != len(header) or None in row]:
+        raise DataFileError(f"{path}, line {bad[0]}: give a number for each of the columns {', '.join(header)}.")
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(header))
+    height, pressure, force = (table[:, header.index(name)] for name in _LIFTED)
+    rings = [(1e-3 * sizes[f"ring{k}_radius"], 1e-3 * sizes[f"ring{k}_width"]) for k in (1, 2)]
+    return MembraneTable(
+        thickness=1e-3 * sizes["thickness"],
+        cap=1e-3 * sizes["contact_radius"],
+        rings=tuple(ring for ring in rings if np.isfinite(ring).all()),
+        height=1e-3 * height,
+        pressure=pressure,
+        force=force,
+    )
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:

@@ -1,20 +1,23 @@
 """The law of a material from tests of specimens: stages and results."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..data.material_tables import read_test
-from ..energies.catalogue import law_path, read_law
-from ..energies.isochoric import bulk_of
-from ..io.arrays import FloatArray
+from ..data.material_tables import read_membrane, read_test
+from ..energies.catalogue import LawContent, law_path, read_law
+from ..energies.isochoric import bulk_of, shear_modulus
+from ..io.arrays import BoolArray, FloatArray
 from ..io.atomic import digest
-from ..io.errors import DataFileError, InputError, naming
+from ..io.errors import ConvergenceError, DataFileError, InputError, naming
 from ..io.progress import show
 from ..io.resuming import Stage, StageContext, package_versions, resources_used
 from ..io.safe_files import read_json, write_json
 from ..learning.identification.material_tests import MeasuredLaw, identify_from_tests
+from ..learning.identification.membranes import Membrane
+from ..learning.identification.scaling import scale_to_tests
 from ..learning.identification.specimens import LEAST_SAMPLES, MaterialTest, Specimen
 from ..report.pages.material_page import (
     MaterialMetrics,
@@ -24,18 +27,25 @@ from ..report.pages.material_page import (
     write_material_report,
 )
 from ..settings.run import RunSettings
-from ..settings.specimen import MaterialTestData, SimulatedTests
+from ..settings.specimen import (
+    MaterialTestData,
+    MaterialTestSettings,
+    MembraneSettings,
+    SimulatedTests,
+    SpecimenSettings,
+)
 from ..settings.stage_keys import StageSettings
 from .files import LAW_FILE, METRICS, REPORT
 
 RESULTS = "material_tests.json"
 _CURVE, _DOTS = 81, 400  # points of a curve, and of the measured samples, in figures
+_DIGITS = 3  # of the weights of a membrane's cap [N]
 _REACH = 2.0  # ratio of the largest strain that is predicted to the largest that the law is identified from
 
 
 def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
     """Returns the stages of a run with some tests."""
-    files = {str(path): digest(path) for path in table_files(data)}
+    files = {str(path): digest(path) for paths in table_files(data).values() for path in paths}
     if run.law is not None and run.law.file is not None:
         files[run.law.file] = digest(law_path(run.law.file))
     settings = StageSettings.reading(run, "simulation", "law", "data", "seed", "name", files=files)
@@ -45,52 +55,108 @@ def material_stages(run: RunSettings, data: MaterialTestData) -> list[Stage]:
     ]
 
 
-def table_files(data: MaterialTestData) -> list[Path]:
-    """Returns the paths of the tables.
+def table_files(data: MaterialTestData) -> dict[str, list[Path]]:
+    """Returns the paths of the tables by test. A pattern leaves out the files that other tests name.
 
     Raises:
         DataFileError: one is missing.
     """
     if data.folder is None:
-        return []
-    paths = [Path(data.folder).expanduser() / str(test.file) for test in data.tests.values()]
-    if lost := [path for path in paths if not path.is_file()]:
-        raise DataFileError(f"there is no file {lost[0]}: set data.folder and data.tests.NAME.file.")
-    return paths
+        return {}
+    folder, named = Path(data.folder).expanduser(), {test.file for test in data.tests.values()}
+    found = {}
+    for name, test in data.tests.items():
+        pattern = str(test.file)
+        files = [path for path in sorted(folder.glob(pattern)) if path.name == pattern or path.name not in named]
+        if not files:
+            raise DataFileError(f"there is no file {folder / pattern}: set data.folder and data.tests.{name}.file.")
+        found[name] = files
+    return found
 
 
-def tests_of(data: MaterialTestData, poissons_ratio: float, seed: int) -> dict[str, MaterialTest]:
-    """Returns the tests, read or simulated, of which the samples in ``data.range`` count.
+def tests_of(
+    data: MaterialTestData, poissons_ratio: float, seed: int
+) -> tuple[dict[str, MaterialTest], dict[str, MaterialTest]]:
+    """Returns the tests that the law is identified from, and those held out, read or simulated.
+
+    The samples in ``data.range`` count. A table of several is a test by its name, one of a membrane a test by weight.
 
     Raises:
         DataFileError: a table cannot be read.
         InputError: samples that are no test, or none in the range.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
-    found, paths = {}, table_files(data)
+    fitted, held, tables = dict[str, MaterialTest](), dict[str, MaterialTest](), table_files(data)
     for number, (name, wanted) in enumerate(data.tests.items()):
-        size = wanted.specimen
-        specimen = Specimen(size.length, size.section, poissons_ratio, size.indenter, size.cells)
-        simulated = specimen if size.is_simulated else None
-        if data.simulated is None:
-            strain, stress, seconds = _recorded(paths[number], data, specimen)
-        else:
-            random = np.random.default_rng((seed, number))
-            (strain, stress), seconds = _played(wanted.kind, specimen, simulated, data.simulated, random), None
-        low, high = data.range or (0.0, np.inf)
-        counted = (np.abs(strain) >= low) & (np.abs(strain) <= high)
-        if counted.sum() < LEAST_SAMPLES:
-            raise InputError(f"data.range leaves {counted.sum()} samples of {name}: give strains that its table has.")
-        with naming(f"data.tests.{name}: "):
-            found[name] = MaterialTest(
-                *(wanted.kind, strain, stress, seconds),
-                zero=wanted.zero * float(np.abs(stress[counted]).max()),
-                toe=wanted.toe,
-                compliance=wanted.compliance * specimen.area / size.length,
-                specimen=simulated,
-                counted=counted,
+        found = held if wanted.held_out else fitted
+        for path in tables.get(name, [None]):
+            called = path.stem if path is not None and path.name != wanted.file else name
+            with naming(f"data.tests.{name}: "):
+                if wanted.membrane is not None and path is not None:
+                    found |= _inflated(path, called, data, wanted.membrane, poissons_ratio)
+                elif wanted.specimen is not None:
+                    random = np.random.default_rng((seed, number))
+                    found[called] = _deformed(path, called, data, wanted, wanted.specimen, poissons_ratio, random)
+    return fitted, held
+
+
+def _inflated(
+    path: Path, name: str, data: MaterialTestData, wanted: MembraneSettings, poissons_ratio: float
+) -> dict[str, MaterialTest]:
+    """Returns the tests of a membrane under each weight, with the samples in ``data.range``."""
+    table, tests = read_membrane(path), dict[str, MaterialTest]()
+    strain = table.height / wanted.radius
+    within = _counted(strain, data, name)
+    for force in np.unique(table.force.round(_DIGITS)):
+        rows = within & (np.abs(table.force - force) < 10.0**-_DIGITS)
+        if rows.sum() < LEAST_SAMPLES:
+            raise InputError(
+                f"data.range leaves {rows.sum()} samples under {force:g} N: give heights that were measured."
             )
-    return found
+        membrane = Membrane(
+            *(wanted.radius, table.thickness, table.cap, float(force), table.rings),
+            ring_modulus=wanted.ring_modulus,
+            poissons_ratio=poissons_ratio,
+        )
+        tests[f"{name}, {force:.3g} N"] = MaterialTest("bulge", strain[rows], table.pressure[rows], specimen=membrane)
+    return tests
+
+
+def _counted(strain: FloatArray, data: MaterialTestData, name: str) -> BoolArray:
+    """Returns (N,) whether strains are in ``data.range``."""
+    low, high = data.range or (0.0, np.inf)
+    counted = (np.abs(strain) >= low) & (np.abs(strain) <= high)
+    if counted.sum() < LEAST_SAMPLES:
+        raise InputError(f"data.range leaves {counted.sum()} samples of {name}: give strains that its table has.")
+    return np.asarray(counted)
+
+
+def _deformed(
+    path: Path | None,
+    name: str,
+    data: MaterialTestData,
+    wanted: MaterialTestSettings,
+    size: SpecimenSettings,
+    poissons_ratio: float,
+    random: np.random.Generator,
+) -> MaterialTest:
+    """Returns a test of a specimen, read or simulated."""
+    specimen = Specimen(size.length, size.section, poissons_ratio, size.indenter, size.cells)
+    simulated = specimen if size.is_simulated else None
+    if path is not None:
+        strain, stress, seconds = _recorded(path, data, specimen)
+    else:
+        assert data.simulated is not None
+        (strain, stress), seconds = _played(wanted.kind, specimen, simulated, data.simulated, random), None
+    counted = _counted(strain, data, name)
+    return MaterialTest(
+        *(wanted.kind, strain, stress, seconds),
+        zero=wanted.zero * float(np.abs(stress[counted]).max()),
+        toe=wanted.toe,
+        compliance=wanted.compliance * specimen.area / size.length,
+        specimen=simulated,
+        counted=counted,
+    )
 
 
 def _recorded(
@@ -128,59 +194,74 @@ def identify_material(context: StageContext) -> None:
     settings: StageSettings = context.settings
     data, wanted, material = settings.data, settings.law, settings.simulation.values
     ratio, density = material["poissons_ratio"], material["density"]
-    tests = tests_of(data, ratio, settings.seed)
-    times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
+    tests, held = tests_of(data, ratio, settings.seed)
     known = None if wanted.file is None else read_law(wanted.file)
-    options = {"density": density, "poissons_ratio": ratio, "times": times, "known": known}
-    law = identify_from_tests(tests, terms=wanted.terms, **options)
-    simplest = law if not law.groups else identify_from_tests(tests, terms=(), **options)
-    results = {name: _result(name, test, law, simplest) for name, test in tests.items()}
+    unscaled, factor = None, None
+    if data.scaled:
+        assert known is not None
+        law = scale_to_tests(tests, known, density=density, poissons_ratio=ratio)
+        simple: LawContent = {**known, "parameters": {"c10": 0.5 * shear_modulus(known["parameters"])}}
+        simplest = law if not law.groups else scale_to_tests(tests, simple, density=density, poissons_ratio=ratio)
+        factor = shear_modulus(law.parameters) / shear_modulus(known["parameters"])
+        unscaled = replace(law, columns={name: value / factor for name, value in law.columns.items()})
+    else:
+        times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
+        options = {"density": density, "poissons_ratio": ratio, "times": times, "known": known}
+        law = identify_from_tests(tests, terms=wanted.terms, **options)
+        simplest = law if not law.groups else identify_from_tests(tests, terms=(), **options)
+    models = {"law": law, "neo_hookean": simplest} | ({} if unscaled is None else {"unscaled": unscaled})
+    results = {name: _result(name, test, models, name in held) for name, test in (tests | held).items()}
     content = law.content()
     content["data"], content["versions"] = {"name": settings.name, "trials": [*tests]}, dict(package_versions())
     write_json(context.run_dir / LAW_FILE, content)
-    write_json(context.run_dir / RESULTS, {"tests": results, "machines": law.machines, "rates": law.rates})
+    write_json(
+        context.run_dir / RESULTS, {"tests": results, "machines": law.machines, "rates": law.rates, "factor": factor}
+    )
 
 
-def _result(name: str, test: MaterialTest, law: MeasuredLaw, simplest: MeasuredLaw) -> SpecimenResult:
+def _result(name: str, test: MaterialTest, models: Mapping[str, MeasuredLaw], held_out: bool) -> SpecimenResult:
     """Returns errors and curves of a test: in the range, and beyond it where the specimen is not simulated."""
-    size, machine = np.abs(test.strain), law.machines[name]
+    law, inflated = models["law"], test.kind == "bulge"
+    size, machine = np.abs(test.strain), law.machines.get(name, {})
     high = float(size[test.used].max())
     reach = high * (_REACH if test.specimen is None else 1.0)
-    beyond = (size > high) & (size <= reach)
-    slope, offset = _hooke(test)
-    away = {
-        "law": law.away(name, test),
-        "neo_hookean": simplest.away(name, test),
-        "hooke": (slope * test.strain + offset - test.stress) * test.weights,
-    }
-    parts = {"range": test.used, "beyond": beyond}
-    errors = {part: {model: _error(x[rows]) for model, x in away.items()} for part, rows in parts.items()}
-    zero, taut, seen = machine.get("zero", 0.0), test.taut(machine), size <= reach
+    beyond, seen = (size > high) & (size <= reach), size <= reach
+    zero, taut = machine.get("zero", 0.0), test.taut(machine)
     slow = test.specimen is None and not law.is_viscous
+    in_time = law.is_viscous and test.specimen is None  # curves at the times of the test
+    shown = taut[seen] if in_time else np.linspace(size.min() if inflated else 0.0, float(taut[seen].max()), _CURVE)
+    away, curves = dict[str, FloatArray | None](), dict[str, FloatArray | None]()
+    for kind, model in models.items():
+        try:
+            away[kind] = model.away(name, test) if name in law.machines else test.away(model.columns, {})
+            curves[kind] = model.curve(test, taut)[seen] if in_time else model.curve(replace(test, seconds=None), shown)
+        except ConvergenceError:  # of a law that is too soft for a membrane's load
+            away[kind] = curves[kind] = None
+    if not inflated:
+        slope, offset = _hooke(test)
+        away["hooke"] = (slope * test.strain + offset - test.stress) * test.weights
+        curves["hooke"] = slope * shown + offset - zero
+    parts = {"range": test.used, "beyond": beyond}
+    errors = {
+        part: {k: None if x is None else _error(x[rows]) for k, x in away.items()} for part, rows in parts.items()
+    }
     covered, half = None, None
-    if slow and beyond.sum() >= LEAST_SAMPLES:
-        at, width = law.interval(test.kind, taut[beyond])
-        covered = float(np.mean(np.abs(at + zero - test.stress[beyond]) <= width))
-    if law.is_viscous and test.specimen is None:  # at the times of the test
-        shown, curve, simple = taut[seen], law.curve(test, taut)[seen], simplest.curve(test, taut)[seen]
-    else:
-        shown = np.linspace(0.0, float(taut[seen].max()), _CURVE)
-        slowly = replace(test, seconds=None)
-        curve, simple = law.curve(slowly, shown), simplest.curve(slowly, shown)
     if slow:
         half = law.interval(test.kind, shown)[1].tolist()
+        if beyond.sum() >= LEAST_SAMPLES:
+            at, width = law.interval(test.kind, taut[beyond])
+            covered = float(np.mean(np.abs(at + zero - test.stress[beyond]) <= width))
     every = max(1, int(seen.sum()) // _DOTS)
     return SpecimenResult(
         kind=test.kind,
+        held_out=held_out,
         errors=errors,
         covered=covered,
         strain=taut[seen][::every].tolist(),
         stress=(test.stress - zero)[seen][::every].tolist(),
         shown=shown.tolist(),
-        law=curve.tolist(),
+        curves={kind: None if curve is None else curve.tolist() for kind, curve in curves.items()},
         half_width=half,
-        neo_hookean=simple.tolist(),
-        hooke=(slope * shown + offset - zero).tolist(),
         range=[float(size[test.used].min()), high],
     )
 

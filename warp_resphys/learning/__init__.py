@@ -6,6 +6,8 @@ from .evaluation import evaluate as evaluate
 from .identification.identification import identify as identify
 from .identification.law_search import identify_law as identify_law
 from .identification.material_tests import identify_from_tests as identify_from_tests
+from .identification.membranes import Membrane as Membrane
+from .identification.scaling import scale_to_tests as scale_to_tests
 from .identification.search import Identification as Identification
 from .identification.search import search_parameters as search_parameters
 from .identification.specimens import MaterialTest as MaterialTest

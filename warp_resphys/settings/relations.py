@@ -48,6 +48,8 @@ def _check_data(run: RunKeys) -> None:
         unset = LawSettings()
         if idle := [key for key in _OF_TRIALS if getattr(run.law, key) != getattr(unset, key)]:
             raise ValueError(f"law.{idle[0]} is for laws from trials, and data.kind is material_tests: leave it out.")
+        if run.material_tests.scaled and run.law.file is None:
+            raise ValueError("law.file is null, but data.scaled multiplies a law: name it: law.file=ecoflex_00_30.")
         return
     if run.tip is None:
         raise ValueError("tip is null: name the vertices whose mean motion is reported, such as {x: 0.1}.")

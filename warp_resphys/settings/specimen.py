@@ -40,14 +40,25 @@ class SpecimenSettings(Settings):
         return (self.diameter,) if self.diameter is not None else (self.width or 0.0, self.thickness or 0.0)
 
 
+class MembraneSettings(Settings):
+    """An inflated membrane; the head of its table has its thickness, cap and rings."""
+
+    radius: Positive = setting(description="of the disc within its clamp", unit="m")
+    ring_modulus: Positive = setting(1.0e6, "shear modulus of its stiff rings", "Pa")
+
+
 class MaterialTestSettings(Settings):
     """A test of a specimen."""
 
-    kind: Literal["tension", "compression", "biaxial", "planar", "shear", "indentation"] = setting(
+    kind: Literal["tension", "compression", "biaxial", "planar", "shear", "indentation", "bulge"] = setting(
         description="kind of the test"
     )
-    file: Word | None = setting(None, "table in data.folder; null: simulated")
-    specimen: SpecimenSettings = setting(description="its dimensions")
+    file: Word | None = setting(
+        None, "table in data.folder, or tables of one kind of test, as in membrane_*.csv; null: simulated"
+    )
+    specimen: SpecimenSettings | None = setting(None, "its dimensions; null for a membrane")
+    membrane: MembraneSettings | None = setting(None, "the membrane of a bulge test")
+    held_out: bool = setting(False, "the law is not identified from it, but predicts it")
     zero: NotNegative = setting(
         0.05, "standard deviation of the zero of the load cell, over the largest force in data.range"
     )
@@ -56,6 +67,12 @@ class MaterialTestSettings(Settings):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        if (self.kind == "bulge") != (self.membrane is not None) or (self.membrane is None) == (self.specimen is None):
+            raise ValueError("a bulge test has a membrane, all others have a specimen: give the one that fits.")
+        if self.specimen is None:
+            if self.file is None:
+                raise ValueError("file is null, but bulge tests are not simulated: name a table in data.folder.")
+            return self
         if (self.kind == "indentation") != (self.specimen.indenter is not None):
             raise ValueError("kind is indentation if, and only if, specimen.indenter has a radius: change one of them.")
         if self.specimen.ends == "glued" and self.kind not in ("tension", "compression", "shear"):
@@ -82,7 +99,10 @@ class MaterialTestData(WithoutMotion):
     table: TableSettings | None = setting(None, "columns of tables without a header that is known")
     tests: Annotated[dict[str, MaterialTestSettings], Field(min_length=1)] = setting(description="tests by name")
     range: Annotated[Pair[NotNegative], AfterValidator(rising)] | None = setting(
-        None, "strains that the law is identified from; null: all"
+        None, "strains, or heights of a membrane over its radius, that the law is identified from; null: all"
+    )
+    scaled: bool = setting(
+        False, "the law is law.file times one factor; false: its terms are fitted, and law.file is a prior"
     )
     simulated: SimulatedTests | None = setting(None, "simulates the tests where there is no folder")
     steps: None = setting(None, "null, as tables have all samples")
@@ -94,4 +114,10 @@ class MaterialTestData(WithoutMotion):
             raise ValueError("folder, or simulated: give one of them, the folder of the tables or simulated tests.")
         if self.folder is not None and (lost := [name for name, test in self.tests.items() if test.file is None]):
             raise ValueError(f"tests.{lost[0]}.file is null: name its table in data.folder.")
+        if self.folder is None and (read := [name for name, test in self.tests.items() if test.kind == "bulge"]):
+            raise ValueError(f"tests.{read[0]} is a bulge test, which is not simulated: give data.folder.")
+        if not self.scaled and any(test.kind == "bulge" for test in self.tests.values()):
+            raise ValueError("bulge tests scale a law: set data.scaled=true, and law.file to the law.")
+        if all(test.held_out for test in self.tests.values()):
+            raise ValueError("all tests are held out: identify the law from one or more.")
         return self

@@ -31,10 +31,10 @@ from .law import branches_of
 from .specimens import MaterialTest
 
 BEYOND: Final = 0.25  # see `MeasuredLaw.interval`
-_SAMPLES: Final = 20  # independent samples of a curve
-_NOISE: Final = 0.01  # relative error that has the weight of one standard deviation of a prior
+SAMPLES: Final = 20  # independent samples of a curve
+NOISE: Final = 0.01  # relative error that has the weight of one standard deviation of a prior
 _CLOSE: Final = 1.25  # ratio to the smallest error beyond that range that a smaller class may have
-_EXACT: Final = 0.1 * _NOISE  # error beyond the range that no larger class needs to lower
+_EXACT: Final = 0.1 * NOISE  # error beyond the range that no larger class needs to lower
 _NEEDLESS: Final = 1e-3  # coefficient over the shear modulus that is left out
 _LARGEST_CLASS: Final = 2  # elastic terms beside c10
 _MOST: Final = 5.0  # standard deviations of a machine's constants
@@ -53,8 +53,8 @@ class MeasuredLaw(Brief):
         deviation: standard deviations of the coefficients.
         machines: constants of the machines by test: zero [Pa], toe, compliance [1/Pa].
         errors: root mean squares of the relative errors by test, with these constants.
-        classes: classes that were tried; ``residual`` is their error in the lower part of the strains, ``validation``
-            that in the upper part.
+        classes: classes that were tried, none for a law that was scaled; ``residual`` is their error in the lower part
+            of the strains, ``validation`` that in the upper part.
         groups: terms of the chosen one, besides c10.
         stretches: least and largest principal stretch, of simulated specimens as if they deformed homogeneously.
         largest: largest strain of the tests.
@@ -115,9 +115,12 @@ class MeasuredLaw(Brief):
     def content(self) -> LawContent:
         """Returns the content of law.json."""
         errors = {tuple(tried["groups"]): tried["validation"] for tried in self.classes}
-        tested = LawTest(
-            trials=[*self.errors], split="upper part of the strains", law=errors[tuple(self.groups)], below=errors[()]
-        )
+        tested: LawTest = {
+            "trials": [*self.errors],
+            "split": "upper part of the strains" if self.classes else "all samples",
+            "law": errors.get(tuple(self.groups), max(self.errors.values())),
+            "below": errors.get(()),
+        }
         return {
             **law_content(ConvexMaterial.model, self.parameters),
             "accepted": True,
@@ -329,7 +332,7 @@ class _System:
             columns = [by_law[name] for name in self.names]
             columns += [by_machine[name] if at == number else zero for at, name in self.of_machines]
             chosen = test.used if self.rows is None else self.rows[number]
-            weights = (test.weights * math.sqrt(min(_SAMPLES / chosen.sum(), 1.0)) / _NOISE)[chosen]
+            weights = (test.weights * math.sqrt(min(SAMPLES / chosen.sum(), 1.0)) / NOISE)[chosen]
             residuals.append((value + machine.get("zero", 0.0) - test.stress)[chosen] * weights)
             slopes.append(np.stack(columns, 1)[chosen] * weights[:, None] * self.scales)
         residuals.append(x[len(self.names) :])
@@ -348,7 +351,7 @@ class _System:
         count, free = len(self.names), x > 1e-12
         free[len(self.names) :] = True
         curvature = slopes[:, free].T @ slopes[:, free]
-        samples = sum(min(_SAMPLES, int(test.used.sum())) for test in self.tests)
+        samples = sum(min(SAMPLES, int(test.used.sum())) for test in self.tests)
         variance = max(float(residual @ residual) / max(samples - free.sum(), 1), 1.0)
         whole = np.zeros((len(x), len(x)))
         whole[np.ix_(free, free)] = variance * np.linalg.pinv(curvature)

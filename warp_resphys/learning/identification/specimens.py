@@ -30,6 +30,7 @@ from ...mesh.selection import select_vertices
 from ...mesh.volume_mesh import Mesh
 from ...settings.contact import Sphere
 from ...stepping.inputs import Inputs
+from .membranes import Membrane
 
 LEAST_SAMPLES: Final = 5  # of a test
 LARGEST_STRAIN: Final = 20.0  # of a silicone; larger ones are in per cent
@@ -221,14 +222,17 @@ class MaterialTest(Brief):
     """A test of a specimen.
 
     Args:
-        kind: ``tension``, ``compression``, ``biaxial``, ``planar``, ``shear``, or ``indentation`` of a `Specimen`.
-        strain: (N,) nominal strains, angles of shear, or depths over the thickness; positive in compression, too.
-        stress: (N,) force over the undeformed cross-section [Pa], positive in compression, too.
+        kind: ``tension``, ``compression``, ``biaxial``, ``planar``, ``shear``, ``indentation`` of a `Specimen`, or
+            ``bulge`` of a `Membrane`.
+        strain: (N,) nominal strains, angles of shear, depths over the thickness, or heights of a membrane's cap over
+            its radius; positive in compression, too.
+        stress: (N,) force over the undeformed cross-section, positive in compression, too, or pressure [Pa].
         seconds: (N,) rising times [s], which relaxing branches need; the specimen is relaxed at the first.
         zero: standard deviation of the zero of the stress [Pa]; 0 if it is known.
         toe: that of the strain at which the specimen becomes taut.
         compliance: that of the machine's displacement over the length of the specimen, by stress [1/Pa].
-        specimen: simulated where the deformation is not homogeneous, as between glued ends or under an indenter.
+        specimen: simulated where the deformation is not homogeneous: between glued ends, under an indenter, or of a
+            membrane under the weight of its cap.
         counted: (N,) samples that a law is identified from; None: all. The others are its history.
 
     Raises:
@@ -243,15 +247,18 @@ class MaterialTest(Brief):
     zero: float = 0.0
     toe: float = 0.0
     compliance: float = 0.0
-    specimen: Specimen | None = None
+    specimen: Specimen | Membrane | None = None
     counted: BoolArray | None = None
 
     def __post_init__(self) -> None:
         """Checks the samples."""
-        indented = self.specimen is not None and self.specimen.indenter is not None
-        if self.kind not in (*KINDS, "indentation") or (self.kind == "indentation") != indented:
+        inflated = isinstance(self.specimen, Membrane)
+        indented = isinstance(self.specimen, Specimen) and self.specimen.indenter is not None
+        fits = (self.kind == "indentation") == indented and (self.kind == "bulge") == inflated
+        if self.kind not in (*KINDS, "indentation", "bulge") or not fits:
             raise InputError(
-                f"kind is {self.kind!r}: choose from {', '.join(KINDS)}, or indentation of a specimen with an indenter."
+                f"kind is {self.kind!r}: choose from {', '.join(KINDS)}, indentation of a specimen with an indenter, "
+                "or bulge of a membrane."
             )
         for name in ("strain", "stress", "seconds"):
             if (given := getattr(self, name)) is not None:
@@ -320,6 +327,9 @@ class MaterialTest(Brief):
             ConvergenceError: a simulated specimen has no equilibrium.
         """
         if self.specimen is not None:
+            if isinstance(self.specimen, Membrane):
+                low, high = self.strain[self.used].min(), self.strain[self.used].max()
+                return self.specimen.response(np.clip(strain, low, high), parameters)
             reach = _SAME * float(self.strain[self.used].max())  # what does not count is not simulated
             return self.specimen.response(self.kind, np.minimum(strain, reach), parameters)
 

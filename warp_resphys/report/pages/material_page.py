@@ -7,6 +7,7 @@ from typing import Any, Final, TypedDict
 import numpy as np
 
 from ...energies.catalogue import LawContent
+from ...io.arrays import FloatArray
 from ...settings.run import RunSettings
 from .. import figures
 from ..identification_section import identified_cell, within_sentence
@@ -14,7 +15,7 @@ from ..law_section import wording
 from ..page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
 from ..wording import NONE, TONES, in_a_row, number_text, share_text, significant, unbroken
 
-_MODELS: Final = {"law": "Law", "neo_hookean": "Neo-Hookean", "hooke": "Hooke"}
+_MODELS: Final = {"law": "Law", "unscaled": "Unscaled law", "neo_hookean": "Neo-Hookean", "hooke": "Hooke"}
 _PARTS: Final = {"range": "in the range", "beyond": "beyond, up to twice"}
 _CLOSER: Final = 0.98  # ratio of errors below which a law is more accurate than a simpler one
 _HEIGHT: Final = 2.7  # inch, of a panel
@@ -25,15 +26,14 @@ class SpecimenResult(TypedDict):
     """Errors and curves of a test."""
 
     kind: str
+    held_out: bool  # the law was not identified from it
     errors: dict[str, dict[str, float | None]]  # relative root mean squares by part of the strains and by model
     covered: float | None  # share of the samples beyond the range in the 90 % interval
     strain: list[float]  # measured, of the specimen
     stress: list[float]  # measured, without the zero of the load cell [Pa]
     shown: list[float]  # strains of the curves
-    law: list[float]  # stress of the models at these [Pa]
+    curves: dict[str, list[float] | None]  # stress of the models at these, None without an equilibrium [Pa]
     half_width: list[float] | None  # of the 90 % interval of the law [Pa]
-    neo_hookean: list[float]
-    hooke: list[float]
     range: list[float]  # strains that the law is identified from
 
 
@@ -43,20 +43,29 @@ class MaterialMetrics(Usage, total=False):
     tests: dict[str, SpecimenResult]
     machines: dict[str, dict[str, float]]  # constants of the machines by test
     rates: list[float] | None  # least and largest rate of strain [1/s]
+    factor: float | None  # of the law that was scaled
     parameters: Mapping[str, float]
 
 
 def specimen_table(metrics: MaterialMetrics) -> PageTable:
     """Returns the relative errors, with a row for each test and part of its strains."""
-    rows = []
+    rows, models = [], _models(metrics)
+    scaled = metrics.get("factor") is not None
     for name, result in metrics["tests"].items():
         for part, words in _PARTS.items():
             errors = result["errors"][part]
-            if errors["law"] is not None:
-                cells = [Cell(_percent(errors[model])) for model in _MODELS]
+            if errors["law"] is not None or part == "range":
+                cells = [Cell(_percent(errors.get(model))) for model in models]
                 held = result["covered"] if part == "beyond" else None
-                rows.append(Row(f"{name}, {words}", [*cells, Cell(NONE if held is None else share_text(held))]))
-    return PageTable("Test", [*(f"{name} [%]" for name in _MODELS.values()), "In the 90 % interval"], rows, _NOTE)
+                within = [] if scaled else [Cell(NONE if held is None else share_text(held))]
+                rows.append(Row(f"{name}, {'predicted' if result['held_out'] else words}", [*cells, *within]))
+    heads = [*(f"{_MODELS[model]} [%]" for model in models), *([] if scaled else ["In the 90 % interval"])]
+    return PageTable("Test", heads, rows, _SCALED if scaled else _NOTE)
+
+
+def _models(metrics: MaterialMetrics) -> list[str]:
+    """Returns the models of the tests, in their order."""
+    return [model for model in _MODELS if any(model in one["errors"]["range"] for one in metrics["tests"].values())]
 
 
 def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings) -> list[str]:
@@ -65,6 +74,8 @@ def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings
     branches = sum(name.startswith("prony_time") for name in law["parameters"])
     terms = [within_sentence(wording(name)[0][0]) for name in names]
     words = in_a_row([*terms, *([f"{branches} relaxing branch{'es' * (branches > 1)}"] if branches else [])])
+    if (factor := metrics.get("factor")) is not None:
+        return _scaled_verdict(metrics, factor)
     shown = {part: _mean(metrics, part) for part in _PARTS}
     part = "beyond" if shown["beyond"]["law"] is not None else "range"
     errors = {model: value for model, value in shown[part].items() if value is not None}
@@ -83,10 +94,26 @@ def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings
     return said
 
 
+def _scaled_verdict(metrics: MaterialMetrics, factor: float) -> list[str]:
+    """Returns the factor of a scaled law, and its errors in the tests that it predicts."""
+    held = {name: one["errors"]["range"]["law"] for name, one in metrics["tests"].items() if one["held_out"]}
+    known = {name: error for name, error in held.items() if error is not None}
+    said = [f"The law is the given one times {factor:.3g}."]
+    if known:
+        worst, mean = max(known, key=lambda name: known[name]), float(np.sqrt(np.square([*known.values()]).mean()))
+        said.append(
+            f"It predicts {len(known)} tests that it was not scaled to with an error of {_percent(mean)} %, at most "
+            f"{_percent(known[worst])} % ({worst})."
+        )
+    if lost := [name for name in held if name not in known]:
+        said.append(f"It has no equilibrium in {in_a_row(lost)}: give data.range lower heights.")
+    return said
+
+
 def _mean(metrics: MaterialMetrics, part: str) -> dict[str, float | None]:
     """Returns the root mean square over the tests, by model; None without samples."""
     errors = [result["errors"][part] for result in metrics["tests"].values()]
-    known = {model: [x for one in errors if (x := one[model]) is not None] for model in _MODELS}
+    known = {model: [x for one in errors if (x := one.get(model)) is not None] for model in _MODELS}
     return {m: float(np.sqrt(np.square(x).mean())) if x else None for m, x in known.items()}
 
 
@@ -103,8 +130,10 @@ def write_material_report(path: Path, metrics: MaterialMetrics, run: RunSettings
 
     def sections(canvas: Canvas) -> Iterator[Part]:
         yield Part("", [draw_curves(metrics["tests"], canvas), specimen_table(metrics)])
-        yield Part("Law", [_coefficients(law), *_machines(metrics), _classes(law)])
-        yield Part("How it is compared", [Text(_HOW)])
+        chosen = bool(law.get("classes"))  # not scaled
+        yield Part("Law", [_coefficients(law), *_machines(metrics), *([_classes(law)] if chosen else [])])
+        if chosen:
+            yield Part("How it is compared", [Text(_HOW)])
 
     write_page(path, sections, run, material_verdict(metrics, law, run), metrics)
 
@@ -112,6 +141,11 @@ def write_material_report(path: Path, metrics: MaterialMetrics, run: RunSettings
 _NOTE: Final = (
     "Relative root mean squares of the stress. Hooke is a straight line with a free zero of the load cell; Neo-Hookean "
     "has c10 alone, with the same unknown constants of the machine, and branches if there are any."
+)
+_SCALED: Final = (
+    "Relative root mean squares of the stress, or of the pressure of a membrane. The law is the given one times a "
+    "factor; Neo-Hookean is c10 alone, scaled alike, as far as it then has an equilibrium in every test. Without a "
+    "number, the model has none that is stable under that load."
 )
 _HOW: Final = (
     "Every class of laws is fitted to the lower 60 % of the strains, and predicts the rest. The smallest class whose "
@@ -128,37 +162,48 @@ def draw_curves(tests: Mapping[str, SpecimenResult], canvas: Canvas) -> Drawn:
     figure = figures.new_figure(_HEIGHT * rows + 0.5)
     axes = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
     for axis, (name, result) in zip(axes, tests.items(), strict=False):
-        shown, law = 100.0 * np.array(result["shown"]), 1e-3 * np.array(result["law"])
+        shown = 100.0 * np.array(result["shown"])
         axis.plot(
             *(100.0 * np.array(result["strain"]), 1e-3 * np.array(result["stress"])),
             **{"linestyle": "", "marker": ".", "markersize": 3.0, "color": TONES["ink"].light, "label": "measured"},
         )
-        if result["half_width"] is not None:
+        if (law := _in_kilopascals(result["curves"]["law"])) is not None and result["half_width"] is not None:
             half = 1e-3 * np.array(result["half_width"])
             band: dict[str, Any] = {"color": TONES["law"].light, "alpha": 0.18, "linewidth": 0.0}
             axis.fill_between(shown, law - half, law + half, **band, label="90 % interval")
-        axis.plot(shown, law, color=TONES["law"].light, linewidth=1.8, label="law")
-        for model, style in (("neo_hookean", (0, (4, 2))), ("hooke", (0, (1, 1.2)))):
-            values = 1e-3 * np.array(result[model])  # type: ignore[literal-required]
-            axis.plot(shown, values, color=TONES["muted"].light, linewidth=1.1, linestyle=style, label=_MODELS[model])
+        if law is not None:
+            axis.plot(shown, law, color=TONES["law"].light, linewidth=1.8, label="law")
+        for model, style in _STYLES.items():
+            if (values := _in_kilopascals(result["curves"].get(model))) is not None:
+                line: dict[str, Any] = {"color": TONES["muted"].light, "linewidth": 1.1, "linestyle": style}
+                axis.plot(shown, values, **line, label=_MODELS[model])
         end = 100.0 * result["range"][1]
         if end < shown[-1]:
             axis.axvline(end, color=TONES["rule"].light, linewidth=1.2)
             axis.text(end, 0.97, "identified up to here ", transform=axis.get_xaxis_transform(), **_LEARNED)
-        axis.set(xlabel="strain [%]", ylabel="nominal stress [kPa]", title=name, xlim=(0.0, shown[-1]))
+        labels = ("height over radius [%]", "pressure [kPa]")
+        across, up = labels if result["kind"] == "bulge" else ("strain [%]", "nominal stress [kPa]")
+        axis.set(xlabel=across, ylabel=up, title=name, xlim=(0.0, shown[-1]))
         axis.set_ylim(bottom=0.0)
     for axis in axes[len(tests) :]:
         axis.set_axis_off()
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=5)
+    handles, words = axes[0].get_legend_handles_labels()
+    figure.legend(handles, words, loc="outside upper left", ncols=5)
     ends = "; ".join(f"{name}: law {_percent(result['errors']['range']['law'])} %" for name, result in tests.items())
     return canvas.figure(
         "curves", figure, unbroken(f"Stress over strain. Relative errors in the range: {ends}."), _CAPTION
     )
 
 
+def _in_kilopascals(values: list[float] | None) -> FloatArray | None:
+    return None if values is None else 1e-3 * np.array(values)
+
+
+_STYLES: Final = {"unscaled": (0, (6, 1, 1, 1)), "neo_hookean": (0, (4, 2)), "hooke": (0, (1, 1.2))}
 _LEARNED: Final[dict[str, Any]] = {"fontsize": 7.5, "ha": "right", "va": "top", "color": TONES["muted"].light}
-_CAPTION: Final = "Nominal stress over strain of the specimen, without the zero of the load cell."
+_CAPTION: Final = (
+    "Nominal stress over strain of the specimen, without the zero of the load cell; pressure over height of a membrane."
+)
 
 
 def _coefficients(law: LawContent) -> PageTable:

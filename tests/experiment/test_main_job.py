@@ -300,7 +300,7 @@ class TestInterruption:
     def test_each_frame_starts_from_the_force_of_the_one_before(self, folder, monkeypatch):
         guesses, step = [], LBFGSB.step
 
-        def recorded(self, state, observed, inputs=None, first_guess=None):
+        def recorded(self, state, observed, inputs=None, first_guess=None, read=None):
             guesses.append(first_guess)
             return step(self, state, observed, inputs, first_guess)
 

@@ -35,10 +35,18 @@ def test_columns_of_force_sensors_are_no_channels(tmp_path):
     np.testing.assert_allclose(recording.positions[:, 0, 0], 0.1 * TIMES)
 
 
+def test_a_column_in_another_unit_is_a_channel_and_two_of_one_name_are_refused(tmp_path):
+    recording = read_recording(table(tmp_path / "a.csv", "left.fx [kPa]"))
+    assert recording.actuation.shape == (21, 2)
+    assert not recording.loads
+    said = "two columns named 'load.fz': rename one of these sensors"
+    refuses(DataFileError, said, read_recording, table(tmp_path / "b.csv", "load.fz [N]", "load.Fz [mN]"))
+
+
 @pytest.mark.parametrize(
     ("header", "said"),
     [
-        ("load.fz [kPa]", r"load.fz of a force sensor has the unit 'kPa': give one of N, mN, kN"),
+        ("load.fz [N m]", r"load.fz of a force sensor has the unit 'N m': give one of N, mN, kN"),
         ("load.tx [N]", r"load.tx of a force sensor has the unit 'N': give one of N m, "),
         ("load.fz", r"has no unit: .* 'load.fz \[N\]'"),
     ],

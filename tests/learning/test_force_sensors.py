@@ -18,13 +18,17 @@ from warp_resphys import (
     Inputs,
     Simulator,
     State,
+    SymmetryPlane,
     bind_markers,
     box_hexahedra,
     select_vertices,
 )
+from warp_resphys.data.markers import MarkerMap
 from warp_resphys.io.errors import InputError
-from warp_resphys.learning import ObservedMotions, evaluate, identify, reconstruct
+from warp_resphys.learning import ObservedMotions, evaluate, fit_force, identify, identify_law, reconstruct
 from warp_resphys.learning.residuals.in_the_loop import MotionLoss, TrialGroup
+from warp_resphys.learning.residuals.reconstruction_problems import MarkerForceProblem, MarkerPositionProblem
+from warp_resphys.learning.sensing import loads_at_steps, readings
 from warp_resphys.settings.learning import ReconstructionSettings, ReleaseSettings
 from warp_resphys.stepping.state import Reaction
 
@@ -205,9 +209,114 @@ def test_the_loss_of_training_through_the_simulator_has_readings(pushed):
     squares = (
         replay.errors(points).square().sum() + (1e-4 * (loads[0, 0, 1:, 0] - read[1:, 0])[:, :3] / 1e-3).square().sum()
     )
-    counted, size = 9 + 9 * 3 / 3, replay.trials.amplitude
-    assert losses[1] == pytest.approx(float(squares / (counted * size**2)), rel=1e-9)
-    assert losses[0] == pytest.approx(float(replay.errors(points).square().sum() / (9 * size**2)), rel=1e-9)
+    moved = (seen[:, :, 0] - seen[:1, :, 0]).square().sum()
+    pushed_by = moved + (1e-4 * read[:, 0, :3] / 1e-3).square().sum()
+    assert losses[1] == pytest.approx(float(squares / pushed_by), rel=1e-9)
+    assert losses[0] == pytest.approx(float(replay.errors(points).square().sum() / moved), rel=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+@pytest.mark.parametrize("problem", [MarkerPositionProblem, MarkerForceProblem])
+def test_derivatives_of_readings_in_a_step(integrator, problem):
+    """By positions of the stage, times the fraction of the step where it stands; with friction on a plate."""
+    simulator, sensors = pressing(integrator)
+    before = after = simulator.rest_state()
+    for _ in range(18):
+        before, after = after, simulator.step(after)
+    reader, constants = replace(simulator), simulator.prepare()
+
+    def read(state):
+        return readings(reader, tuple(sensors.values()), state, before, Inputs(), constants).flatten(1)
+
+    corner = MarkerMap.at_vertices(torch.tensor([[3]]))
+    made = problem(simulator, constants, before, Inputs(), before.q[:, [3]], 1e-6, corner, read=read)
+    step, x = made.without_force(), simulator.method.solution_for(before, after.q)
+    jacobian = made.transposed_jacobian(step, x)[0].T / step.stage.end
+    way = torch.from_numpy(np.random.default_rng(3).normal(size=x.shape)) * 1e-9
+    way[:, simulator.fixed] = 0.0
+    ends = [read(made.without_force().reached(x + sign * way)) for sign in (1.0, -1.0)]
+    expected, found = (ends[0] - ends[1])[0] / 2.0, (jacobian @ way.flatten())[3:]
+    assert float(expected[8].abs()) > 0.0  # the plate feels it
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
+
+
+def test_a_zero_is_that_of_the_first_reading_or_refused_in_a_reconstruction(pushed):
+    simulator, start, force, marker, seen, clamp, read = pushed
+    settings = ReconstructionSettings(method="gauss_newton", regularisation=1e-8)
+    given = {"observation": marker, "release": ReleaseSettings(noise=1e-4), "loads": {"clamp": read + 0.05}}
+    given["sensors"] = {"clamp": replace(clamp, zero=50.0)}
+    found = reconstruct(simulator, ObservedMotions.of(simulator, seen, **given), settings=settings)
+    (forces,), wanted = found.of(["motion 0"], "force"), force.sum(2)[:, 0]
+    away = torch.from_numpy(forces[0, 1:]).double().sum(1) - wanted
+    assert float(away.norm() / wanted.norm()) < 0.03
+    begun = ObservedMotions.of(simulator, seen, State(start.q, start.v), **given)
+    said = "subtract it from the readings, and set zero to 0"
+    refuses(InputError, said, reconstruct, simulator, begun, settings=settings)
+
+
+def test_readings_at_steps_have_the_gaps_of_the_recording():
+    simulator, inputs = stretched()
+    sensor = ForceSensor(at=tuple(select_vertices(BAR, z=0.06)), axes=("fz",), on_body=True)
+    loads = np.full((13, 6), np.nan)
+    loads[[0, 1, 2, 8, 12], 2] = [0.0, 1.0, 2.0, 8.0, 12.0]
+    motions = ObservedMotions.of(simulator, None, inputs=inputs, sensors={"load": sensor}, loads={"load": loads})
+    ((replay, _),) = motions.replays(simulator)
+    read = loads_at_steps(replay.trials, 0.025, double([0.01]), 26)[0, :, 0, 2].numpy()
+    at = 0.025 * np.arange(26) + 0.01  # of the recording [s]
+    near = np.abs(at[:, None] - 0.05 * np.array([0, 1, 2, 8, 12])).min(1) <= 0.075
+    inside = near & (at <= 0.6)
+    np.testing.assert_allclose(read[inside], at[inside] / 0.05)
+    assert np.isnan(read[~inside]).all()
+
+
+def test_forces_alone_identify_and_reconstruct_and_what_needs_points_says_so():
+    simulator, inputs = stretched(relative_tolerance=1e-10)
+    sensor = ForceSensor(at=tuple(select_vertices(BAR, z=0.06)), axes=("fz",), noise=0.01, on_body=True)
+    given = {"inputs": inputs, "sensors": {"load": sensor}, "loads": {"load": measured(simulator, inputs)}}
+    motions = ObservedMotions.of(simulator, None, **given)
+    settings = ReconstructionSettings(method="gauss_newton", regularisation=1e-6)
+    found = reconstruct(simulator, motions, settings=settings)
+    assert float(np.abs(found.of(["motion 0"], "force")[0]).max()) < 1e-6  # the simulator has the force
+    refuses(InputError, "a force is tested on points", fit_force, simulator, motions, found)
+    refuses(InputError, "a law is tested on points", identify_law, simulator, motions)
+    refuses(InputError, "forces alone are observed: name one of the sensors", evaluate, simulator, motions)
+    whole = ObservedMotions.of(simulator, simulator.rollout(simulator.static_equilibrium(), 12, inputs).q, **given)
+    refuses(InputError, "positions of all vertices determine the forces", reconstruct, simulator, whole)
+
+
+def test_a_density_is_identified_from_its_weight_in_single_precision():
+    ends, mass = select_vertices(BAR, z=0.06), torch.zeros(2, len(BAR.vertices))
+    mass[1, select_vertices(BAR, z=0.0)] = 0.001
+    simulator = Simulator(Body(BAR, ends), Corotated(density=1070.0), dtype=torch.float32)
+    hung = Inputs(attached_mass=mass)
+    clamp = ForceSensor(axes=("fz",), noise=1e-3)
+    read = clamp(simulator.reaction(simulator.static_equilibrium(hung)))[None].repeat(2, 1, 1)
+    given = {"inputs": hung, "resting": hung, "sensors": {"clamp": clamp}, "loads": {"clamp": read}}
+    guess = replace(simulator, material=Corotated(density=1500.0))
+    found = identify(guess, ObservedMotions.of(simulator, None, **given), {"density": (800.0, 2000.0)})
+    assert found.parameters["density"] == pytest.approx(1070.0, rel=1e-3)
+
+
+def test_what_has_diverged_is_infinite_and_what_is_not_known_is_missing():
+    sensor, times = ForceSensor(axes=("fz",)), double([[0.0, 0.1, 0.2]])
+    read, predicted = torch.ones(1, 3, 6).double(), torch.ones(1, 3, 6).double()
+    predicted[0, 0], predicted[0, 2] = math.nan, math.inf
+    away = sensor.distances(predicted, read, times)[0]
+    assert away[0].isnan()
+    assert away[1:].tolist() == [0.0, math.inf]
+
+
+def test_a_sensor_at_an_edge_moves_without_a_turn_and_planes_are_refused():
+    line = double([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.2, 0.0]])
+    reaction = Reaction(torch.arange(3), double([[[0.0, 0.0, 1.0]] * 3]), line[None] + 0.5)
+    read = ForceSensor(moment_noise=1.0)(reaction, line)
+    torch.testing.assert_close(read, double([[0.0, 0.0, -3.0, -0.3, 0.0, 0.0]]), rtol=0, atol=1e-12)
+    half = Body(BAR, select_vertices(BAR, z=0.0), symmetry=[SymmetryPlane((1.0, 0.0, 0.0))])
+    simulator = Simulator(half, Corotated())
+    given = {"sensors": {"load": ForceSensor(axes=("fz",))}, "loads": {"load": np.ones((3, 6))}}
+    refuses(
+        InputError, "symmetry planes cut it", identify, simulator, ObservedMotions.of(simulator, None, **given), RANGES
+    )
 
 
 def test_bad_sensors_and_readings_are_refused():
@@ -222,3 +331,9 @@ def test_bad_sensors_and_readings_are_refused():
     refuses(InputError, "axis 'fw'", ForceSensor, axes=("fw",))
     refuses(InputError, "no axes", ForceSensor, axes=())
     refuses(InputError, "noise of a force sensor is 0.0", ForceSensor, axes=("fx",), noise=0.0)
+    refuses(InputError, "zero of a force sensor is -1.0: it must be zero or more", ForceSensor, axes=("fx",), zero=-1.0)
+    refuses(InputError, "axes of a force sensor is 'fz': give a tuple", ForceSensor, axes="fz")
+    free = {"start": simulator.rest_state(), "loads": {"load": np.ones((3, 6))}}
+    tip = ObservedMotions.of(simulator, None, sensors={"load": ForceSensor((62,), ("fz",))}, **free)
+    said = "a force sensor: there is no reaction at some of these vertices"
+    refuses(InputError, said, identify, simulator, tip, RANGES)

@@ -6,7 +6,7 @@ x_i, in its own axes, the columns of R:
     F = -R^T sum f_i,    T = -R^T sum (x_i - o) x f_i
 
 The minus sign is for readings of the force on the sensor; those of the force on the body have none. Under a base that
-moves, origin and axes move with it.
+moves, origin and axes move with it; with an obstacle that moves, they do not.
 
 A reading has noise, a zero that is unknown in each trial, and a drift from there: its errors have the covariance
 s^2 I + z^2 1 1^T + d^2 t t^T over the frames of a trial, with the standard deviations s, z and d and the times t. With
@@ -30,7 +30,8 @@ from ..stepping.state import Reaction
 
 AXES = ("fx", "fy", "fz", "tx", "ty", "tz")  # forces [N], then moments [N m]
 UNITS = dict(zip(AXES, 3 * ["N"] + 3 * ["N m"], strict=True))
-_PLANE = 3  # places that determine a rotation
+_PLANE = 2  # dimensions that places span which determine a rotation
+_FLAT = 1e-6  # of the largest extent, up to which places span no dimension
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,11 @@ class ForceSensor(Brief):
         origin: point about which moments are measured, on the body at rest [m].
         rotation: rotation vector of its axes in the frame of the body at rest [rad].
         on_body: whether readings are forces on the body, such as the tension of a testing machine, not on the sensor.
-        zero: standard deviation of the unknown zero in each trial, in units of the noise.
-        drift: standard deviation of the change of the zero per second, in units of the noise [1/s].
+        zero: standard deviation of the unknown zero in each trial, of forces and moments in units of their noise.
+        drift: standard deviation of the change of the zero per second, likewise [1/s].
 
     Raises:
-        InputError: no or unknown axes, or a noise that is not positive.
+        InputError: no or unknown axes, a noise that is not positive, or a negative zero or drift.
     """
 
     at: str | Sequence[int] | None = None
@@ -64,13 +65,20 @@ class ForceSensor(Brief):
     drift: float = 0.0
 
     def __post_init__(self) -> None:
-        """Checks axes and noise."""
+        """Checks axes, noise, zero and drift."""
+        if isinstance(self.axes, str):
+            raise InputError(f"axes of a force sensor is {self.axes!r}: give a tuple, such as ({self.axes!r},).")
         if not self.axes or (unknown := [axis for axis in self.axes if axis not in AXES]):
             named = f"has the axis {unknown[0]!r}" if self.axes else "has no axes"
             raise InputError(f"a force sensor {named}: name some of {', '.join(AXES)}.")
-        for name, value in (("noise", self.noise), ("moment_noise", self.moment_noise)):
-            if value is not None and not (value > 0.0 and math.isfinite(value)):
-                raise InputError(f"{name} of a force sensor is {value!r}: it must be positive.")
+        for name in ("noise", "moment_noise", "zero", "drift"):
+            value, is_noise = getattr(self, name), "noise" in name
+            if name == "moment_noise" and value is None:
+                continue
+            known = isinstance(value, float | int) and math.isfinite(value)
+            if not known or value < 0.0 or (is_noise and value == 0.0):
+                wanted = "positive" if is_noise else "zero or more"
+                raise InputError(f"{name} of a force sensor is {value!r}: it must be {wanted}.")
         if self.moment_noise is None and any(UNITS[axis] == "N m" for axis in self.axes):
             raise InputError("a force sensor measures moments, but has no moment_noise: give it, in N m.")
 
@@ -89,27 +97,29 @@ class ForceSensor(Brief):
         """Returns sizes (R, T) of the error of the force, or of the moment where that alone is measured [`unit`].
 
         Of an error, the zero and the drift that explain it best are taken away. It is NaN where nothing was measured or
-        no step has led to a prediction yet, and infinite where there is none any more, as the simulation diverged. The
-        arguments are as of `errors`, with predictions (R, T, 6).
+        predicted, and infinite where the prediction is, as the simulation diverged. The arguments are as of `errors`,
+        with predictions (R, T, 6).
         """
         errors = self.errors(predicted[None], measured, times)[0]
         chosen = [n for n, axis in enumerate(AXES) if axis in self.axes and UNITS[axis] == self.unit]
         away = (errors[..., chosen] * errors.new_tensor([self.deviations[n] for n in chosen])).norm(dim=-1)
         known, read = (values[..., chosen].isfinite().all(-1) for values in (predicted, measured))
-        begun = known.cummax(1).values if known.shape[1] else known
-        return torch.where(read & begun, torch.where(known, away, torch.inf), torch.nan)
+        lost = predicted[..., chosen].isinf().any(-1)
+        return torch.where(read & lost, torch.inf, torch.where(read & known, away, torch.nan))
 
     def __call__(self, reaction: Reaction, rest: torch.Tensor | None = None) -> torch.Tensor:
         """Returns readings (B, 6) of all `AXES`, differentiable [N, N m].
 
         Args:
             reaction: at the vertices that it holds, or of the obstacle.
-            rest: (D, 3) places of these vertices at rest [m], with which it moves; None: it stands still.
+            rest: (D, 3) places of these vertices at rest [m], with which it moves, without a turn where they are on one
+                line; None: it stands still.
         """
         like = reaction.places
+        rest = None if rest is None else rest.to(like)
         turn = rotations(like.new_tensor([[*self.rotation]]))
         origin = like.new_tensor([[*self.origin]])
-        if rest is not None and len(rest) >= _PLANE:
+        if rest is not None and _spanned(rest) >= _PLANE:
             middle, at_rest = like.mean(-2), rest.mean(0)
             moved = closest_rotation((like - middle[:, None]).mT @ (rest - at_rest))
             turn, origin = moved @ turn, middle + ((origin - at_rest) @ moved.mT)[:, 0]
@@ -138,3 +148,9 @@ class ForceSensor(Brief):
         kept = (1.0 - (1.0 + sizes.square()).rsqrt())[..., None]
         flat = errors.transpose(2, 3)[..., None]  # (E, R, 6, T, 1)
         return (flat - basis @ (kept * (basis.mT @ flat)))[..., 0].transpose(2, 3)
+
+
+def _spanned(places: torch.Tensor) -> int:
+    """Returns how many dimensions places (D, 3) span."""
+    sizes = torch.linalg.svdvals((places - places.mean(0)).double())
+    return int((sizes > _FLAT * sizes.amax()).sum())

@@ -97,6 +97,10 @@ class NoPoints(Observation):
     def __call__(self, positions: torch.Tensor) -> torch.Tensor:
         return positions[:, :0]
 
+    @override
+    def transposed_jacobian(self, positions: torch.Tensor) -> torch.Tensor:
+        return positions.new_zeros(len(positions), positions[0].numel(), 0)
+
 
 def _to(value: Any, like: torch.Tensor) -> Any:
     if isinstance(value, torch.Tensor):

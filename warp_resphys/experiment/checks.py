@@ -80,8 +80,17 @@ def _check_sensors(run: RunSettings, simulator: Simulator) -> None:
     """Refuses force sensors without recordings, and those on what nothing holds."""
     if run.sensors and run.recorded is None:
         raise InputError("sensors are read from recordings: set sensors to {}, or take data.kind recorded.")
+    if run.sensors and run.symmetry:
+        raise InputError(
+            "sensors read the whole robot, and symmetry cuts it: set sensors to {}, or simulate all of it."
+        )
     for name, sensor in run.sensors.items():
         if sensor.at in simulator.energies.obstacle_names:
+            if run.obstacles[str(sensor.at)].moves and any(axis.startswith("t") for axis in sensor.axes):
+                raise InputError(
+                    f"sensors.{name} measures moments, but its obstacle moves, with which its origin does not: name "
+                    "forces alone in axes."
+                )
             continue
         if not len(simulator.fixed):
             raise InputError(f"sensors.{name}: nothing holds the body: name an obstacle in at, or fix vertices.")

@@ -364,5 +364,7 @@ def _loads_as_points(motions: ObservedMotions) -> ObservedMotions:
     trials = motions.trials
     readings = np.stack([*trials.loads.values()], 2).reshape(*trials.times.shape, -1, 3)
     names = tuple(f"{name} {kind}" for name in trials.loads for kind in ("force", "moment"))
-    changed = replace(trials, labels=names, observed=readings, held=readings[:, 0], smoothed=None, bound=None)
+    known = np.isfinite(readings)
+    first = np.take_along_axis(readings, known.argmax(axis=1)[:, None], axis=1)[:, 0]  # NaN where there is none
+    changed = replace(trials, labels=names, observed=readings, held=first, smoothed=None, bound=None)
     return replace(motions, trials=replace(changed, loads={}), sensors={})

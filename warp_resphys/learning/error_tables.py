@@ -135,6 +135,8 @@ class ComparedModels:
                 known = [row[at & ~np.isnan(row)] for row, at in zip(away, counts, strict=True)]
                 if any(map(len, known)):
                     models[model] = summarise(row for row in known if len(row))
+            if not (np.isfinite(read.numpy()).any(-1) & counts).any():
+                continue
             size = sensor.distances(torch.zeros_like(read), read, times).numpy()
             found[name] = {
                 "unit": sensor.unit,

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from ..data.markers import NoPoints
 from ..data.trials import GIVEN, STATIC, Trials
 from ..dynamics.simulator import Simulator
 from ..io.arrays import BoolArray, FloatArray
@@ -64,6 +65,8 @@ def evaluate(
     names = trials.chosen(names)
     if sensor is not None and sensor not in motions.sensors:
         raise InputError(f"there is no force sensor {sensor!r}: there are {listed([*motions.sensors]) or 'none'}.")
+    if sensor is None and isinstance(motions.observe, NoPoints):
+        raise InputError(f"forces alone are observed: name one of the sensors, {listed([*motions.sensors])}.")
     cut_up = rollout_parts(simulator, motions, names, force, parameters, parts.batch)
     parts.run(cut_up)
     order, rows = [name for part in cut_up for name in part.names], trials.rows(names)
@@ -246,14 +249,20 @@ class TrialRollout:
 
     @torch.no_grad()
     def loads(self, state: State, number: int) -> torch.Tensor:
-        """(R, S, 6) readings in a state of `roll` by its number, NaN where there is none [N, N m]."""
+        """(R, S, 6) readings in a state of `roll` by its number [N, N m].
+
+        They are NaN in an initial state that no equilibrium led to, and infinite where the simulation has diverged.
+        """
         before, self._before, sensors = self._before, state, len(self.replay.trials.sensors)
         resting = number == 0 and self.start.at_rest
-        if self._data_driven or not (number or resting) or not sensors or bool(state.lost.all()):
-            return state.q.new_full((state.batch, sensors, 6), torch.nan)
+        none = state.q.new_full((state.batch, sensors, 6), torch.nan)
+        if self._data_driven or not sensors:
+            return none
+        if bool(state.lost.all()) or not (number or resting):
+            return torch.where(state.lost[:, None, None], torch.inf, none)
         inputs = self._resting if resting else self._inputs.at(number - 1)
         read = self.replay.read(state, None if resting else before, inputs, self._constants)
-        return torch.where(state.lost[:, None, None], torch.nan, read)
+        return torch.where(state.lost[:, None, None], torch.inf, read)
 
     def points(self, state: State) -> torch.Tensor:
         """(R, M, D) observed points of a state; NaN where the roll-out has diverged."""
@@ -265,7 +274,10 @@ class TrialRollout:
 
     def loads_at_frames(self, loads: Sequence[torch.Tensor]) -> FloatArray:
         """(R, T, S, 6) readings at the frames of the trials [N, N m], from those of all steps (R, S, 6)."""
-        return np.asarray(self.replay.loads_at_frames(self._stacked(loads), self.start).cpu().numpy())
+        series = self._stacked(loads)
+        lost = self.replay.loads_at_frames(series.isinf().to(series), self.start) > 0.5  # of the steps around a frame
+        read = self.replay.loads_at_frames(torch.where(series.isinf(), torch.nan, series), self.start)
+        return np.asarray(torch.where(lost, torch.inf, read).cpu().numpy())
 
     def _stacked(self, steps: Sequence[torch.Tensor]) -> torch.Tensor:
         """Values of all steps, the last one alone of static poses."""

@@ -178,6 +178,11 @@ class ObservedMotions(Brief):
         )
         return cls(trials, observation, **more)
 
+    def need_points(self, what: str) -> None:
+        """Raises InputError where forces alone are observed, by which something is not tested."""
+        if isinstance(self.observe, NoPoints):
+            raise InputError(f"{what} is tested on points, and forces alone are observed: observe markers as well.")
+
     @property
     def sees_states(self) -> bool:
         """Whether the positions of all vertices are observed."""

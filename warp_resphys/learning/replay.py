@@ -260,11 +260,14 @@ class Replay:
     @torch.no_grad()
     def observed(self, start: Start, states: Sequence[State], parameters: Parameters) -> Sensed:
         """Points (1, R, T, M, 3) [m] and readings (1, R, T, S, 6) [N, N m] at the frames, from `states`."""
+        points = self._observed(state.q for state in states)
+        if not self.trials.sensors:
+            return self._of_sets((points, points.new_zeros(*points.shape[:2], 0, 6)), start, 1)
         constants, inputs, resting = self.prepare(parameters)
         pairs = enumerate(itertools.pairwise(states))
         loads = [self.read(after, before, inputs.at(k), constants) for k, (before, after) in pairs]
         loads.insert(0, self._first_reading(start, states[0], resting, constants))
-        return self._of_sets((self._observed(state.q for state in states), torch.stack(loads, 1)), start, 1)
+        return self._of_sets((points, torch.stack(loads, 1)), start, 1)
 
     def varied(
         self, start: Start, parameters: Parameters, states: Sequence[State] | None = None, record: Record | None = None
@@ -332,7 +335,7 @@ class Replay:
         else:
             here = self._beside[0].linearise_equilibrium(resting, constants, state.batch)
             there = self._beside[1].linearise_equilibrium(their_resting, their, sets * state.batch)
-            varied = self._varied(state.q, here, there)
+            state, varied = self._varied(state, state.q, here, there)
         if record is not None:
             record(state.q, varied.q)
         begun = (state, resting, constants), (varied, their_resting, their)
@@ -346,16 +349,20 @@ class Replay:
                 message = f"the motion depends so much on the parameters that it has no derivatives from step {k} on."
                 raise ConvergenceError(message, None, None) from error
             before, acting = varied, their_inputs.at(k)
-            varied = self._varied(self.simulator.method.solution_for(state, solved.q), here, there)
+            x = self.simulator.method.solution_for(state, solved.q)
+            solved, varied = self._varied(solved, x, here, there)
             read = [self.read(solved, state, inputs.at(k), constants), self.read(varied, before, acting, their)]
             yield torch.cat([solved.q, varied.q]), torch.cat(read)
             if record is not None:
                 record(solved.q, varied.q)
 
-    def _varied(self, x: torch.Tensor, here: Linearisation, there: Linearisation) -> State:
-        """Returns the states of the other sets of parameters, from the solution (R, N, 3) x of the first [m]."""
-        near = first_order(x, here, there)
-        return there.reached(near) if self.trials.sensors else there.finish(near)
+    def _varied(self, solved: State, x: torch.Tensor, here: Linearisation, there: Linearisation) -> tuple[State, State]:
+        """Returns the state with the solution (R, N, 3) x [m], and those of the other sets; reactions at rounded x."""
+        near, sensed = first_order(x, here, there), bool(self.trials.sensors)
+        found = there.reached(near) if sensed else there.finish(near)
+        varied = found if found.q.dtype == x.dtype else found.map(lambda t: t.to(x) if t.is_floating_point() else t)
+        reaction = here.reached(x).reaction if sensed else solved.reaction
+        return replace(solved, reaction=reaction), replace(varied, reaction=found.reaction)
 
     @cached_property
     def _beside(self) -> tuple[Simulator, Simulator]:
@@ -369,15 +376,18 @@ class Replay:
 
     def at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
         """(E R, T, M, 3) points at the frames [m], from points (E R, K + 1, M, 3) at the steps."""
-        points = self.loads_at_frames(series, start)
-        sets = len(series) // len(self.trials.names)
+        points, sets = self._at_times(series, start), len(series) // len(self.trials.names)
         return start.shifted(points.unflatten(0, (sets, -1))).flatten(0, 1)
 
     def loads_at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
-        """(E R, T, S, 6) readings at the frames [N, N m], from those (E R, K + 1, S, 6) at the steps."""
-        sets = len(series) // len(self.trials.names)
-        times = (self.trials.times - start.delay[:, None]).clamp_min(0.0).repeat(sets, 1)
-        return sample(series, times, self.simulator.time_step)
+        """(E R, T, S, 6) readings at the frames [N, N m], from those of the steps, by the midpoint rule in their middle."""
+        halves = self.simulator.integrator == "midpoint" and series.shape[1] > 2
+        return self._at_times(series, start, 0.5 * self.simulator.time_step * halves)
+
+    def _at_times(self, series: torch.Tensor, start: Start, ahead: float = 0.0) -> torch.Tensor:
+        """Values (E R, T, ...) at the frames, from those at the steps, which belong to a time before the end [s]."""
+        times = (self.trials.times - start.delay[:, None]).clamp_min(0.0) + ahead
+        return sample(series, times.repeat(len(series) // len(times), 1), self.simulator.time_step)
 
     def errors(self, simulated: torch.Tensor) -> torch.Tensor:
         """(E, R, T, M, 3) simulated less observed points [m], zero where a point was not seen."""

@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 
 from ..data.force_sensors import ForceSensor
 from ..dynamics.simulator import Simulator
+from ..io.errors import InputError, naming
 from ..stepping.inputs import Inputs
 from ..stepping.rollout import sample
 from ..stepping.state import Constants, State
 from .trial_batch import TrialBatch
+
+_NEAR = 1.5  # frames from a step to the nearest one in which something was seen
 
 
 def readings(
@@ -35,11 +38,14 @@ def readings(
     Raises:
         InputError: a sensor is on nothing that holds or touches the body.
     """
+    if sensors and len(simulator.body.coordinates.sliding):
+        raise InputError("a force sensor reads the whole robot, and symmetry planes cut it: simulate all of it.")
     found = list[torch.Tensor]()
     for sensor in sensors:
-        at = simulator.fixed if sensor.at is None else sensor.at
-        reaction = simulator.reaction(after, at, before, inputs, constants)
         stands = isinstance(sensor.at, str) and sensor.at in simulator.energies.obstacle_names
+        at = simulator.fixed if sensor.at is None else sensor.at
+        with naming("a force sensor: "):
+            reaction = simulator.reaction(after, at, before, inputs, constants)
         found.append(sensor(reaction, None if stands else simulator.rest_positions[reaction.vertices]))
     return torch.stack(found, 1) if found else after.q.new_zeros(after.batch, 0, 6)
 
@@ -82,25 +88,30 @@ def at_steps(trials: TrialBatch, step: float, delay: torch.Tensor | None = None)
         if len(t) < min(4, len(times[r])):
             continue
         nearest = np.abs(steps[:, None] - t).min(1)
-        near = (nearest <= 1.5 * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
+        near = (nearest <= _NEAR * np.median(np.diff(t))) & (steps <= t[-1] + 1e-9)
         positions[r, near, m] = CubicSpline(t, y)(steps[near])
     return positions
 
 
-def loads_at_steps(trials: TrialBatch, step: float, delay: torch.Tensor) -> torch.Tensor:
-    """(R, K + 1, S, 6) readings at the steps of a simulator [N, N m], linear between frames; NaN before and after them.
+def loads_at_steps(trials: TrialBatch, step: float, delay: torch.Tensor, count: int) -> torch.Tensor:
+    """(R, count, S, 6) readings at the steps of a simulator [N, N m], linear between frames.
+
+    NaN before and after the frames, and at steps that are more than 1.5 frames away from the nearest reading.
 
     Args:
         trials: observed trials.
         step: time step h [s].
         delay: (R,) delay of the release after time zero of the frames [s].
+        count: number of steps, the start among them.
     """
-    since = (trials.times - delay[:, None]).cpu().numpy()
-    steps = step * np.arange(int(since.max() / step + 1e-6) + 1)
-    loads = trials.loads.cpu().numpy()
-    series = np.full((len(since), len(steps), *loads.shape[2:]), np.nan)
+    since, loads = (trials.times - delay[:, None]).cpu().numpy(), trials.loads.cpu().numpy()
+    steps = step * np.arange(count)
+    series = np.full((len(since), count, *loads.shape[2:]), np.nan)
     for row, sensor, axis in np.ndindex(len(since), *loads.shape[2:]):
         known = np.isfinite(values := loads[row, :, sensor, axis])
         if known.any():
-            series[row, :, sensor, axis] = np.interp(steps, since[row, known], values[known], np.nan, np.nan)
+            times, frame = since[row, known], np.diff(since[row]).max(initial=step)
+            near = np.abs(steps[:, None] - times).min(1) <= _NEAR * frame
+            read = np.interp(steps, times, values[known], np.nan, np.nan)
+            series[row, near, sensor, axis] = read[near]
     return trials.loads.new_tensor(series)

@@ -66,9 +66,12 @@ class TrialBatch(Brief):
         batches = [v.shape[i] for inputs in (self.inputs, self.resting) for v, i in inputs.axes().values()]
         if self.times.shape != (r, t) or self.held.shape != (r, m, d) or set(batches) - {r}:
             raise InputError("the times, the held points and the inputs do not belong to the same trials.")
-        for name, seen, loads in zip(self.names, self.seen, self.loads, strict=True):
-            if not bool(seen.any() | loads.isfinite().any()):
-                raise InputError(f"no marker of the trial {name!r} was seen: leave it out.")
+        if self.loads.shape != (r, t, len(self.sensors), 6):
+            raise InputError("the readings and the force sensors do not belong to the same trials.")
+        for name, seen, read in zip(self.names, self.seen, self.readings.tolist(), strict=True):
+            if not (read or bool(seen.any())):
+                what = "marker" if m else "force"
+                raise InputError(f"no {what} of the trial {name!r} was {'seen' if m else 'read'}: leave it out.")
 
     @property
     def seen(self) -> torch.Tensor:
@@ -101,18 +104,24 @@ class TrialBatch(Brief):
         )
 
     @property
+    def size(self) -> torch.Tensor:
+        """(R,) as `amplitude`, of points and readings together [m]."""
+        if not self.sensors:
+            return self.amplitude
+        squares = self.load_errors(torch.zeros_like(self.loads)[None])[0].square().sum((1, 2, 3))
+        moved = (self.observed - self.held[:, None]).square().nansum((1, 2, 3))
+        return ((squares + moved) / self.count).sqrt()
+
+    @property
     def amplitude(self) -> torch.Tensor:
-        """(R,) root mean square distance of points from the held ones, without any the size of readings [m]."""
-        if not self.observed.shape[2]:
-            squares = self.load_errors(torch.zeros_like(self.loads)[None])[0].square()
-            return (squares.sum((1, 2, 3)) / self.count).sqrt()
+        """(R,) root mean square distance of points from the held ones [m]."""
         square = (self.observed - self.held[:, None]).square().sum(-1)
         return square.nanmean((1, 2)).sqrt()
 
     @property
     def loss_weight(self) -> torch.Tensor:
         """Weights (R,) of sums of squares that give the mean over trials of the mean square over squared amplitude."""
-        return 1.0 / (self.count * self.amplitude**2 * len(self.names))
+        return 1.0 / (self.count * self.size**2 * len(self.names))
 
     def select(self, indices: list[int]) -> "TrialBatch":
         """Returns the trials with these indices."""

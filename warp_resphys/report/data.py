@@ -296,16 +296,16 @@ def folds_in(metrics: Metrics) -> list[Metrics]:
     return [*metrics.get("folds", {}).values()] or [metrics]
 
 
-def force_errors(metrics: Metrics) -> dict[str, tuple[str, float, dict[str, float]]]:
-    """Unit, mean size of the force and mean errors by model of each force sensor, of those without a diverged trial."""
-    found = dict[str, tuple[str, float, dict[str, float]]]()
+def force_errors(metrics: Metrics) -> dict[str, tuple[str, float, dict[str, float | None]]]:
+    """Unit, mean size of the force and mean errors by model of each force sensor; None for a model that diverged."""
+    found = dict[str, tuple[str, float, dict[str, float | None]]]()
     folds = [fold["forces"] for fold in folds_in(metrics) if "forces" in fold]
-    for name in folds[0] if folds else ():
-        tables = [fold[name] for fold in folds]
+    for name in dict.fromkeys(name for fold in folds for name in fold):
+        tables = [fold[name] for fold in folds if name in fold]
         shared = [model for model in tables[0]["models"] if all(model in table["models"] for table in tables)]
         means = {model: [table["models"][model]["mean"] for table in tables] for model in shared}
-        known = {model: fmean(x for x in of if x is not None) for model, of in means.items() if None not in of}
-        found[name] = tables[0]["unit"], fmean(table["size"] for table in tables), known
+        errors = {m: None if None in of else fmean(x for x in of if x is not None) for m, of in means.items()}
+        found[name] = tables[0]["unit"], fmean(table["size"] for table in tables), errors
     return found
 
 

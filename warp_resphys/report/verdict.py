@@ -96,8 +96,9 @@ def results_table(metrics: Metrics, settings: RunSettings) -> PageTable:
             plain[title] = min(means, key=means.__getitem__, default="")
     for name, (unit, _, of_models) in force_errors(metrics).items():
         title = f"{name} [{unit}]"
-        columns[title] = {model: Cell(number_text(mean)) for model, mean in of_models.items()}
-        plain[title] = min((m for m in BASELINES if m in of_models), key=of_models.__getitem__, default="")
+        columns[title] = {m: Cell("diverged" if x is None else number_text(x)) for m, x in of_models.items()}
+        known_means = {m: mean for m in BASELINES if (mean := of_models.get(m)) is not None}
+        plain[title] = min(known_means, key=known_means.__getitem__, default="")
     last = next(reversed(groups.values()), {})
     best, mark = best_of(known_errors(last, idle), _RANKED), "best beyond the training" if len(groups) > 1 else "best"
     rows = []

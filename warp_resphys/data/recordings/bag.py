@@ -86,7 +86,7 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
     for source in inputs:
         stamps, values = source.series(late)
         columns.append(values[np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, None), 0])
-    loads = {name: _between(*source.series(late), times) for name, source in wrenches.items()}
+    loads = {name: _between(*source.series(late), times, rate) for name, source in wrenches.items()}
     poses = None if base is None else _at_frames(*base.series(late), times, rate)
     return Recording(
         (*bag.markers,),
@@ -263,9 +263,13 @@ def _wrench(source: _Source, kind: str, message: Any) -> Sequence[float]:
     return [float(getattr(part, axis)) for part in (wrench.force, wrench.torque) for axis in "xyz"]
 
 
-def _between(times: FloatArray, values: FloatArray, frames: FloatArray) -> FloatArray:
-    """Values (T, C) at the frames, linear between messages, NaN before the first and after the last."""
-    return np.stack([np.interp(frames, times, column, np.nan, np.nan) for column in values.T], 1)
+def _between(times: FloatArray, values: FloatArray, frames: FloatArray, rate: float) -> FloatArray:
+    """Values (T, C) at the frames, linear between messages, NaN before the first, after the last, and in gaps."""
+    series = np.stack([np.interp(frames, times, column, np.nan, np.nan) for column in values.T], 1)
+    after = np.searchsorted(times, frames).clip(1, max(len(times) - 1, 1))
+    if len(times) > 1:
+        series[(times[after] - times[after - 1] > _GAP / rate) & ~np.isin(frames, times)] = np.nan
+    return series
 
 
 def _frames(path: Path, times: Sequence[FloatArray], rate: float | None) -> tuple[FloatArray, float]:

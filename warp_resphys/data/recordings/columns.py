@@ -112,9 +112,14 @@ class Layout:
             actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
         positions = np.full((frames[-1] + 1, len(markers), 3), np.nan)  # NaN in frames that were not recorded
         positions[frames] = values[:, chosen].reshape(len(values), -1, 3)
-        loads = {name: np.full((len(positions), len(FORCES)), np.nan) for name, *_ in self.loads.values()}
+        loads, given = dict[str, FloatArray](), set[tuple[str, int]]()
         for column, (name, axis, factor) in self.loads.items():
-            loads[name][frames, axis] = factor * values[:, column]
+            if (name, axis) in given:
+                twice = f"{name}.{FORCES[axis]}"
+                raise DataFileError(f"{path} has two columns named '{twice}': rename one of these sensors.")
+            given.add((name, axis))
+            readings = loads.setdefault(name, np.full((len(positions), len(FORCES)), np.nan))
+            readings[frames, axis] = factor * values[:, column]
         turns = np.full((*positions.shape[:2], 4), np.nan)
         for marker, columns in turned.items():
             try:
@@ -220,9 +225,9 @@ def load_of(head: str, unit: str | None, path: Path) -> tuple[str, int, float] |
     """Returns the sensor, index in `force_sensors.AXES` and factor to SI units of a column; None for another column.
 
     Raises:
-        DataFileError: it has no unit of a force or moment.
+        DataFileError: a force has the unit of a moment, or a moment that of a force, or neither has one.
     """
-    if (match := _LOAD.fullmatch(head)) is None:
+    if (match := _LOAD.fullmatch(head)) is None or (unit is not None and unit not in SI_PER_LOAD_UNIT):
         return None
     name, axis = match["name"], match["axis"].lower()
     kind, factor = SI_PER_LOAD_UNIT.get(unit or "", ("", 0.0))

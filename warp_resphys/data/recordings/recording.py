@@ -25,9 +25,10 @@ _SPELLED = {
 _UNLABELLED = re.compile(
     r"(?:.*:)?\*|unlabell?ed|uname|[\d ]*$", re.IGNORECASE
 )  # as Vicon and OptiTrack name trajectories
+# Kind and factor to SI units of forces and moments.
+SI_PER_LOAD_UNIT = {"N": ("f", 1.0), "mN": ("f", 1e-3), "kN": ("f", 1e3), "N m": ("t", 1.0), "Nm": ("t", 1.0)}
+SI_PER_LOAD_UNIT |= dict.fromkeys(("N mm", "Nmm", "mN m", "mNm"), ("t", 1e-3))
 # Factors to SI units; 1 for an actuation without a unit.
-SI_PER_LOAD_UNIT = {"N": ("f", 1.0), "mN": ("f", 1e-3), "kN": ("f", 1e3)}  # of forces, and of moments
-SI_PER_LOAD_UNIT |= {"N m": ("t", 1.0), "Nm": ("t", 1.0), "N mm": ("t", 1e-3), "mN m": ("t", 1e-3)}
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
 LEAST_SPAN = 1e-3  # [m]

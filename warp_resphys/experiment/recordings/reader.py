@@ -243,7 +243,11 @@ class Reader:
         else:
             assert trial.file is not None
             recording = read_recording(trial.file, data.units, data.rate, trial.labels, data.table, data.bag)
-        recording = replace(recording, loads={n: x for n, x in recording.loads.items() if n in self.settings.sensors})
+        if unread := [name for name in recording.loads if name not in self.settings.sensors]:
+            log.warning(
+                "import: %s has force sensors that are not in sensors: %s", recording.source.name, listed(unread)
+            )
+        recording = replace(recording, loads={n: x for n, x in recording.loads.items() if n not in unread})
         lengths = {name: body.length for name, body in self.markers.rigid_bodies.items() if trial.has(name)}
         recording = with_corners(recording, lengths)
         seconds = _HELD_SECONDS if trial.is_released else data.rest_seconds

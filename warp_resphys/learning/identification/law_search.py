@@ -97,6 +97,7 @@ def identify_law(
         raise InputError("a law describes one material, but the simulator has some by region: give a single one.")
     if known is not None and not {"model", "parameters"} <= {*known}:
         raise InputError(f"known has {', '.join(known)}: a law of this version has model and parameters.")
+    motions.need_points("a law")
     wanted = ranges_of(parameters or {})
     with naming("parameters: "):
         check_names(wanted, identifiable_parameters(simulator))

@@ -181,11 +181,12 @@ class Misfit(BoundedMisfit):
         count = sum(len(replay.trials.names) for replay, _ in replays)
         for replay, start in chain.from_iterable(starmap(_parts, replays)):
             trials = replay.trials if seconds is None else replay.trials.first(seconds)
-            amplitude = torch.ones_like(trials.amplitude) if self._known else trials.amplitude
+            amplitude = torch.ones_like(trials.size) if self._known else trials.size
             for name, moved in zip(trials.names, amplitude.tolist(), strict=True):
                 if not moved > 0.0:
                     still = "markers" if trials.observed.shape[2] else "forces"
                     stay = "stay where they were held" if trials.observed.shape[2] else "are zero"
+                    stay += ", and its forces are zero" if trials.sensors and trials.observed.shape[2] else ""
                     raise InputError(f"the {still} of the trial {name!r} {stay}: leave it out.")
             pair = replay.changed(simulator=self.simulator, trials=trials), start
             self._replays.append(pair if accuracy is None else DisplacedMarkers.replay(*pair))

@@ -80,6 +80,7 @@ def fit_actuator(
         ConvergenceError: the simulation fails without the actuator.
     """
     others = [name for name in motions.trials.names if name not in validation]
+    motions.need_points("an actuator")
     train = motions.trials.chosen(others if train is None else train)
     fitting = ActuatorFitting(simulator, motions, train, tuple(validation), Identified.of(parameters))
     return fitting.fit(settings or ActuatorSettings())[0]

@@ -74,6 +74,7 @@ def fit_force(
         InputError: sizes, or a number of reconstructed steps, that do not fit the motions.
     """
     others = [name for name in motions.trials.names if name not in validation]
+    motions.need_points("a force")
     train = motions.trials.chosen(others if train is None else train)
     fitting = Fitting(simulator, motions, reconstructed, train, tuple(validation), Identified.of(parameters), **more)
     groups = {"network": network or NetworkSettings(), "trainer": trainer or TrainerSettings()}

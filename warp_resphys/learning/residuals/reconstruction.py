@@ -38,8 +38,14 @@ from ...stepping.rollout import states
 from ...stepping.state import State
 from ..metrics import mean_distance
 from ..observed_motions import Identified, ObservedMotions
-from ..sensing import loads_at_steps
-from .reconstruction_problems import FullStateProblem, MarkerForceProblem, MarkerPositionProblem, Read, StepProblem
+from .reconstruction_problems import (
+    FullStateProblem,
+    MarkerForceProblem,
+    MarkerPositionProblem,
+    Read,
+    StepProblem,
+    load_reader,
+)
 
 log = logging.getLogger(__name__)
 
@@ -359,21 +365,11 @@ def _reconstructed(
         simulator = replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
         observed = torch.cat([torch.full_like(observed, torch.nan), observed], 1)
         inputs = resting
-    frame, reader = replay.simulator.time_step, replay.changed(simulator=replace(simulator))
-    loads = loads_at_steps(replay.trials, frame, start.delay)
-
-    def read(before: State, after: State, number: int) -> torch.Tensor:
-        now = 0 if replay.is_static else number + 1
-        if now >= loads.shape[1]:
-            return after.q.new_zeros(after.batch, 0)
-        sensed = reader.read(after, before, inputs.at(number), constants)[None, :, None]
-        measured = loads[:, now, None], loads.new_full((after.batch, 1), frame * now)
-        return replay.trials.load_errors(sensed, measured)[0].flatten(1)
-
     method = make_reconstructor(simulator, settings, replay.observe)
     reached, forces = [state], [torch.zeros_like(state.q)]
     report()
-    sensed = read if replay.trials.sensors else None
+    prepared = replay.prepare(identified.values(replay.simulator))
+    sensed = load_reader(replay, start, state, prepared, observed.shape[1])
     for step in follow(method.with_constants(constants), state, observed[:, 1:].unbind(1), inputs, sensed):
         reached.append(step.state)
         forces.append(step.force)

@@ -3,13 +3,13 @@
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from typing_extensions import override
 
-from ...data.markers import WHOLE_STATE, Observation
+from ...data.markers import WHOLE_STATE, Observation, WholeState
 from ...dynamics.linearisation import Linearisation
 from ...dynamics.simulator import Constants, Simulator
 from ...io.errors import ConvergenceError, InputError
@@ -17,6 +17,9 @@ from ...linalg.conjugate_gradients import LinearMap, conjugate_gradients
 from ...linalg.least_squares import Move, Point, Problem, ridge
 from ...stepping.inputs import Inputs
 from ...stepping.state import State
+from ..replay import Prepared, Replay
+from ..sensing import loads_at_steps
+from ..start import Start
 
 Read = Callable[[State], torch.Tensor]  # errors of readings in the state after a step, (B, C) as lengths [m]
 
@@ -245,3 +248,53 @@ class MarkerForceProblem(StepProblem):
             return (force - force / factor + change).view_as(point.x)
 
         return damped_step
+
+
+def load_reader(
+    replay: Replay, start: Start, begun: State, prepared: Prepared, count: int
+) -> Callable[[State, State, int], torch.Tensor] | None:
+    """Returns the errors (B, C) of readings after a step of a number, for `follow`; None without force sensors.
+
+    In a motion that begins in equilibrium, the zero of a sensor is that with which the first reading agrees. A pose
+    with an unknown zero says nothing.
+
+    Args:
+        replay: of the trials.
+        start: how they begin.
+        begun: their initial state.
+        prepared: constants and inputs.
+        count: number of steps, the start among them.
+
+    Raises:
+        InputError: the zero is unknown, and the motion does not begin in equilibrium; or all vertices are observed.
+    """
+    if not (sensors := replay.trials.sensors):
+        return None
+    if isinstance(replay.observe, WholeState):
+        raise InputError(
+            "positions of all vertices determine the forces that are missing: leave the force sensors out of it."
+        )
+    constants, inputs, resting = prepared
+    inputs = resting if replay.is_static else inputs
+    reader, step = replay.changed(simulator=replace(replay.simulator)), replay.simulator.time_step
+    loads = loads_at_steps(replay.trials, step, start.delay, 1 if replay.is_static else count)
+    for number, sensor in enumerate(sensors):
+        if sensor.zero and not start.at_rest:
+            raise InputError(
+                "a force sensor has a zero, which forces that are missing cannot be told from in motions that do not "
+                "begin in equilibrium: subtract it from the readings, and set zero to 0."
+            )
+        if sensor.zero:
+            first = reader.read(begun, None, resting, constants)[:, number]
+            off = torch.nan if replay.is_static else loads[:, 0, number] - first
+            loads[:, :, number] -= off if isinstance(off, float) else off[:, None]
+    trials = replace(replay.trials, sensors=tuple(replace(sensor, zero=0.0) for sensor in sensors))
+    measured = [math.isfinite(deviation) for sensor in sensors for deviation in sensor.deviations]
+
+    def read(before: State, after: State, number: int) -> torch.Tensor:
+        now = 0 if replay.is_static else number + 1
+        sensed = reader.read(after, before, inputs.at(number), constants)[None, :, None]
+        at = loads[:, now, None], loads.new_full((after.batch, 1), step * now)
+        return trials.load_errors(sensed, at)[0].flatten(1)[:, measured]
+
+    return read

@@ -380,7 +380,7 @@ class Replay:
         return start.shifted(points.unflatten(0, (sets, -1))).flatten(0, 1)
 
     def loads_at_frames(self, series: torch.Tensor, start: Start) -> torch.Tensor:
-        """(E R, T, S, 6) readings at the frames [N, N m], from those of the steps, by the midpoint rule in their middle."""
+        """Readings (E R, T, S, 6) at the frames, from those of the steps; the midpoint rule has them in its middle."""
         halves = self.simulator.integrator == "midpoint" and series.shape[1] > 2
         return self._at_times(series, start, 0.5 * self.simulator.time_step * halves)
 

@@ -117,12 +117,12 @@ def kept_renderers():
 
 
 @contextlib.contextmanager
-def renderers_used_again(kept_renderers: list[Any]) -> Iterator[None]:
-    """Drawing processes that draw for the next renderer, as each takes seconds to start."""
-    start, close, command = render.Renderer._start, render.Renderer.close, render.COMMAND
+def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
+    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
+    frames, start, close = render.Renderer.frames, render.Renderer._start, render.Renderer.close
 
     def started(self: render.Renderer) -> None:
-        if kept_renderers and render.COMMAND is command:  # which some tests replace
+        if kept_renderers:
             self._process, self._messages = own = kept_renderers.pop()
             self._end = weakref.finalize(self, render._end, *own)
         else:
@@ -136,22 +136,13 @@ def renderers_used_again(kept_renderers: list[Any]) -> Iterator[None]:
         else:
             close(self)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render.Renderer, "_start", started)
-        patch.setattr(render.Renderer, "close", closed)
-        yield
-
-
-@contextlib.contextmanager
-def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
-    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
-    frames = render.Renderer.frames
-
     def coarse(self: render.Renderer, scene: render.RenderScene) -> Iterator[render.Pixels]:
         return frames(self, replace(scene, size=[side // 8 * 2 for side in scene.size]))
 
-    with renderers_used_again(kept_renderers), pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render.Renderer, "frames", coarse)
+        patch.setattr(render.Renderer, "_start", started)
+        patch.setattr(render.Renderer, "close", closed)
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
         patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
         patch.setattr(figures, "themed_svg", lambda figure, name: b"<svg/>")
@@ -162,8 +153,7 @@ def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
 def _pictures(request, kept_renderers):
     """Coarse pictures, but for tests that look at them."""
     looks = {request.path.parent.name, request.path.stem} & LOOK_AT_PICTURES
-    pictures = renderers_used_again if looks else coarse_pictures
-    with pictures(kept_renderers):
+    with contextlib.nullcontext() if looks else coarse_pictures(kept_renderers):
         yield
 
 

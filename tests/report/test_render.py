@@ -70,17 +70,6 @@ def test_sharp_edges_are_those_of_the_box_and_the_rim_of_a_part():
     assert len(sharp_edges(mesh.vertices, end)) == 4 * 2
 
 
-START, CLOSE = render.Renderer._start, render.Renderer.close
-
-
-@pytest.fixture
-def own_processes(monkeypatch):
-    """Processes that begin and end with their renderers, unlike those that tests share."""
-    monkeypatch.setattr(render.Renderer, "_start", START)
-    monkeypatch.setattr(render.Renderer, "close", CLOSE)
-
-
-@pytest.mark.usefixtures("own_processes")
 @pytest.mark.parametrize(
     ("script", "time_out", "reason"),
     [
@@ -107,7 +96,7 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
     assert not [*tmp_path.glob("*.mp4*")]
 
 
-@pytest.mark.usefixtures("can_draw", "own_processes")
+@pytest.mark.usefixtures("can_draw")
 def test_one_process_draws_scene_after_scene():
     mesh = box_hexahedra(divisions=(1, 1, 1))
     small = body_scene(mesh)

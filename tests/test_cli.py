@@ -325,7 +325,7 @@ class TestCommands:
         assert set(commands.VALUED) == valued
 
 
-_OWN = {"my_robot", "my_arm", "--cfg"}  # experiments that the reader writes
+_OWN = {"my_robot", "my_arm", "ecoflex", "--cfg"}  # experiments that the reader writes
 
 
 def documented():

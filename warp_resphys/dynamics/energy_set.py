@@ -26,6 +26,7 @@ from ..energies.solid import solids_of
 from ..energies.term import Term, Values
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
+from ..fem.internal_forces import InternalForces
 from ..io.errors import InputError
 from ..stepping.inputs import Inputs
 from ..stepping.integrators import Integrator
@@ -77,6 +78,7 @@ class EnergySet:
         counts: number of values of a parameter or an input per environment, by name.
         parts: names of the parts, such as tendons, with one value each, by the name of the parameter.
         memory: memory variables by name.
+        internal: resultants of internal forces.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class EnergySet:
         time_step: float,
     ) -> None:
         self.placed, self._coordinates = tuple(placed), coordinates
+        self.internal = InternalForces(body, rest_positions)
         self._bound: list[BoundEnergy] = []
         self.parameters: dict[str, Quantity] = {}
         self.inputs: dict[str, Quantity] = {}
@@ -155,11 +158,17 @@ class EnergySet:
         inputs = _without(prefix, step.inputs.actuation)
         return EnergyStep(state, step.stage, inputs, fixed, constants.values[k], constants.gravity, step.terms[k])
 
-    def step_terms(self, step: SimulatorStep) -> StepTerms:
-        """Returns the terms of a step, differentiable."""
+    def step_terms(self, step: SimulatorStep, near: torch.Tensor | None = None) -> StepTerms:
+        """Returns the terms of a step, differentiable.
+
+        Args:
+            step: the step.
+            near: (B, N, 3) positions of forces that depend on the pose (`internal_force`); without, those without
+                forces [m].
+        """
         batch, h, constants, stage = step.state.batch, step.stage.step, step.constants, step.stage
         damping = constants.mass_damping[..., None] * h  # (1 or B, 1, 1)
-        mass, force = constants.mass, self._loads(step)
+        mass, force = constants.mass, self._loads(step, near)
         if step.inputs.attached_mass is not None:
             mass = mass + step.inputs.attached_mass
         values = self._values(step)
@@ -188,17 +197,33 @@ class EnergySet:
         if near is not None:
             for k in self._posing:
                 values[k] |= self._bound[k].at_pose(near, values[k])
-        force = self._coordinates.reduce(self._loads(step).expand(batch, -1, -1))
+        force = self._coordinates.reduce(self._loads(step, near).expand(batch, -1, -1))
         return StepTerms(state.q, state.q.new_zeros(state.q.shape[:2]), share * force, values)
 
-    def _loads(self, step: SimulatorStep) -> torch.Tensor:
-        """Returns the dead loads (1 or B, N, 3): gravity, external force and those of the energies [N]."""
+    def internal_force(self, step: SimulatorStep, q: torch.Tensor | None = None) -> torch.Tensor | None:
+        """Returns the internal force (B, N, 3) of a step, balanced at q (B, N, 3) or without forces, or None [N]."""
+        force, mass = step.inputs.internal_force, step.constants.mass
+        if force is None or not self.internal.is_loose:
+            return force
+        if step.inputs.attached_mass is not None:
+            mass = mass + step.inputs.attached_mass
+        return self.internal.balanced(force, step.stage.target if q is None else q, mass)
+
+    def depends_on_pose(self, step: SimulatorStep) -> bool:
+        """Whether the internal force of a step depends on the pose at its end, as of a body that nothing holds."""
+        return self.internal.is_loose and step.inputs.internal_force is not None
+
+    def _loads(self, step: SimulatorStep, near: torch.Tensor | None) -> torch.Tensor:
+        """Returns the dead loads (1 or B, N, 3): gravity, forces of the inputs and those of the energies [N]."""
         constants, inputs, mass = step.constants, step.inputs, step.constants.load_mass
         if inputs.attached_mass is not None:
             mass = mass + inputs.attached_mass
         force = mass[..., None] * constants.gravity[:, None]
         if inputs.external_force is not None:
             force = force + inputs.external_force
+        internal = self.internal_force(step, near)
+        if internal is not None:
+            force = force + internal
         loads = (self._bound[k].load(self._step(step, k)) for k in self._loading)
         return sum((load for load in loads if load is not None), start=force)
 

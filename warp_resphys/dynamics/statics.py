@@ -18,7 +18,7 @@ from ..stepping.state import Constants, SolveReport, State
 from .energy_set import SimulatorStep
 from .equilibrium import equilibrium
 from .nonlinear_solver import check_converged
-from .time_step import TimeStep
+from .time_step import TimeStep, settle
 
 log = logging.getLogger(__name__)
 
@@ -26,9 +26,8 @@ _MOST_ITERATIONS = 100  # of Newton's method; a few suffice from a good start
 SHIFT = 1e-6  # m, along every axis, against which friction acts that is to hold a body
 _HELD_BY = 3  # vertices with friction, against all displacements and turns
 _MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
+_REMEDY = "the equilibrium does not settle: lower the friction, the tension or the internal forces"
 _LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
-_MOST_SETTLINGS = 100
-_SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
 
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 
@@ -36,14 +35,12 @@ Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
 class StaticEquilibrium(TimeStep):
     """A static equilibrium under constant inputs after a state: a step without end, in which inertia has no part."""
 
-    _gradient: torch.Tensor  # of the energies at the fixed vertices, in the last `_balance` [N]
-
     @override
     def _begin(self, state: State, inputs: Inputs, constants: Constants) -> SimulatorStep:
         return SimulatorStep.endless(state, inputs, constants, self.workspace.potential.energies)
 
     @override
-    def terms(self, share: float = 1.0, near: torch.Tensor | None = None) -> StepTerms:
+    def terms(self, share: float = 1.0, *, near: torch.Tensor | None = None) -> StepTerms:
         """Returns the terms of the potential under a share of the loads.
 
         Args:
@@ -65,7 +62,7 @@ class StaticEquilibrium(TimeStep):
 
     def _solved(self, x: torch.Tensor) -> State:
         """Returns the state of the last `_balance`, with its reaction."""
-        terms = self.terms(near=x if self.equations.energies.follow_pose else None)
+        terms = self.terms(near=x if self._follows_pose else None)
         return replace(self.finish(x), reaction=self.reaction(terms, x, self._gradient))
 
     @override
@@ -81,13 +78,18 @@ class StaticEquilibrium(TimeStep):
         equations, state = self.equations, self.step.state
         limited = equations.settings.max_iterations < _MOST_ITERATIONS
         rest, guess = equations.rest_positions.expand_as(state.q), (state.q if near is None else near).detach()
-        if not equations.energies.follow_pose:
+        if not self._follows_pose:
             return self._solved(find_equilibrium(self._balance, rest, guess, limited))
         try:
             x = find_equilibrium(partial(self._balance, near=guess), rest, guess, limited)
         except ConvergenceError:  # The guess is far away.
             x = find_equilibrium(self._balance, rest, guess, limited)
-        return self._solved(settle(lambda at: self._balance(1.0, at.detach(), at)[0], x))
+        return self._solved(settle(lambda at: self._balance(1.0, at.detach(), at)[0], x, _REMEDY))
+
+    @property
+    def _follows_pose(self) -> bool:
+        energies = self.equations.energies
+        return energies.follow_pose or energies.depends_on_pose(self.step)
 
     def _balance(
         self, share: float, start: torch.Tensor, near: torch.Tensor | None = None
@@ -96,7 +98,7 @@ class StaticEquilibrium(TimeStep):
         equations, workspace = self.equations, self.workspace
         most = min(equations.settings.max_iterations, _MOST_ITERATIONS)
         settings = equations.settings.changed(name="newton", on_failure="raise", max_iterations=most)
-        terms, fixed = self.terms(share, near), self.fixed_positions(share)
+        terms, fixed = self.terms(share, near=near), self.fixed_positions(share)
         with _progress_of(workspace.parts[0][1].potential, share, most):
             x, report, self._gradient = equilibrium(workspace, "statics", settings, terms, start, fixed)
         check_converged(settings, report, x)
@@ -184,48 +186,3 @@ def _ramp_loads(solve: Solve, rest: torch.Tensor, limit: ConvergenceError | None
         else:
             done = share
     return x
-
-
-def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor) -> torch.Tensor:
-    """Returns the fixed point x = solve(x), differentiable in everything that the function depends on.
-
-    The gradient g by the solution fulfils g = w + (d solve / dx)^T g, for that of the loss w, and is found like the
-    solution, by iteration.
-
-    Args:
-        solve: equilibrium (B, N, 3) under forces at given positions [m], near which it lies.
-        start: (B, N, 3) initial guess [m].
-
-    Raises:
-        ConvergenceError: the iteration does not converge.
-    """
-    with torch.no_grad():
-        x = _repeated(solve, start.detach(), "the equilibrium does not settle")
-    if not torch.is_grad_enabled():
-        return x
-    solution = solve(x)
-    if not solution.requires_grad:
-        return solution
-    near = x.clone().requires_grad_()
-    again = solve(near)
-
-    def through(gradient: torch.Tensor) -> torch.Tensor:
-        def more(total: torch.Tensor) -> torch.Tensor:
-            return gradient + torch.autograd.grad(again, near, total, retain_graph=True)[0]
-
-        return _repeated(more, gradient, "the gradient of the equilibrium does not settle")
-
-    solution.register_hook(through)
-    return solution
-
-
-def _repeated(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor, failure: str) -> torch.Tensor:
-    """Returns the limit of repeated calls of a function, or raises ConvergenceError."""
-    settled = max(_SETTLED, 16.0 * torch.finfo(x.dtype).eps)
-    for _ in range(_MOST_SETTLINGS):
-        previous, x = x, function(x)
-        if bool((x - previous).norm() <= settled * x.norm()):
-            return x
-    raise ConvergenceError(
-        f"{failure}: friction depends too strongly on the pose; lower the friction or the tension.", x, None
-    )

@@ -24,7 +24,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .simulator import Simulator
 
-_VECTOR_INPUTS = ("external_force", "fixed_positions")
+_VECTOR_INPUTS = ("external_force", "internal_force", "fixed_positions")
 _SCALARS = {torch.float64: wp.float64, torch.float32: wp.float32}
 _VECTORS = {torch.float64: wp.vec3d, torch.float32: wp.vec3f}
 
@@ -53,9 +53,9 @@ def record_rollout(
         v: (B, N) vec3 velocities [m/s].
         steps: number of steps T.
         previous: (q, v) one step earlier, to continue a roll-out by BDF2: its ``(q[-2], v[-2])``.
-        inputs: inputs by name: ``external_force`` (B, N) vec3 [N], ``fixed_positions`` (B, D) vec3 [m],
-            ``attached_mass`` (B, N) [kg], and those of the energies (B, n); all but the masses may have a leading time
-            axis T.
+        inputs: inputs by name: ``external_force`` and ``internal_force`` (B, N) vec3 [N], ``fixed_positions``
+            (B, D) vec3 [m], ``attached_mass`` (B, N) [kg], and those of the energies (B, n); all but the masses may
+            have a leading time axis T.
         parameters: parameters by name, with shapes as in `Simulator.prepare`.
 
     Returns:

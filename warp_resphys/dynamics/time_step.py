@@ -1,16 +1,22 @@
 """The implicit solve of a time step, and the state that follows from its solution."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
 
 from ..energies.potential import StepTerms
+from ..io.errors import ConvergenceError
 from ..stepping.inputs import Inputs
-from ..stepping.state import Constants, Reaction, State
+from ..stepping.state import Constants, Reaction, SolveReport, State
 from .energy_set import SimulatorStep
 from .equations import EquationsOfMotion
 from .equilibrium import equilibrium, reaction_of
+
+_MOST_SETTLINGS = 100
+_REMEDY = "the step does not settle: take a smaller time step or internal forces"
+_SETTLED = 1e-10  # change of the positions, or of the gradient, relative to their size; or some roundings
 
 
 class TimeStep:
@@ -27,6 +33,9 @@ class TimeStep:
         step: the step as the energies see it.
     """
 
+    _report: SolveReport  # of the last solve
+    _gradient: torch.Tensor  # (B, D + R, 3) of the energies at the held vertices, in the last solve [N]
+
     def __init__(self, equations: EquationsOfMotion, state: State, inputs: Inputs, constants: Constants) -> None:
         self.equations, self.workspace = equations, equations.workspace(state.batch)
         self.step = self._begin(state, inputs, constants)
@@ -35,9 +44,13 @@ class TimeStep:
         stage = self.equations.method.stage(state, self.equations.time_step)
         return SimulatorStep(state, stage, inputs, constants, self.workspace.potential.energies)
 
-    def terms(self) -> StepTerms:
-        """Returns the terms of the incremental potential, differentiable."""
-        return self.equations.energies.step_terms(self.step)
+    def terms(self, *, near: torch.Tensor | None = None) -> StepTerms:
+        """Returns the terms of the incremental potential, differentiable.
+
+        Args:
+            near: (B, N, 3) positions of the forces that depend on the pose; None: positions without forces [m].
+        """
+        return self.equations.energies.step_terms(self.step, near)
 
     def fixed_positions(self) -> torch.Tensor:
         """Returns the positions (B, D, 3) of the fixed vertices at the stage [m]."""
@@ -59,13 +72,17 @@ class TimeStep:
     def reaction(self, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor) -> Reaction | None:
         """Returns the reaction at the held vertices, differentiable; None without such vertices.
 
+        Internal forces have no part in its resultant (`fem.internal_forces`).
+
         Args:
             terms: of the potential.
             x: (B, N, 3) solution of the stage [m].
             gradient: (B, D + R, 3) of the energies at the held vertices there, as numbers [N].
         """
-        loads = self.equations.energies.loads_at_fixed(terms, x)
-        return self._at_known_velocity(reaction_of(self.workspace, terms, x, gradient, loads))
+        energies = self.equations.energies
+        loads, internal = energies.loads_at_fixed(terms, x), energies.internal_force(self.step, x)
+        reaction = self._at_known_velocity(reaction_of(self.workspace, terms, x, gradient, loads))
+        return reaction if reaction is None or internal is None else energies.internal.taken_up(reaction, internal, x)
 
     def _at_known_velocity(self, reaction: Reaction | None) -> Reaction | None:
         """Returns the reaction with the inertia of fixed vertices, whose velocity V at the end is prescribed.
@@ -91,9 +108,68 @@ class TimeStep:
         """
         equations, workspace, state = self.equations, self.workspace, self.step.state
         start = self.step.stage.target if near is None else equations.method.solution_for(state, near).detach()
-        terms, fixed, follows = self.terms(), self.fixed_positions(), workspace.follows(state.q)
-        x, report, gradient = equilibrium(workspace, "dynamics", equations.settings, terms, start, fixed, follows)
-        whole = equations.coordinates.expand(x)
-        new = replace(self.finish(whole), report=report, reaction=self.reaction(terms, whole, gradient))
+        if equations.energies.depends_on_pose(self.step):
+            x = settle(self._minimised, start, _REMEDY)
+            terms = self.terms(near=x)
+        else:
+            terms = self.terms()
+            x = self._minimise(terms, start, workspace.follows(state.q))
+        new = replace(self.finish(x), report=self._report, reaction=self.reaction(terms, x, self._gradient))
         workspace.record_positions(new.q)
         return new
+
+    def _minimise(self, terms: StepTerms, start: torch.Tensor, follows: torch.Tensor | None) -> torch.Tensor:
+        """Returns the solution (B, N, 3) [m]; sets its report, and the gradient at held vertices."""
+        equations = self.equations
+        arguments = equations.settings, terms, start, self.fixed_positions(), follows
+        x, self._report, self._gradient = equilibrium(self.workspace, "dynamics", *arguments)
+        return equations.coordinates.expand(x)
+
+    def _minimised(self, at: torch.Tensor) -> torch.Tensor:
+        """Returns the solution (B, N, 3) under forces at positions (B, N, 3), which stay where the solver fails [m]."""
+        x = self._minimise(self.terms(near=at), at.detach(), None)
+        return torch.where(self._report.converged[:, None, None], x, at)
+
+
+def settle(solve: Callable[[torch.Tensor], torch.Tensor], start: torch.Tensor, failure: str) -> torch.Tensor:
+    """Returns the fixed point x = solve(x), differentiable in everything that the function depends on.
+
+    The gradient g by the solution fulfils g = w + (d solve / dx)^T g, for that of the loss w, and is found like the
+    solution, by iteration.
+
+    Args:
+        solve: equilibrium (B, N, 3) under forces at given positions [m], near which it lies.
+        start: (B, N, 3) initial guess [m].
+        failure: what the error says.
+
+    Raises:
+        ConvergenceError: the iteration does not converge.
+    """
+    with torch.no_grad():
+        x = _repeated(solve, start.detach(), failure)
+    if not torch.is_grad_enabled():
+        return x
+    solution = solve(x)
+    if not solution.requires_grad:
+        return solution
+    near = x.clone().requires_grad_()
+    again = solve(near)
+
+    def through(gradient: torch.Tensor) -> torch.Tensor:
+        def more(total: torch.Tensor) -> torch.Tensor:
+            return gradient + torch.autograd.grad(again, near, total, retain_graph=True)[0]
+
+        return _repeated(more, gradient, failure)
+
+    solution.register_hook(through)
+    return solution
+
+
+def _repeated(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor, failure: str) -> torch.Tensor:
+    """Returns the limit of repeated calls of a function, or raises ConvergenceError."""
+    settled = max(_SETTLED, 16.0 * torch.finfo(x.dtype).eps)
+    for _ in range(_MOST_SETTLINGS):
+        previous, x = x, function(x)
+        if bool((x - previous).norm() <= settled * x.norm()):
+            return x
+    raise ConvergenceError(f"{failure}.", x, None)

@@ -14,7 +14,7 @@ from ..stepping.inputs import Inputs
 from .bodies import Body, BodyEnergy
 from .coordinates import Coordinates
 
-_FIELDS = ("external_force", "fixed_positions", "attached_mass")  # inputs with one value per vertex
+_FIELDS = ("external_force", "internal_force", "fixed_positions", "attached_mass")  # inputs with one value per vertex
 
 
 class Scene(Body):

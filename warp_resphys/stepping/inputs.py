@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ _BY_VERTEX = {
     "external_force": "(N, 3) or (B, N, 3), a force for every vertex",
     "fixed_positions": "(D, 3) or (B, D, 3), a position for every fixed vertex",
     "attached_mass": "(N,) or (B, N), a mass for every vertex",
+    "internal_force": "(N, 3) or (B, N, 3), a force for every vertex",
 }
+Acts = Literal["internal", "external"]  # a force: within the body, or on it from outside
 
 
 class Inputs:
@@ -30,6 +32,8 @@ class Inputs:
         fixed_positions: (B, D, 3) or (T, B, D, 3) positions of the fixed vertices at the end of a step, in the order of
             ``body.fixed_vertices`` [m]; if omitted, they do not move.
         attached_mass: (1 or B, N) weights hung on the vertices, beside the body's own [kg].
+        internal_force: like ``external_force``, but of what acts within a body. Its resultant is taken up there: it
+            changes neither the reactions' balance with external loads nor momentum (`fem.internal_forces`) [N].
         actuation: (B, n) or (T, B, n) inputs of the body's energies by name, such as ``pressure`` in each chamber [Pa].
 
     Attributes:
@@ -44,14 +48,16 @@ class Inputs:
         external_force: torch.Tensor | ArrayLike | None = None,
         fixed_positions: torch.Tensor | ArrayLike | None = None,
         attached_mass: torch.Tensor | ArrayLike | None = None,
+        internal_force: torch.Tensor | ArrayLike | None = None,
         **actuation: torch.Tensor | ArrayLike | None,
     ) -> None:
-        loads = {"external_force": external_force, "fixed_positions": fixed_positions, "attached_mass": attached_mass}
+        by_vertex = (external_force, fixed_positions, attached_mass, internal_force)
+        loads = dict(zip(_BY_VERTEX, by_vertex, strict=True))
         plain = {n for n, x in (loads | actuation).items() if not (x is None or isinstance(x, torch.Tensor))}
         self.plain = frozenset(plain)
-        self.external_force, self.fixed_positions, self.attached_mass = (
-            _batched(name, value, axes) for (name, value), axes in zip(loads.items(), (2, 2, 1), strict=True)
-        )
+        axes = {"attached_mass": 1}
+        batched = [_batched(name, value, axes.get(name, 2)) for name, value in loads.items()]
+        self.external_force, self.fixed_positions, self.attached_mass, self.internal_force = batched
         self.actuation: dict[str, torch.Tensor] = {}
         for name, value in actuation.items():
             if (values := _batched(name, value, 1)) is not None:
@@ -93,8 +99,7 @@ class Inputs:
     @property
     def fields(self) -> dict[str, torch.Tensor]:
         """All fields that are set, by name."""
-        names = ("external_force", "fixed_positions", "attached_mass")
-        fields = {name: getattr(self, name) for name in names} | self.actuation
+        fields = {name: getattr(self, name) for name in _BY_VERTEX} | self.actuation
         return {name: value for name, value in fields.items() if value is not None}
 
     def replace(self, **fields: torch.Tensor | ArrayLike | None) -> "Inputs":
@@ -121,18 +126,19 @@ class Inputs:
         """Returns the inputs with the device and dtype of a tensor."""
         return self._derived({name: value.to(like) for name, value in self.fields.items()})
 
-    def plus(self, force: torch.Tensor | None) -> "Inputs":
-        """Returns the inputs with an external force (B, N, 3) added [N]."""
+    def plus(self, force: torch.Tensor | None, acts: Acts = "external") -> "Inputs":
+        """Returns the inputs with a force (B, N, 3) added that acts from outside, or within the body [N]."""
         if force is None:
             return self
-        before = self.external_force
-        if before is not None and "external_force" in self.plain:
+        name = f"{acts}_force"
+        before = self.fields.get(name)
+        if before is not None and name in self.plain:
             before = before.to(force)
-        return self.replace(external_force=force if before is None else before + force)
+        return self.replace(**{name: force if before is None else before + force})
 
     def _has_time_axis(self) -> Mapping[str, bool]:
         """Whether each field has a time axis, by name."""
-        axes = {"external_force": 4, "fixed_positions": 4}
+        axes = {"external_force": 4, "internal_force": 4, "fixed_positions": 4}
         return {n: n != "attached_mass" and value.ndim == axes.get(n, 3) for n, value in self.fields.items()}
 
     def axes(self) -> dict[str, tuple[torch.Tensor, int]]:
@@ -193,6 +199,7 @@ class Inputs:
         """
         fields = {
             "external_force": ((batch, vertices, 3), "N", "vertex"),
+            "internal_force": ((batch, vertices, 3), "N", "vertex"),
             "fixed_positions": ((batch, fixed, 3), "m", "vertex"),
             "attached_mass": ((batch, vertices), "kg", "vertex"),
         } | {name: ((batch, count), quantity.unit, quantity.per) for name, (quantity, count) in accepted.items()}

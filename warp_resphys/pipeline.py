@@ -203,7 +203,8 @@ class _SplitStages:
             if model not in run.models or model == SIMFREE:
                 continue
             self.add(
-                *(f"reconstruct_{model}", reconstruct, (files.reconstruction_file(model),), ("reconstruction",)),
+                *(f"reconstruct_{model}", reconstruct, (files.reconstruction_file(model),)),
+                ("reconstruction", "network.acts"),
                 model=model,
                 reconstructed=reconstructed,
             )

@@ -138,7 +138,7 @@ def at_rest(*stiffnesses):
     k = torch.zeros(len(stiffnesses), len(MESH.vertices), 1, dtype=torch.float64)
     k[:, TIP] = torch.tensor(stiffnesses, dtype=torch.float64)[:, None, None]
 
-    def force(state):
+    def force(state, number=0):
         return k * (s.rest_positions - state.q)
 
     guess = s.rest_state(len(stiffnesses))
@@ -163,7 +163,7 @@ def test_a_force_that_turns_round_has_no_equilibrium():
     s, free, _ = at_rest(0.0)
     height = free.q[:, TIP, 2].mean()
 
-    def force(state):
+    def force(state, number=0):
         push = torch.zeros_like(state.q)
         push[:, TIP, 2] = -0.02 * torch.sign(state.q[:, TIP, 2].mean() - height)
         return push

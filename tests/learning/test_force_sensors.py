@@ -178,7 +178,7 @@ def test_reconstructed_forces_agree_with_the_sensor_at_the_clamp(pushed, method)
     sensing = ObservedMotions.of(simulator, seen, **given, sensors={"clamp": clamp}, loads={"clamp": read})
     errors, wanted = [], force.sum(2)[:, 0]
     for motions in (blind, sensing):
-        (forces,) = reconstruct(simulator, motions, settings=settings).of(["motion 0"], "force")
+        (forces,) = reconstruct(simulator, motions, settings=settings, acts="external").of(["motion 0"], "force")
         errors.append(float((torch.from_numpy(forces[0, 1:]).double().sum(1) - wanted).norm() / wanted.norm()))
     assert errors[1] < 0.03 < 0.3 < errors[0]
 
@@ -215,9 +215,30 @@ def test_the_loss_of_training_through_the_simulator_has_readings(pushed):
     assert losses[0] == pytest.approx(float(replay.errors(points).square().sum() / moved), rel=1e-9)
 
 
+@pytest.mark.parametrize("method", ["gauss_newton", "levenberg_marquardt"])
+def test_internal_forces_leave_the_sensor_its_true_loads(pushed, method):
+    """Forces that are found as internal ones explain marker and readings when they act so; external ones do not."""
+    simulator, start, force, marker, *_, clamp, _ = pushed
+    motion = simulator.rollout(start, 8, Inputs(internal_force=force))
+    read = torch.stack([clamp(simulator.reaction(start)), *(clamp(one) for one in reactions(motion))])
+    seen = torch.stack([marker(q) for q in motion.q])
+    settings = ReconstructionSettings(method=method, regularisation=1e-8, max_iterations=200, tolerance=1e-9)
+    given = {"observation": marker, "release": ReleaseSettings(noise=1e-4)}
+    motions = ObservedMotions.of(simulator, seen, **given, sensors={"clamp": clamp}, loads={"clamp": read})
+    errors = []
+    for acts in ("internal", "external"):
+        (forces,) = reconstruct(simulator, motions, settings=settings, acts=acts).of(["motion 0"], "force")
+        again = simulator.rollout(start, 8, Inputs(internal_force=torch.from_numpy(forces[0, 1:, None]).double()))
+        assert float((marker(again.q[-1]) - seen[-1]).norm()) < 1e-6
+        felt = torch.stack([clamp(one) for one in reactions(again)])
+        errors.append(float((felt - read[1:])[..., :3].norm()))
+    assert errors[0] < 1e-5 < 1e-2 < errors[1]
+
+
+@pytest.mark.parametrize("acts", ["internal", "external"])
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 @pytest.mark.parametrize("problem", [MarkerPositionProblem, MarkerForceProblem])
-def test_derivatives_of_readings_in_a_step(integrator, problem):
+def test_derivatives_of_readings_in_a_step(integrator, problem, acts):
     """By positions of the stage, times the fraction of the step where it stands; with friction on a plate."""
     simulator, sensors = pressing(integrator)
     before = after = simulator.rest_state()
@@ -229,12 +250,12 @@ def test_derivatives_of_readings_in_a_step(integrator, problem):
         return readings(reader, tuple(sensors.values()), state, before, Inputs(), constants).flatten(1)
 
     corner = MarkerMap.at_vertices(torch.tensor([[3]]))
-    made = problem(simulator, constants, before, Inputs(), before.q[:, [3]], 1e-6, corner, read=read)
+    made = problem(simulator, constants, before, Inputs(), before.q[:, [3]], 1e-6, corner, read=read, acts=acts)
     step, x = made.without_force(), simulator.method.solution_for(before, after.q)
     jacobian = made.transposed_jacobian(step, x)[0].T / step.stage.end
     way = torch.from_numpy(np.random.default_rng(3).normal(size=x.shape)) * 1e-9
     way[:, simulator.fixed] = 0.0
-    ends = [read(made.without_force().reached(x + sign * way)) for sign in (1.0, -1.0)]
+    ends = [read(made.without_force().reached(x + sign * way, acts)) for sign in (1.0, -1.0)]
     expected, found = (ends[0] - ends[1])[0] / 2.0, (jacobian @ way.flatten())[3:]
     assert float(expected[8].abs()) > 0.0  # the plate feels it
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
@@ -245,7 +266,8 @@ def test_a_zero_is_that_of_the_first_reading_or_refused_in_a_reconstruction(push
     settings = ReconstructionSettings(method="gauss_newton", regularisation=1e-8)
     given = {"observation": marker, "release": ReleaseSettings(noise=1e-4), "loads": {"clamp": read + 0.05}}
     given["sensors"] = {"clamp": replace(clamp, zero=50.0)}
-    found = reconstruct(simulator, ObservedMotions.of(simulator, seen, **given), settings=settings)
+    motions = ObservedMotions.of(simulator, seen, **given)
+    found = reconstruct(simulator, motions, settings=settings, acts="external")
     (forces,), wanted = found.of(["motion 0"], "force"), force.sum(2)[:, 0]
     away = torch.from_numpy(forces[0, 1:]).double().sum(1) - wanted
     assert float(away.norm() / wanted.norm()) < 0.03

@@ -2,14 +2,18 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 import torch
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from ..linalg.linear_solver import Factor
 from ..linalg.threads import threads_for
+from ..stepping.adjoints import AdjointFunction, first_derivatives
+from ..stepping.inputs import Acts
 from ..stepping.state import State
 from .assembly import HessianAssembly
 from .time_step import TimeStep
@@ -56,12 +60,18 @@ class Linearisation:
         self._potential.evaluate()
         return self._potential.residual.clone()
 
-    def reached(self, x: torch.Tensor) -> State:
-        """Returns the new state, with its reaction, as if x (B, N, 3) [m] solved the step, differentiable by x."""
+    def reached(self, x: torch.Tensor, missing: Acts = "external") -> State:
+        """Returns the new state, with its reaction, as if x solved the step, differentiable by x.
+
+        Args:
+            x: (B, N, 3) [m].
+            missing: whether the force with which x solves the step (`residual`) acts within the body or on it.
+        """
+        force = _Residual.apply(self, x) if missing == "internal" else None
         self._potential.positions.copy_(x.detach())
         self._potential.evaluate()
         gradient = self._potential.held_gradient[:, self._workspace.held]
-        return replace(self.finish(x), reaction=self._reaction(self._terms, x, gradient))
+        return replace(self.finish(x), reaction=self._reaction(self._terms, x, gradient, force))
 
     def factorise(self, x: torch.Tensor) -> None:
         """Prepares H at x (B, N, 3) [m] for `product` and `solve`, which makes an expensive factor if it needs one."""
@@ -97,6 +107,10 @@ class Linearisation:
         """Prepares H at x for `product` and `shifted`, without a factor."""
         self._potential.positions.copy_(x)
         self._potential.update_tangent()
+
+    def restrict(self, field: torch.Tensor) -> torch.Tensor:
+        """Returns a field (B, N, 3), zero where vertices have no unknowns."""
+        return self._potential.restrict(field)
 
     def product(self, direction: torch.Tensor) -> torch.Tensor:
         """Returns H d (B, N, 3) on the free vertices [N]."""
@@ -151,6 +165,26 @@ class Linearisation:
         elastic, _ = self.matrix(x)
         self._potential.set_terms(self._terms)
         return scipy.sparse.csc_array(whole - elastic)
+
+
+class _Residual(AdjointFunction):
+    """The residual g (B, N, 3) of a linearised step at x (B, N, 3); dL/dx = H z for dL/dg = z, as H is symmetric."""
+
+    @override
+    @staticmethod
+    def forward(ctx: Any, step: Linearisation, x: torch.Tensor) -> torch.Tensor:
+        ctx.step = step
+        ctx.save_for_backward(x)
+        return step.residual(x).to(x)
+
+    @override
+    @staticmethod
+    @first_derivatives
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        (x,) = ctx.saved_tensors
+        ctx.step.update(x)
+        free = ctx.step.restrict(gradient.double())  # g is zero at fixed vertices
+        return None, ctx.step.product(free).to(x)
 
 
 def first_order(x: torch.Tensor, here: Linearisation, there: Linearisation) -> torch.Tensor:

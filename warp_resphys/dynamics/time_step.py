@@ -69,7 +69,9 @@ class TimeStep:
         moved = torch.zeros_like(now) if fixed is None else fixed - now
         return replace(new, v=new.v.index_copy(1, equations.fixed, moved / h))
 
-    def reaction(self, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor) -> Reaction | None:
+    def reaction(
+        self, terms: StepTerms, x: torch.Tensor, gradient: torch.Tensor, missing: torch.Tensor | None = None
+    ) -> Reaction | None:
         """Returns the reaction at the held vertices, differentiable; None without such vertices.
 
         Internal forces have no part in its resultant (`fem.internal_forces`).
@@ -78,9 +80,12 @@ class TimeStep:
             terms: of the potential.
             x: (B, N, 3) solution of the stage [m].
             gradient: (B, D + R, 3) of the energies at the held vertices there, as numbers [N].
+            missing: (B, N, 3) internal force that the terms lack [N].
         """
         energies = self.equations.energies
-        loads, internal = energies.loads_at_fixed(terms, x), energies.internal_force(self.step, x)
+        loads = energies.loads_at_fixed(terms, x)
+        whole = replace(self.step, inputs=self.step.inputs.plus(missing, "internal"))
+        internal = energies.internal_force(whole, x)
         reaction = self._at_known_velocity(reaction_of(self.workspace, terms, x, gradient, loads))
         return reaction if reaction is None or internal is None else energies.internal.taken_up(reaction, internal, x)
 

@@ -151,6 +151,7 @@ def reconstruct(context: StageContext, workers: Workers = ALONE) -> None:
         settings.reconstructed,
         parameters=experiment.identified(model),
         settings=settings.reconstruction,
+        acts=settings.network.acts,
         parts=parts,
     )
     with atomic_hdf5(folder / reconstruction_file(model), "reconstruction", {"names": [*found.names]}) as file:

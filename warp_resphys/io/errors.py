@@ -11,6 +11,7 @@ from types import NoneType, UnionType
 from typing import (
     Any,
     Final,
+    Literal,
     ParamSpec,
     SupportsFloat,
     SupportsIndex,
@@ -127,6 +128,11 @@ def checks_types(function: Callable[P, R]) -> Callable[P, R]:
     def call(*given: P.args, **options: P.kwargs) -> R:
         hints = get_type_hints(function)
         for name, value in signature.bind(*given, **options).arguments.items():
+            if get_origin(hints[name]) is Literal:
+                choices = get_args(hints[name])
+                if value not in choices:
+                    raise InputError(f"{function.__name__}: {name} is {value!r}: choose {' or '.join(choices)}.")
+                continue
             parts = get_args(hints[name]) if get_origin(hints[name]) in (Union, UnionType) else (hints[name],)
             kinds = [Mapping if is_typeddict(kind) else get_origin(kind) or kind for kind in parts]
             letters = isinstance(value, str) and str not in kinds  # which are no list of names

@@ -24,7 +24,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
-from .residuals.correction import equilibrium_under_feedback
+from .residuals.correction import acts_of, equilibrium_under_feedback
 from .sensing import readings
 from .start import Start
 from .trial_batch import TrialBatch
@@ -158,9 +158,7 @@ class Replay:
             return State(q, v)
         if force is None or not self.is_static:
             return self.simulator.static_equilibrium(resting, constants, start=q)
-        return equilibrium_under_feedback(
-            self.simulator, resting, constants, State(q, v), lambda state: force(state, 0)
-        )
+        return equilibrium_under_feedback(self.simulator, resting, constants, State(q, v), force)
 
     @property
     def is_static(self) -> bool:
@@ -204,7 +202,7 @@ class Replay:
 
         def step(last: tuple[State, torch.Tensor], k: int) -> tuple[State, torch.Tensor]:
             state = last[0]
-            acting = inputs.at(k).plus(None if force is None else force(state, k))
+            acting = inputs.at(k).plus(None if force is None else force(state, k), acts_of(force))
             new = self.simulator.step(state, acting, constants)
             return new, self.read(new, state, acting, constants)
 

@@ -2,9 +2,8 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -241,8 +240,7 @@ class Robot:
             return settled
         acting, predictor = self._acting(start, inputs)
         assert predictor is not None
-        force = cast(Callable[[State], torch.Tensor], partial(predictor, step=0))
-        body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start, force)
+        body = equilibrium_under_feedback(self.simulator, acting.inputs, self.constants, start, predictor)
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return body.with_memory({**start.memory_of(), **acting.memory, "left": left})
 
@@ -322,7 +320,7 @@ class Robot:
         if predictor is not None:
             force = predictor(state, 0)
             assert isinstance(force, torch.Tensor)
-            total = total.plus(force)
+            total = total.plus(force, predictor.acts)
         return total, lambda body: self._remembered(state, acting, predictor, body)
 
     def rollout(

@@ -227,8 +227,10 @@ class RobotScene:
 
     def _inputs_in_scene(self, name: str, inputs: Inputs) -> Inputs:
         fields: dict[str, torch.Tensor | None] = {}
-        if inputs.external_force is not None:
-            fields["external_force"] = inputs.external_force @ self._frames[name][0].mT
+        for key in ("external_force", "internal_force"):
+            force = inputs.fields.get(key)
+            if force is not None:
+                fields[key] = force @ self._frames[name][0].mT
         if inputs.fixed_positions is not None:
             fields["fixed_positions"] = self._placed(name, inputs.fixed_positions)
         return inputs.replace(**fields)

@@ -218,6 +218,11 @@ class NetworkSettings(Settings):
     activation: Literal["normalised_elu", "silu"] = setting(
         "normalised_elu", "layer normalisation and ELU, as published; silu is smoother"
     )
+    acts: Literal["internal", "external"] = setting(
+        "internal",
+        "where the force acts: within the body, whose support does not feel it, or on it, as water or an obstacle that "
+        "the simulator lacks",
+    )
     core: ClassSettings | None = setting(
         None, "map between the coders by a class of another package, in place of blocks and layers"
     )

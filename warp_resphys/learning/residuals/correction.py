@@ -15,7 +15,7 @@ from ...dynamics.simulator import Constants, Simulator
 from ...io.arrays import Brief
 from ...io.errors import ConvergenceError, InputError, in_short
 from ...io.safe_files import read_checkpoint, write_checkpoint
-from ...stepping.inputs import Inputs
+from ...stepping.inputs import Acts, Inputs
 from ...stepping.state import State
 from ..scores import HeldOutTest
 from .networks import NextState, ResidualForce, StateMap, restore
@@ -24,7 +24,8 @@ COROTATED: Final = "corotated"
 _KINDS: Final = {ResidualForce: "residual force", NextState: "next state"}  # of checkpoints
 DIVERGENCE_DISTANCE = 10.0  # body lengths from rest beyond which a roll-out has diverged
 
-# Function of the state and the number of the step: a residual force (B, N, 3) [N] to add, or the next state.
+# Function of the state and the number of the step: a residual force (B, N, 3) [N] to add, or the next state. Where the
+# force acts is its attribute `acts`; a plain function without it returns an external force.
 Predictor = Callable[[State, int], torch.Tensor | State]
 
 _FADES = (1.25, 2.5)  # ratios of the distance from the modes to that in training, between which a force fades out
@@ -92,8 +93,14 @@ class CorrectedSimulator:
             if inputs.fixed_positions is not None:
                 idle["fixed_positions"] = torch.where(failed[:, None, None], rest, inputs.fixed_positions)
             inputs = inputs.replace(**idle)
-        new = self.simulator.step(state, inputs.plus(force), self._constants)
+        new = self.simulator.step(state, inputs.plus(force, acts_of(self._predict)), self._constants)
         return new, failed | ~new.converged
+
+
+def acts_of(predict: object) -> Acts:
+    """Returns where the force of a predictor acts: a function of the user's without `acts` is an external force."""
+    acts: Acts = getattr(predict, "acts", "external")
+    return acts
 
 
 def known_positions(state: State) -> torch.Tensor:
@@ -193,6 +200,7 @@ class LearnedPredictor:
 
     Attributes:
         left_at: (B,) step at which an environment left the range, -1 where it has not; None before the first step.
+        acts: where its force acts.
     """
 
     def __init__(
@@ -205,6 +213,7 @@ class LearnedPredictor:
     ) -> None:
         self.model, self._context, self._range, self._frames, self._base = model, context, range_, frames, base
         self.left_at: torch.Tensor | None = None
+        self.acts = model.acts
 
     def __call__(self, state: State, step: int) -> torch.Tensor | State:
         """Returns the model's force (B, N, 3) [N] or next state, on the simulator's device and in its precision."""
@@ -300,7 +309,7 @@ def force_frames(simulator: Simulator, kind: str) -> VertexFrames | None:
 
 
 def equilibrium_under_feedback(
-    simulator: Simulator, inputs: Inputs, constants: Constants, guess: State, force: Callable[[State], torch.Tensor]
+    simulator: Simulator, inputs: Inputs, constants: Constants, guess: State, predict: Callable[[State, int], Any]
 ) -> State:
     """Returns the state of rest under constant inputs and a force (B, N, 3) [N] that depends on the state.
 
@@ -313,20 +322,21 @@ def equilibrium_under_feedback(
         inputs: constant inputs beside the force.
         constants: see `Simulator.prepare`.
         guess: initial guess.
-        force: (B, N, 3) of a state [N].
+        predict: predictor of the force, called with step zero.
 
     Raises:
         ConvergenceError: there is no equilibrium, or the iteration does not converge; its report says which
             environments converged, (B,).
     """
-    state, solution, acceleration, stalled = guess, guess, _AndersonAcceleration(), 0
+    acts, acceleration, stalled = acts_of(predict), _AndersonAcceleration(), 0
+    state = solution = guess
     current: torch.Tensor | None = None
     smallest: torch.Tensor | None = None
     for number in range(_ITERATIONS):
-        previous, current = current, force(state)
-        if previous is not None and torch.equal(current, previous) and torch.equal(force(solution), current):
+        previous, current = current, predict(state, 0)
+        if previous is not None and torch.equal(current, previous) and torch.equal(predict(solution, 0), current):
             return solution
-        solution = simulator.static_equilibrium(inputs.plus(current), constants, start=state.q.detach())
+        solution = simulator.static_equilibrium(inputs.plus(current, acts), constants, start=state.q.detach())
         change = solution.q - state.q
         size = change.detach().abs().amax((1, 2))
         done = size < _TOLERANCE

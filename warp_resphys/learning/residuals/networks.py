@@ -16,6 +16,7 @@ from ...dynamics.modes import RestStiffness
 from ...io.classes import ClassSettings
 from ...io.errors import InputError
 from ...settings.learning import NetworkSettings
+from ...stepping.inputs import Acts
 from .coders import Coder, actuation_coder, displacement_coder, empty_coder, nodal_coder, pod_coder
 
 _ARCHITECTURE = ("blocks", "layers", "width", "activation")
@@ -101,6 +102,7 @@ class StateMap(nn.Module):
 
     Attributes:
         fields: names of the predicted fields, in order.
+        acts: whether a force acts within the body or on it (`Inputs.plus`).
 
     Args:
         rest: (N, 3) rest positions [m].
@@ -129,6 +131,7 @@ class StateMap(nn.Module):
         self.register_buffer("rest", rest)
         self.position, self.velocity, self.actuation = position, velocity, actuation
         self.outputs = nn.ModuleDict(outputs)
+        self.acts: Acts = architecture.acts
         keys = (*_ARCHITECTURE, *(("core",) if architecture.core else ()))
         self.architecture = {key: value for key, value in architecture.plain().items() if key in keys}
         self._sizes = [coder.size for coder in outputs.values()]
@@ -203,6 +206,7 @@ class StateMap(nn.Module):
         """Metadata for `restore`, beside the tensors."""
         return {
             "architecture": self.architecture,
+            "acts": self.acts,
             "reduced": self.position.basis is not None,
             "actuated": self.actuation is not None,
         }
@@ -293,7 +297,9 @@ def restore(kind: type[Model], tensors: Mapping[str, torch.Tensor], description:
     outputs = {name: coder(f"outputs.{name}") for name in kind.fields}
     actuation = coder("actuation") if description["actuated"] else None
     state = coder("position"), coder("velocity")
-    model = kind(tensors["rest"], *state, outputs, NetworkSettings(**description["architecture"]), actuation)
+    acts = description.get("acts", "internal")  # files of earlier versions lack it
+    settings = NetworkSettings(**description["architecture"], acts=acts)
+    model = kind(tensors["rest"], *state, outputs, settings, actuation)
     if tensors["linear"].dtype == torch.float64:
         model.double()
     model.load_state_dict(tensors)

@@ -33,7 +33,7 @@ from ...io.parts import Arrays, Parts, Report, TrialPart, cut
 from ...linalg.least_squares import minimise
 from ...linalg.threads import threads_for
 from ...settings.learning import ReconstructionSettings
-from ...stepping.inputs import Inputs
+from ...stepping.inputs import Acts, Inputs
 from ...stepping.rollout import states
 from ...stepping.state import State
 from ..metrics import mean_distance
@@ -65,8 +65,11 @@ class ReconstructedStep(Brief):
 class Reconstructor(ABC):
     """Finds residual forces for a simulator; see `make_reconstructor`."""
 
-    def __init__(self, simulator: Simulator, settings: ReconstructionSettings, observation: Observation) -> None:
-        self.simulator, self.settings, self.regularisation = simulator, settings, settings.regularisation
+    def __init__(
+        self, simulator: Simulator, settings: ReconstructionSettings, observation: Observation, acts: Acts
+    ) -> None:
+        self.simulator, self.settings, self.acts = simulator, settings, acts
+        self.regularisation = settings.regularisation
         self.observation = observation.to(simulator.rest_positions)
         if not isinstance(observation, WholeState):
             self._check_sparse(observation)
@@ -103,7 +106,7 @@ class Reconstructor(ABC):
         Args:
             state: at the start of the step.
             observed: (B, M, D) measured points, NaN where a point was not seen [unit].
-            inputs: during the step; an external force is added to the reconstructed one.
+            inputs: during the step; a force in them acts beside the reconstructed one.
             first_guess: (B, N, 3) initial guess of the force, such as that of the last step [N]; not all methods use
                 it.
             read: errors of force sensors after the step.
@@ -140,7 +143,7 @@ class LeastSquares(Reconstructor):
         step = (self.simulator, constants, state, acting, observed, self.regularisation, self.observation)
         with threads_for(state.q[0].numel()), torch.no_grad():
             for number, kind in enumerate(self._problems, 1):
-                problem = kind(*step, self.settings.tolerance, read)
+                problem = kind(*step, self.settings.tolerance, read, self.acts)
                 result = minimise(
                     problem, problem.start(first_guess), self.settings.tolerance, self.settings.max_iterations
                 )
@@ -181,7 +184,7 @@ class LBFGSB(Reconstructor):
         def objective(values: np.ndarray) -> tuple[float, np.ndarray]:
             force = torch.as_tensor(values, device=like.device, dtype=like.dtype).reshape(like.shape)
             force.requires_grad_(True)
-            end = sim.step(state, acting.plus(free * force), self._constants)
+            end = sim.step(state, acting.plus(free * force, self.acts), self._constants)
             residual = self.observation.residual(self.observation(end.q), observed)
             misfit = (free * residual if whole else residual).square().sum()
             misfit = misfit if read is None else misfit + read(end).square().sum()
@@ -213,7 +216,7 @@ class LBFGSB(Reconstructor):
             )
         force = free * sim.tensor(result.x.reshape(like.shape))
         with torch.no_grad():
-            new = sim.step(state, acting.plus(force), self._constants)
+            new = sim.step(state, acting.plus(force, self.acts), self._constants)
         return ReconstructedStep(new, force, int(result.nit))
 
 
@@ -256,7 +259,10 @@ def without_ringing(simulator: Simulator, observation: Observation) -> Simulator
 
 
 def make_reconstructor(
-    simulator: Simulator, settings: ReconstructionSettings, observation: Observation = WHOLE_STATE
+    simulator: Simulator,
+    settings: ReconstructionSettings,
+    observation: Observation = WHOLE_STATE,
+    acts: Acts = "internal",
 ) -> Reconstructor:
     """Returns the reconstruction method that settings name.
 
@@ -264,6 +270,7 @@ def make_reconstructor(
         simulator: to correct.
         settings: method and tolerances; ``levenberg_marquardt`` is for markers, which need a positive regularisation.
         observation: C, for as many environments as the states have.
+        acts: where the force acts; force sensors feel an ``external`` one.
 
     Raises:
         InputError: a method that does not fit the observation, or a marker on a vertex that the body does not have.
@@ -275,7 +282,7 @@ def make_reconstructor(
         problems = {"gauss_newton": (MarkerPositionProblem, *damped), "levenberg_marquardt": damped}
     if method not in (*problems, "lbfgsb"):
         raise InputError(f"reconstruction.method is {method!r}: choose one of {', '.join(problems)}, lbfgsb.")
-    arguments = (simulator, settings, observation)
+    arguments = (simulator, settings, observation, acts)
     return LBFGSB(*arguments) if method == "lbfgsb" else LeastSquares(problems[method], *arguments)
 
 
@@ -314,6 +321,7 @@ def reconstruct(
     *,
     parameters: Identified | Mapping[str, float] | None = None,
     settings: ReconstructionSettings | None = None,
+    acts: Acts = "internal",
     parts: Parts | None = None,
 ) -> ReconstructedTrials:
     """Finds the forces with which a simulator follows observed motions, step by step.
@@ -324,6 +332,8 @@ def reconstruct(
         names: of the trials; all by default.
         parameters: values in place of the simulator's, such as `Identification.parameters`.
         settings: method, regularisation [unit^2/N^2], tolerance and iterations; the defaults of the class if None.
+        acts: ``internal``, or ``external`` as of water or an obstacle that the simulator lacks: this a force sensor
+            feels. The network must have the same (`NetworkSettings.acts`).
         parts: workers and files of the work; this process and its memory if None.
 
     Raises:
@@ -336,7 +346,7 @@ def reconstruct(
     for number, whole in enumerate(motions.trials.batches(motions.trials.chosen(names))):
         frames = motions.learned_steps(int(motions.trials.seconds(whole) / used.time_step + 1e-6)) + 1
         for first, batch in cut(whole, parts.batch):
-            work = partial(_reconstructed, used, motions, batch, known, wanted)
+            work = partial(_reconstructed, used, motions, batch, known, wanted, acts)
             cut_up.append(TrialPart(f"part{number}_{first:03d}", batch, frames, work))
     parts.run(cut_up)
     return ReconstructedTrials(tuple(name for part in cut_up for name in part.names), partial(parts.joined, cut_up))
@@ -348,6 +358,7 @@ def _reconstructed(
     names: Sequence[str],
     identified: Identified,
     settings: ReconstructionSettings,
+    acts: Acts,
     report: Report,
 ) -> Arrays:
     """Reconstruction of trials that begin in the same way, see `ReconstructedTrials`.
@@ -365,7 +376,7 @@ def _reconstructed(
         simulator = replace(simulator, time_step=_STATIC_STEP, integrator="implicit_euler")
         observed = torch.cat([torch.full_like(observed, torch.nan), observed], 1)
         inputs = resting
-    method = make_reconstructor(simulator, settings, replay.observe)
+    method = make_reconstructor(simulator, settings, replay.observe, acts)
     reached, forces = [state], [torch.zeros_like(state.q)]
     report()
     prepared = replay.prepare(identified.values(replay.simulator))

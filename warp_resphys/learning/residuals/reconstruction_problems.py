@@ -15,7 +15,7 @@ from ...dynamics.simulator import Constants, Simulator
 from ...io.errors import ConvergenceError, InputError
 from ...linalg.conjugate_gradients import LinearMap, conjugate_gradients
 from ...linalg.least_squares import Move, Point, Problem, ridge
-from ...stepping.inputs import Inputs
+from ...stepping.inputs import Acts, Inputs
 from ...stepping.state import State
 from ..replay import Prepared, Replay
 from ..sensing import loads_at_steps
@@ -42,6 +42,7 @@ class StepProblem(Problem):
     observation: Observation = WHOLE_STATE  # C, for as many environments as the state has
     tolerance: float = 0.0  # of the distance of two iterates at the minimum [m]
     read: Read | None = None  # of force sensors, differentiable; C' below then has C more rows
+    acts: Acts = "internal"  # where the force acts: sensors feel an external one
 
     def __post_init__(self) -> None:
         """Linearises the step."""
@@ -67,13 +68,13 @@ class StepProblem(Problem):
             return points
         with torch.enable_grad():
             at = x.detach().requires_grad_(True)
-            errors = self.read(step.reached(at)).unbind(1)
+            errors = self.read(step.reached(at, self.acts)).unbind(1)
             columns = [torch.autograd.grad(one.sum(), at, retain_graph=True)[0].flatten(1) for one in errors]
         return torch.cat([points, step.stage.end * torch.stack(columns, 2)], 2)
 
     def _reached(self, step: Linearisation, x: torch.Tensor) -> State:
         """Returns the state after the step with positions x of the stage [m]."""
-        return step.finish(x) if self.read is None else step.reached(x)
+        return step.finish(x) if self.read is None else step.reached(x, self.acts)
 
     @abstractmethod
     def start(self, first_guess: torch.Tensor | None) -> Point:
@@ -228,7 +229,7 @@ class MarkerForceProblem(StepProblem):
     @override
     def evaluate(self, x: torch.Tensor) -> Point:
         try:
-            end = self.simulator.step(self.state, self.inputs.plus(x), self.constants)
+            end = self.simulator.step(self.state, self.inputs.plus(x, self.acts), self.constants)
         except ConvergenceError:
             return Point(x, x.new_full((len(x),), torch.inf), (self.state.q,))
         value = self.missing(end).square().sum((1, 2)) + self.weight * x.square().sum((1, 2))

@@ -199,9 +199,7 @@ class _SplitStages:
         # For the published comparison, where all vertices are observed, test trials are reconstructed, too.
         compared = split.test if run.markers is None and run.law is None else ()
         reconstructed = split.train + split.validation + compared
-        for model in LEARNED:
-            if model not in run.models or model == SIMFREE:
-                continue
+        for model in (model for model in LEARNED if model in run.models and model != SIMFREE):
             self.add(
                 *(f"reconstruct_{model}", reconstruct, (files.reconstruction_file(model),)),
                 ("reconstruction", "network.acts"),

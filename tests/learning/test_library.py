@@ -211,7 +211,7 @@ def test_a_force_that_is_no_gain_on_left_out_motions_is_not_used(robot, caplog):
     assert test["split"] == "left-out training"
     assert test["error_mm"] > test["below_mm"] > 0.1
     assert not test["used"]
-    assert "fit_force: the network is no clear gain: on the left-out training trials" in caplog.text
+    assert "fit_force: the network is not used: on the left-out training trials" in caplog.text
 
 
 def test_the_network_has_the_actuation_as_input():

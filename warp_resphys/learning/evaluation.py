@@ -21,6 +21,7 @@ from ..stepping.rollout import states
 from ..stepping.state import State
 from .metrics import marker_errors, summarise
 from .observed_motions import Identified, ObservedMotions
+from .replay import Replay
 from .residuals.correction import CorrectedSimulator, Learned, LearnedPredictor, Predictor, force_frames
 from .start import Start
 
@@ -207,13 +208,18 @@ class TrialRollout:
         if self.replay.is_static:
             self.steps = POSE_STEPS if data_driven else 0
 
-    def predictor(self, learned: Learned) -> LearnedPredictor:
-        """Returns the predictor of a network in these trials, or raises InputError for one of another body."""
+    def predictor(self, learned: Learned, replay: Replay | None = None) -> LearnedPredictor:
+        """Returns the predictor of a network in these trials, or raises InputError for one of another body.
+
+        Args:
+            learned: the network.
+            replay: of the trials under other inputs; None: `replay`.
+        """
         if (given := len(learned.network.rest)) != (wanted := len(self._simulator.rest_positions)):
             raise InputError(f"a force on {given} vertices was learned, but the body has {wanted}: learn one for it.")
         frames = None if self._data_driven else force_frames(self._simulator, learned.force_frame)
         base = self._motions.base(self.replay.trials.names, self._simulator)
-        conditions = self._motions.conditions(self.replay, self._values, self._data_driven)
+        conditions = self._motions.conditions(replay or self.replay, self._values, self._data_driven)
         return LearnedPredictor(learned.network, conditions, learned.range_, frames, base)
 
     @torch.no_grad()

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
-from typing import Final
+from typing import Final, NotRequired
 
 import numpy as np
 from typing_extensions import TypedDict
@@ -70,7 +70,8 @@ class HeldOutTest(TypedDict):
     split: str  # that they belong to
     error_mm: float | None  # mean over the trials of their mean errors; None where a roll-out diverged
     below_mm: float | None  # of the simulator alone
-    used: bool  # whether the model is clearly closer, see `Score.beats`
+    used: bool  # whether the model is clearly closer, see `Score.beats`, and not refused
+    refused: NotRequired[list[str]]  # why it is refused although it is closer, see `acceptance`
 
 
 def held_out_test(
@@ -111,5 +112,7 @@ def text_of(test: HeldOutTest) -> str:
     """Returns half a sentence on the errors of a learned model on held-out trials, and of the simulator without it."""
     error, below = ("diverges" if x is None else f"has {x:.3g} mm" for x in (test["error_mm"], test["below_mm"]))
     trials = ", ".join(test["trials"]) if len(test["trials"]) <= _NAMED else str(len(test["trials"]))
-    clear = "" if test["used"] else ", which it does not clearly beat"
+    refused = test.get("refused", [])
+    clear = f"; it is refused: {'; '.join(refused)}" if refused else ", which it does not clearly beat"
+    clear = "" if test["used"] else clear
     return f"on the {test['split']} trials ({trials}) it {error}, and the simulator without it {below}{clear}"

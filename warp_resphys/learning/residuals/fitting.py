@@ -19,6 +19,7 @@ from ...io.errors import InputError, checks_types
 from ...io.progress import Progress
 from ...io.settings import parse
 from ...settings.learning import InTheLoopSettings, NetworkSettings, TrainerSettings, TrainingSettings
+from ..acceptance import Acceptance
 from ..evaluation import HELD_OUT, HeldOutRollouts, left_out_in_turn
 from ..observed_motions import Identified, ObservedMotions
 from ..replay import Replay
@@ -304,6 +305,14 @@ class Fitting:
         split = HELD_OUT if folds else "validation" if self.validation else "training"
         return held_out_test(names, split, errors, below, sizes)
 
+    def accepted(self, learned: Learned, test: HeldOutTest) -> HeldOutTest:
+        """Returns the test of a network that is accurate, refused where `Acceptance` objects to it."""
+        if not test["used"]:
+            return test
+        acceptance = Acceptance(self.simulator, self.motions, self.identified, test["below_mm"] or math.inf)
+        refused = acceptance.objections(learned, self.train + self.validation, self.validation or self.train)
+        return {**test, "used": not refused, "refused": refused}
+
     def _group(
         self, replay: Replay, start: Start, names: Sequence[str], parameters: Mapping[str, torch.Tensor]
     ) -> TrialGroup | None:
@@ -345,7 +354,8 @@ def fit(
     learned = replace(learned, network=best)
     tested = fitting.data_driven or learned.test is not None or not settings.trainer.gate
     test = learned.test if tested else fitting.test(learned, settings, name)
+    test = None if test is None else fitting.accepted(learned, test)
     if test is not None and not test["used"]:
-        log.warning("%s: the network is no clear gain: %s", name, text_of(test))
+        log.warning("%s: the network is not used: %s", name, text_of(test))
     kept = {"selection": trainer.selection, "epoch": trainer.best_epoch, "validation_rollout_error_mm": error}
     return replace(learned, training={"kept": {**kept, "test": test}, "epochs": trainer.history}, test=test)

@@ -150,7 +150,7 @@ def test_fragments_have_a_valid_name_and_one_entry():
     assert PROJECT["tool"]["towncrier"]["start_string"].strip() in text("CHANGELOG.md")
 
 
-def test_pages_of_the_api_have_the_first_sentences_of_their_modules():
+def test_pages_of_the_api_have_the_first_sentences_of_their_modules_and_names():
     pages = runpy.run_path(str(REPOSITORY / "docs" / "extensions" / "api_pages.py"))["pages"]()
     assert len(pages) > 8
     for path, expected in pages.items():

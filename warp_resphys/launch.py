@@ -31,7 +31,7 @@ from .io.errors import ResphysError, ResphysWarning, did_you_mean
 from .io.process import collector_paused, ends_as_after_ctrl_c
 from .io.settings import Settings, parse
 from .option_files import names_are_texts, run_schema
-from .overrides import LateOverride, readable
+from .overrides import LateOverride, adjust, readable
 from .settings.run import RunSettings
 
 INTERRUPTED: Final = 130
@@ -102,8 +102,7 @@ class _Job:
         """Runs the command, or shows its settings."""
         self.started = True
         try:
-            for override in self.late:
-                override.apply(config)
+            adjust(config, HydraConfig.get().runtime.choices, self.late)
             if self.shown is not None:
                 with ends_where_nobody_reads():
                     return _show(config, self.shown)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import reduce
 from importlib import resources
@@ -33,6 +33,7 @@ _QUOTED: Final = re.compile(r"""'(?:\\.|[^'\\])*'|"(?:\\.|[^"\\])*\"""")
 _CALL: Final = re.compile(r"(?:bool|choice|float|glob|int|interval|range|shuffle|sort|str|tag)\(.*\)")
 _PAIR: Final = re.compile(rf"\s*({_QUOTED.pattern}|[^:]*?)\s*:\s*(.*)", re.DOTALL)
 _CLOSING: Final = {"[": "]", "{": "}", "(": ")", "'": "'", '"': '"'}
+_BUDGETS: Final = "budget_on"  # group of options: what a budget changes for one origin of the trials
 _HYDRA_TEXTS: Final = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
 
 
@@ -96,10 +97,25 @@ def composed(name: str, arguments: Sequence[str] = ()) -> Any:
     """Returns the values of a configuration, such as ``config`` for a run, as a command line composes them."""
     words, late = readable(arguments)
     with initialize_config_module(CONFIG_PACKAGE, version_base="1.3"):
-        config = compose(name, words)
+        config = compose(name, words, return_hydra_config=True)
+    with open_dict(config):
+        choices = config.pop("hydra").runtime.choices
+    adjust(config, choices, late)
+    return OmegaConf.to_container(config, resolve=True)
+
+
+def adjust(config: DictConfig, choices: Mapping[str, str], late: Sequence[LateOverride]) -> None:
+    """Changes a configuration that Hydra has composed from chosen options.
+
+    A group that an experiment set to null stays null: Hydra gives it what a budget changes in it, and nothing else.
+    """
+    change = resources.files(CONFIG_PACKAGE) / _BUDGETS / f"{choices.get(_BUDGETS)}.yaml"
+    changed: Any = OmegaConf.create(change.read_text(encoding="utf-8")) if change.is_file() else {}
+    for name, group in changed.items():
+        if config.get(name) == group:
+            config[name] = None
     for override in late:
         override.apply(config)
-    return OmegaConf.to_container(config, resolve=True)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,12 @@
 """Configurations of experiments on recordings: what is refused, what a budget changes, and which choice wins."""
 
-import pytest
+import re
+from pathlib import Path
 
+import pytest
+import yaml
+
+from support.command_line import outcome
 from support.configured import check, composed, settings
 from support.refusals import refuses
 from warp_resphys.experiment.checks import check_run
@@ -170,6 +175,38 @@ def test_the_quick_budget_takes_fewer_folds_and_wins_but_over_the_command_line()
     assert (given.in_the_loop.epochs, given.data.seconds) == (7, 1)
     full = settings(*repeated, "budget=full")
     assert (full.in_the_loop.epochs, full.data.seconds) == (10, 1.4)
+
+
+def own_settings(name, text, *overrides):
+    """Settings of an experiment in the working directory, as `--cfg job` prints them."""
+    path = Path("configs", "experiment", f"{name}.yaml")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"# @package _global_\nname: {name}\n{text}", encoding="utf-8")
+    ended = outcome("--cfg", "job", f"experiment={name}", *overrides)
+    assert ended.err == ""
+    return yaml.safe_load(ended.out)
+
+
+def test_a_group_that_an_experiment_sets_to_null_stays_null_with_the_quick_budget(folder):
+    beam = "defaults: [beam_real, _self_]\nidentify: null\nin_the_loop: null\n"
+    run = own_settings("beam", beam, "budget=quick")
+    assert (run["identify"], run["in_the_loop"], run["data"]["seconds"]) == (None, None, 0.7)
+    run = own_settings("beam", beam, "budget=quick", "in_the_loop.epochs=7")
+    assert (run["identify"], run["in_the_loop"]["epochs"]) == (None, 7)
+    again = "defaults: [beam, _self_]\nidentify: {parameters: {youngs_modulus: {lower: 1.0e5, upper: 1.0e6}}}\n"
+    run = own_settings("again", again, "budget=quick")
+    assert [*run["identify"]["parameters"]] == ["youngs_modulus"]
+    assert run["in_the_loop"] is None
+
+
+def test_whole_recordings_of_a_driven_robot_determine_its_stiffness_and_no_poissons_ratio(folder):
+    page = (Path(__file__).parents[2] / "docs" / "actuators.md").read_text(encoding="utf-8")
+    _, mine = re.search(r"```yaml\n# @package _global_\n(defaults:.*?name: my_arm\n)(.*?)```", page, re.DOTALL).groups()
+    identify = own_settings("my_arm", f"defaults: [/recordings: pressure, override /mesh: file, _self_]\n{mine}")[
+        "identify"
+    ]
+    assert [*identify["parameters"]] == ["youngs_modulus"]
+    assert identify["seconds"] is None
 
 
 @pytest.mark.parametrize(("group", "option"), [("network", "published"), ("trainer", "published")])

@@ -15,6 +15,7 @@ from . import figures
 from .body_picture import MeshSummary, mesh_picture
 from .data import Driven, RunReport, TrialResults, best_and_worst, shown_markers, spread
 from .page import Block, Canvas, Drawn, Part
+from .ranking import recommended
 from .wording import TONES, mm_text, unbroken
 
 # Models whose coordinates are drawn, as more would overlap.
@@ -165,7 +166,8 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
             models = [m for m in models if m != "simulation"] or models
             caption += f"displacement of the markers from rest, and the {words} that drive it."
             alt += f"; below them the {words} of the {driven.quantity.per}s"
-        banded = [model for model in ("resphys", "actuator", "law", "sysid") if model in trials.half_widths][:1]
+        order = (recommended(data.metrics, data.settings), "resphys", "actuator", "law", "sysid")
+        banded = [model for model in order if model in trials.half_widths][:1]
         bands = {model: trials.half_widths[model][row][:, kept] for model in banded}
         hidden = len(shown) - len(kept)
         caption += _band_note(data, bands)

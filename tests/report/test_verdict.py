@@ -237,8 +237,8 @@ EACH = {  # Conditions by name: what the metrics have, and the line.
     "trials": ({}, "Trials: three trials are too few for an interval; test on five or more."),
     "refused": (
         {"networks": {"resphys": {"test": REFUSED}}},
-        "Not used: ResPhys, as on the validation trials (a) it has 46 mm, and the simulator without it has 11 mm, which "
-        "it does not clearly beat.",
+        "Not used: ResPhys, as on the validation trials (a) it has 46 mm, and the simulator without it has 11 mm, "
+        "which it does not clearly beat.",
     ),
 }
 

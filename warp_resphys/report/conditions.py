@@ -106,7 +106,10 @@ def _bounds(run: Judged) -> Iterator[str]:
         for text in _at_first_guess(fold, run.settings):
             guesses.setdefault(text, []).append(number)
     remedies = {
-        "at a bound": (bounds, "widen such a range in identify.parameters, or add the physics that the simulator lacks"),
+        "at a bound": (
+            bounds,
+            "widen such a range in identify.parameters, or add the physics that the simulator lacks",
+        ),
         "at the first guess": (guesses, "raise identify.starts"),
     }
     for where, (found, remedy) in remedies.items():

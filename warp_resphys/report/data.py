@@ -9,6 +9,7 @@ from typing import NotRequired, TypedDict
 import numpy as np
 
 from ..data.input_network import InputNetwork
+from ..data.input_response import NO_INPUT
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..energies.catalogue import LawContent
@@ -204,6 +205,13 @@ class Driven:
     limit: float | None = None  # Largest allowed value.
     scaled: tuple[str, ...] = ()  # Names of the trials with higher inputs than in training.
     poses: tuple[str, ...] = ()  # Names of the poses, which the last inputs hold.
+
+    @cached_property
+    def used(self) -> tuple[int, ...]:
+        """Numbers of the parts that some trial drives by more than the noise of a gauge; all where none does."""
+        largest = np.max([np.abs(values).max(axis=0) for values in self.values.values()], axis=0)
+        driven = np.flatnonzero(largest > NO_INPUT * largest.max())
+        return tuple(driven.tolist()) or tuple(range(len(self.channels)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,6 @@ from .body_motions import LABORATORY_MARKERS, MEASURED_MARKERS, TARGET_VERTICES,
 from .data import Film, RunReport, at_times, shown_markers, spread
 from .layers import MEASURED, OBSTACLE, OUTLINE, face_edges, sharp_edges
 from .page import Block, Canvas, Drawn, Part, ShownModel, ViewInSpace
-from .ranking import recommended
 from .render import Pixels, draw, write_film
 from .wording import MODELS, TONES, shown_models, unbroken
 
@@ -58,7 +57,7 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
         points = spread(points, _MOST_POINTS)
     if film is None or film.trial not in trials.names:
         return None
-    row, models = trials.names.index(film.trial), shown_models(film.positions, recommended(data.metrics, data.settings))
+    row, models = trials.names.index(film.trial), shown_models(film.positions, data.metrics.get("recommended", ""))
     if not models:
         return None
     if every_model:
@@ -90,7 +89,7 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     motion, trials = motion_of(data), data.trials
     if motion is None or trials is None:
         return None
-    models, best = list(motion.positions), recommended(data.metrics, data.settings)
+    models, best = list(motion.positions), data.metrics.get("recommended", "")
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
     colours = f"Grey: {MODELS[models[0]].name}. " if len(models) > 1 else ""
     colours += f"Blue: {MODELS[models[-1]].name}{', the recommended model' * (models[-1] == best)}."
@@ -136,7 +135,7 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     alt = (
         f"An interactive view of the bodies of {', '.join(MODELS[model].name for model in motion.positions)} in motion."
     )
-    shown = shown_models(motion.positions, recommended(data.metrics, data.settings))
+    shown = shown_models(motion.positions, data.metrics.get("recommended", ""))
     return [view_in_space("view", motion, shown, unbroken(caption), alt)]
 
 

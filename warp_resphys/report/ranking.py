@@ -56,7 +56,8 @@ def is_clear(gain: Gain) -> bool:
 def simplest(known: Known, models: Collection[str] = RANKED) -> str:
     """Returns the simplest of some models that is not clearly worse than the best of them; empty without one."""
     best = best_of(known, models)
-    return next((m for m in RANKED if m in known and m in models and _as_good(known[m], known[best])), "")
+    among = [model for model in RANKED if model in known and model in models]
+    return next((model for model in among if model == best or _as_good(known[model], known[best])), "")
 
 
 def _as_good(errors: Sequence[float], best: Sequence[float]) -> bool:

@@ -85,7 +85,7 @@ TONES: Final[Mapping[str, Tone]] = {
     "reconstruction": Tone("#1d7a55", "#62d2a2"),
     "sysid": Tone("#7a4aa0", "#c9a2ea"),
     "law": Tone("#0f766e", "#5eead4"),
-    "actuator": Tone("#a3342f", "#f2a29d"),
+    "actuator": Tone("#e000e0", "#c44dff"),
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
     "published": Tone("#b0307b", "#f08bc5"),
@@ -167,9 +167,9 @@ def error_parts(summary: ErrorSummary) -> tuple[str, str]:
     mean, std = summary["mean"], summary["std"]
     if mean is None:
         return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
-    if std is None:
+    if std is None or mean < _LEAST:
         return number_text(mean), ""
-    return number_text(mean), f"± {number_text(std) if mean < _LEAST else f'{std:,.{_decimals(mean)}f}'}"
+    return number_text(mean), f"± {std:,.{_decimals(mean)}f}"
 
 
 def duration_text(seconds: float) -> str:

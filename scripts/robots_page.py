@@ -9,7 +9,8 @@ import yaml
 
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.report.data import Errors
-from warp_resphys.report.verdict import LEAST_TRIALS, best_pair, compared, known_errors, less_error
+from warp_resphys.report.ranking import LEAST_TRIALS, best_pair, compared, known_errors
+from warp_resphys.report.verdict import less_error
 from warp_resphys.report.wording import MINUS, MODELS, NONE, duration_text, error_parts, in_a_row, number_text
 
 ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_name("reproduce.yaml").read_text(encoding="utf-8"))

@@ -32,7 +32,8 @@ from .experiment.laboratory import run_laboratory
 from .experiment.learning_stages import evaluate, identify, identify_law, reconstruct, train, train_actuator
 from .experiment.mesh_check import check_mesh
 from .experiment.recordings.importing import import_recordings, import_scaled
-from .experiment.report import collect_metrics, make_folds_report, make_report
+from .experiment.report import make_folds_report, make_report
+from .experiment.run_metrics import collect_metrics
 from .experiment.shapes import try_shapes
 from .experiment.simulate import simulate
 from .experiment.splits import folds_of, scaled_trials_of, split_of, test_groups, trials_of
@@ -43,9 +44,11 @@ from .io.kernel_cache import start_quietly
 from .io.progress import show
 from .io.resuming import Stage, package_versions, resources_used, run_stages, unfinished
 from .io.safe_files import read_json, write_json
-from .learning.metrics import ErrorSummary, summarise_folds
+from .learning.metrics import summarise_folds
+from .report.conditions import conditions
 from .report.control_section import tracking_table
 from .report.data import Metrics
+from .report.ranking import recommended, shown_metrics
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
 from .settings.body import TargetSettings
@@ -56,7 +59,6 @@ from .settings.stage_keys import BATCH, FIGURES, IMPORTED, LEARNING, NETWORKS, P
 
 log = logging.getLogger(__name__)
 
-_SHORT = 60  # characters of advice beside which the path of the report is printed
 
 _MOST_THREADS = 4  # that share the trials of a batch, as Python's part of a step runs in one at a time
 
@@ -324,6 +326,8 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
         run_stages(ablation_stages(run, files_read(run, run, run.target)), folder)
         print_ablation(run, folder)
         return
+    if played := " and ".join(run.targets):
+        log.info("The %s is simulated as well: errors compare simulators, and no real robot", played)
     first, acquired = acquire(run, folder)
     folds = folds_of(run)
     if folds is None:
@@ -371,7 +375,7 @@ def _run_folds(
         metrics[name] = collect_metrics(fold.folder, run, [stage.name for stage in fold.stages(ALONE)])
         write_json(fold.folder / files.METRICS, metrics[name])
     over_folds: Metrics = {
-        "errors_mm": summarise_folds(_of_all([of_fold["errors_mm"] for of_fold in metrics.values()])),
+        "errors_mm": summarise_folds([of_fold["errors_mm"] for of_fold in metrics.values()]),
         "folds": metrics,
         **resources_used(folder, [stage.name for stage in first]),
         "versions": package_versions(),
@@ -379,21 +383,15 @@ def _run_folds(
     }
     if (intervals := intervals_of_folds(folder, {n: fold.folder for n, fold in folds.items()}))["models"]:
         over_folds["intervals"] = intervals
+    over_folds["recommended"] = recommended(over_folds, run)
     return over_folds
 
 
-def _of_all(folds: Sequence[Mapping[str, ErrorSummary]]) -> list[dict[str, ErrorSummary]]:
-    """Errors of the models that all folds have: a law is used in some folds alone."""
-    shared = [model for model in folds[0] if all(model in fold for fold in folds)]
-    return [{model: fold[model] for model in shared} for fold in folds]
-
-
 def _print(metrics: Metrics, folder: Path, run: RunSettings) -> None:
-    """Prints what the report begins with: the mean errors, the verdict and the advice."""
+    """Prints what the report begins with: the mean errors, the verdict, the advice and the conditions."""
+    metrics = shown_metrics(metrics)
     tables = [results_table(metrics, run)]
     tables += [tracking_table(metrics["control"]["tracking"])] if "control" in metrics else []
     tables += [shapes_table(metrics["shapes"])] if "shapes" in metrics else []
-    said, *advice = (*verdict(metrics, run), "")
-    last = [" ".join(filter(None, advice)), f"Report: {folder / files.REPORT}"]
-    lines = ["  ".join(filter(None, last))] if len(last[0]) < _SHORT else last
-    show(*tables, *filter(None, (said, *lines)))
+    holds = [f"- {line}" for line in conditions(metrics, run)]
+    show(*tables, *verdict(metrics, run), *holds, f"Report: {folder / files.REPORT}")

@@ -1,10 +1,12 @@
 """Figures: what is drawn where, in which colours, and what does not set the scale."""
 
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
@@ -17,7 +19,7 @@ from warp_resphys.report.data import Driven, FollowedPath, TrialResults
 from warp_resphys.report.error_section import error_over_time, training_curves
 from warp_resphys.report.figures import CHAMBER_COLOURS, use_logarithm
 from warp_resphys.report.identification_section import loss_histories
-from warp_resphys.report.wording import TONES
+from warp_resphys.report.wording import MODELS, TONES
 
 TIMES = np.arange(20) * 0.01
 MEASURED = np.zeros((20, 1, 3))
@@ -198,3 +200,34 @@ def test_followed_paths_are_drawn_in_their_plane():
     np.testing.assert_allclose(np.ptp(driven.get_ydata()), 11.0)
     assert driven.get_color() == TONES["sysid"].light
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["line", "bow"]
+
+
+# Colours as they look without each kind of cone, for linear RGB (Machado, Oliveira and Fernandes 2009, severity 1).
+CONES = {
+    "all": np.eye(3),
+    "no long": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "no middle": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "no short": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def lab(colour, cones):
+    """CIELAB coordinates of a colour such as #1c2127, as it is seen."""
+    linear = ((np.array(to_rgb(colour)) + 0.055) / 1.055) ** 2.4
+    xyz = TO_XYZ @ np.clip(np.asarray(cones) @ linear, 0.0, 1.0)
+    f = np.cbrt(xyz / TO_XYZ.sum(axis=1))
+    return np.array([116.0 * f[1], 500.0 * (f[0] - f[1]), 200.0 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_lines_of_models_differ_by_colour_or_dashes_also_with_colour_blindness(theme):
+    def apart(one, other):
+        colours = [getattr(TONES[model], theme) for model in (one, other)]
+        return min(np.linalg.norm(lab(colours[0], cones) - lab(colours[1], cones)) for cones in CONES.values())
+
+    solid = [model for model in MODELS if figures.model_line(model)["linestyle"] == "-" and model != "reconstruction"]
+    assert {"simulation", "law", "actuator", "resphys"} <= {*solid}
+    assert {pair for pair in combinations(solid, 2) if apart(*pair) < 10.0} == set()
+    assert {model for model in MODELS if model != "actuator" and apart("actuator", model) < 15.0} == set()
+    assert apart("simulation", "actuator") > 30.0

@@ -72,7 +72,7 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
     inside, outside = (number_text(means[name]["law"]) for name in ("0.07 kg", OTHER))
     assert inside != outside
     page.says(
-        "Beyond the training loads, ",
+        "On a simulated target, beyond the training loads, ",
         "mean error of the vertices [mm]weights of the paperother loads",
         f"+ law of its material{inside}{outside}",
         "is used: its root mean square error on the validation trials (80 g, 180 g) is 0.0049 % of",

@@ -186,7 +186,7 @@ class TestBeams:
             assert all(number_text(row["errors_mm"][model]) in page.text for row in errors["per_trajectory"])
         assert "No recordings are configured" not in page.text
         page.says(
-            "two trials are too few for an interval",
+            "Trials: two trials are no evidence; test on five or more.",
             *("5.46 ± 1.78", "251.3 ± 2.5", "stable neo hookean", "left out", "1 min 35 s", "no OpenGL here"),
             "Young's modulus and Poisson's ratio (correlation \N{MINUS SIGN}0.96)",
             "bare: Base - 1 jumps once, by 0.31 mm, in frame 80.",
@@ -229,8 +229,10 @@ class TestBeams:
         head = page.text[: page.text.index("One test trial")]
         mean = number_text(errors["errors_mm"]["sysid"]["mean"])
         for said in (
-            "SysID has 81 % less error than the uncorrected simulator (on 2 of 2 trials)",
-            "ResPhys is not used: on the validation trials (bare) it diverges, and the simulator without it has 0.5 mm",
+            "No evidence either way: 2 trials (SysID",
+            "At a bound: Poisson's ratio",
+            "Trials: two trials are no evidence",
+            "Not used: ResPhys, as on the validation trials (bare) it diverges, and the simulator without it has 0.5",
             f"+ identified parameters (SysID){mean}best",
         ):
             assert said in head

@@ -200,24 +200,24 @@ def test_bodies_at_frames_instants_that_lie_apart_the_uncorrected_model_and_the_
     assert instants(measured[:1], rest, simulated[:1]) == [0]
     assert wording.shown_models({"resphys": 0, "simulation": 0, "sysid": 0}) == ["simulation", "resphys"]
     assert wording.shown_models({"sysid": 0, "published": 0}) == ["published", "sysid"]
+    every = dict.fromkeys(("simulation", "sysid", "actuator", "resphys"), 0)
+    assert wording.shown_models(every, "actuator") == ["simulation", "actuator"]
+    assert wording.shown_models(every, "simulation") == ["simulation", "resphys"]
 
 
 def test_numbers_have_sensible_digits_and_shares_those_for_what_is_left():
     shown = [wording.number_text(value) for value in (4.48812, 0.000721, 0.0, None)]
-    assert shown == ["4.49", "0.00072", "0", "diverged"]
-    assert [wording.number_text(value) for value in (2.14e-9, 0.0999, 0.154, 1234.5)] == [
-        "2.1e-09",
-        "0.100",
-        "0.154",
-        "1,234",
-    ]
+    assert shown == ["4.49", "below 0.001", "0", "diverged"]
+    shown = [wording.number_text(value) for value in (2.14e-9, 0.00123, 0.09994, 0.154, 1234.5)]
+    assert shown == ["below 0.001", "0.00123", "0.0999", "0.154", "1,234"]
     deviating = {"mean": 0.000721, "std": 0.00031, "trajectories": 5, "diverged": 0}
-    assert wording.error_parts(deviating) == ("0.00072", "± 0.00031")
-    assert wording.error_parts({**deviating, "std": None}) == ("0.00072", "")  # of one fold
+    assert wording.error_parts(deviating) == ("below 0.001", "")
+    assert wording.error_parts({**deviating, "mean": 0.0721}) == ("0.0721", "± 0.0003")
+    assert wording.error_parts({**deviating, "mean": 0.0721, "std": None}) == ("0.0721", "")  # of one fold
     shown = [wording.duration_text(seconds) for seconds in (0.421, 12.34, 59.97, 184.6)]
     assert shown == ["0.42 s", "12.3 s", "60.0 s", "3 min 05 s"]
     shown = [wording.share_text(share) for share in (0.5, 0.897, 0.9958, 0.99976, 1.0, -0.2)]
-    assert shown == ["50 %", "90 %", "99.6 %", "99.98 %", "100 %", f"{MINUS}20 %"]
+    assert shown == ["50 %", "90 %", "99.6 %", "more than 99.9 %", "100 %", f"{MINUS}20 %"]
 
 
 def test_each_trial_has_its_errors_its_amplitude_and_its_coverage():

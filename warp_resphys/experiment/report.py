@@ -3,8 +3,7 @@
 Functions that read a file raise a DataFileError if the file is missing or damaged.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from ..fem.bodies import Body
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.arrays import FloatArray
 from ..io.errors import DataFileError
-from ..io.resuming import StageContext, package_versions, resources_used
+from ..io.resuming import StageContext
 from ..io.safe_files import read_array, read_attribute, read_hdf5, read_json
 from ..learning.error_tables import ErrorTables
 from ..learning.identification.search import Identification
@@ -32,34 +31,30 @@ from ..learning.parameters import configured_parameters
 from ..mesh.chambers import Chamber
 from ..mesh.selection import vertices_at
 from ..mesh.volume_mesh import Mesh
-from ..report.data import Driven, Film, FollowedPath, Metrics, Placed, Recordings, RunReport, TrialResults
+from ..report.data import Driven, Film, FollowedPath, Recordings, RunReport, TrialResults
+from ..report.ranking import shown_metrics
 from ..report.wording import MODELS, models_in_figures
 from ..settings.run import RunSettings
 from .actuators import build_chambers, driving_quantity, routes_of
-from .build import bound_markers, build_body, build_simulator, choose_device, marker_view_of, whole_mesh
+from .build import bound_markers, build_body, build_simulator, marker_view_of, whole_mesh
 from .experiment import read_actuator, training_files
 from .files import (
-    CONTROL,
     DATASET,
     DRIVEN,
     ERRORS,
     IDENTIFICATION,
-    LAW_FILE,
-    MESH_CHECK,
     METRICS,
     QUALITY,
-    RECONSTRUCTION,
     REGISTRATION,
     REPORT,
     ROLLOUTS,
     SCALED_DATASET,
-    SHAPES,
-    TIMES,
     TRUTH,
     fold_folder,
     read_if_there,
 )
 from .force_curves import force_curves
+from .run_metrics import collect_metrics, common_folder
 
 
 def make_report(context: StageContext) -> None:
@@ -82,7 +77,7 @@ def make_folds_report(context: StageContext) -> None:
     from ..report.pages import run_page  # matplotlib
 
     folder, run = context.run_dir, context.settings
-    metrics: Metrics = read_json(folder / METRICS)
+    metrics = shown_metrics(read_json(folder / METRICS))
     reader = RunReader(folder, run)
     data = RunReport(
         metrics=metrics,
@@ -93,61 +88,6 @@ def make_folds_report(context: StageContext) -> None:
         recordings=reader.recordings(reader.body.mesh, {}),
     )
     run_page.write_report(folder / REPORT, data)
-
-
-def common_folder(folder: Path) -> Path:
-    """Folder of the files that do not depend on the fold: the folder itself, or the parent of a fold's folder."""
-    return folder if (folder / DATASET).is_file() else folder.parent
-
-
-def collect_metrics(folder: Path, run: RunSettings, stages: Sequence[str] | None = None) -> Metrics:
-    """Contents of metrics.json of a split.
-
-    These are errors, noise of the observations if known, selected weights, results of identification and
-    reconstruction, time and memory of the stages (by default all finished stages, in order of completion), versions and
-    device.
-    """
-    if stages is None:
-        records = sorted((folder / "stages").glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
-        stages = [path.stem for path in records if "." not in path.stem]  # without files of interrupted stages
-    files = training_files(folder, run)
-    common, identified = common_folder(folder), Identification.read(folder / IDENTIFICATION)
-    errors: ErrorTables = read_json(folder / ERRORS)
-    metrics: Metrics = {
-        **errors,
-        "networks": {name: read_json(path)["kept"] for name, path in files.items() if path.is_file()},
-        "parameters": {name: result.parameters for name, result in identified.items()},
-        "first_guesses": {name: result.first_guess for name, result in identified.items() if result.first_guess},
-        **resources_used(folder, stages),
-        "versions": package_versions(),
-        "device": str(choose_device(run.device)),
-        **({"without_forces": True} if run.reconstruction is None else {}),
-    }
-    law: LawContent | None = None if run.law is None else read_if_there(folder / LAW_FILE) or None
-    if law is not None:
-        metrics["law"] = {**law, "against": "sysid" if "sysid" in identified else "simulation"}
-    if run.reconstruction is not None and (reconstruction := read_if_there(folder / RECONSTRUCTION)):
-        metrics["reconstruction"] = reconstruction
-    if run.control is not None and (control := read_if_there(folder / CONTROL)):
-        metrics["control"] = control
-    if run.shapes and (shapes := read_if_there(folder / SHAPES)):
-        metrics["shapes"] = shapes
-    if registered := read_if_there(common / REGISTRATION):
-        metrics["placement"] = placement(registered, identified)
-    if run.mesh_check is not None and (check := read_if_there(folder / MESH_CHECK)):
-        metrics["mesh_check"] = check
-    if run.timing and (times := read_if_there(folder / TIMES)):
-        metrics["seconds_per_test_trajectory"] = times["seconds"]
-    if "noise_mm" in (truth := read_if_there(common / TRUTH)):
-        metrics["noise_mm"] = truth["noise_mm"]
-    return metrics
-
-
-def placement(registered: Mapping[str, RegistrationSummary], identified: Mapping[str, Identification]) -> Placed:
-    """Largest residual of the registration of a trial [mm], and the identified rotation of the markers [degrees]."""
-    placed = [result.placement for result in identified.values() if result.placement is not None]
-    turned = max((math.hypot(*one["turn"]) for one in placed), default=0.0)
-    return {"rms_mm": max(fit["rms_mm"] for fit in registered.values()), "turned_deg": math.degrees(turned)}
 
 
 def true_contact(run: RunSettings) -> dict[str, float]:
@@ -179,6 +119,7 @@ class RunReader:
 
     def __init__(self, folder: Path, run: RunSettings) -> None:
         self.folder, self.run, self.common = folder, run, common_folder(folder)
+        self._hidden = ("resphys",) if run.reconstruction is None else ()  # equal to the simulator below it
 
     @cached_property
     def body(self) -> Body:
@@ -199,7 +140,7 @@ class RunReader:
         """Returns all data of the page."""
         run, body, trials = self.run, self.body, self.trials
         identification = Identification.read(self.folder / IDENTIFICATION)
-        metrics = collect_metrics(self.folder, run)
+        metrics = shown_metrics(collect_metrics(self.folder, run))
         material = read_if_there(self.common / TRUTH).get("material", {})
         moved = self.dataset.contact_at(trials.names, body, self.dataset.time_step)  # (K + 1, R, O) inputs, by name
         assert run.tip is not None
@@ -243,6 +184,7 @@ class RunReader:
             rolled = tuple(map(str, read_attribute(file, "names")))
             test = [name for name in rolled if self.scaled is None or name not in self.scaled.names]
             models = [model for model in models_in_figures(errors["errors_mm"]) if f"{model}_observed" in file]
+            models = [model for model in models if model not in self._hidden]
             unknown = sorted(set(test) - set(trials.names))
             if unknown or not models:
                 what = f"names trials that {self.common / DATASET} does not hold ({', '.join(unknown)})"
@@ -286,7 +228,7 @@ class RunReader:
             if "film_steps" not in file:
                 return None
             steps = read_array(file, "film_steps", (None,)).astype(np.float64)
-            models = [model for model in MODELS if f"{model}_film" in file]
+            models = [model for model in MODELS if f"{model}_film" in file and model not in self._hidden]
             shape = (len(steps), None, 3)
             bodies = {model: read_array(file, f"{model}_film", shape).astype(np.float64) for model in models}
             trial, times = str(read_attribute(file, "film_trial")), float(read_attribute(file, "time_step")) * steps

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypedDict
+from typing import Final, TypedDict
 
 import numpy as np
 import torch
 
-from ..data.driving import PHASES, phases_of
+from ..data.driving import PHASES, driving, phases_of
 from ..data.rigid_bodies import angles, as_markers, corners_of, owners
 from ..data.trials import STATIC, Trials
 from ..io.arrays import BoolArray, FloatArray, IntArray
@@ -17,6 +17,9 @@ from .identification.sensitivity import FreeFit
 from .intervals import IntervalTable
 from .metrics import ErrorSummary, TrialErrors, errors_per_marker, marker_errors, summarise, summarise_trajectories
 from .observed_motions import ObservedMotions
+
+# Of `beyond_training`, over the largest value of the training: up to there, a trial is within it.
+_EXCESS: Final = {"inputs": 0.05, "loads": 0.05, "displacements": 0.1}
 
 
 class RangeExits(TypedDict):
@@ -46,6 +49,7 @@ class ErrorTables(TypedDict, total=False):
     phases: dict[str, dict[str, ErrorSummary]]  # by phase of the inputs and model
     forces: dict[str, ForceErrors]  # by sensor
     range: dict[str, RangeExits]  # by model with a network
+    beyond: dict[str, dict[str, float]]  # by trial that lies beyond the training, see `beyond_training`
     scales: dict[str, dict[str, ErrorSummary]]  # by scale of the inputs and model
     scales_range: dict[str, dict[str, RangeExits]]
     baselines: dict[str, str]  # settings of the models without physics, in words
@@ -117,6 +121,8 @@ class ComparedModels:
             content["horizons"] = horizons
         if phases := self._by_phase(test, observed):
             content["phases"] = phases
+        if beyond := beyond_training(self.motions, self.train, names, self.first_frames):
+            content["beyond"] = beyond
         if self.loads:
             content["forces"] = self._by_sensor()
         return content | self._by_scale(models, observed)
@@ -225,6 +231,65 @@ def counting(
         if name in train:
             counts[row, : motions.learned_steps(counts.shape[1] - 1) + 1] = False
     return counts
+
+
+def beyond_training(
+    motions: ObservedMotions,
+    train: Sequence[str],
+    names: Sequence[str],
+    first_frames: Mapping[str, Mapping[str, float]],
+) -> dict[str, dict[str, float]]:
+    """Returns by how much tested trials leave the range of the training trials, over its largest value there.
+
+    A trial leaves it where one of its inputs, its payload or a coordinate of a displacement is outside of the least and
+    the largest one of the training, or the norm of all inputs is larger. Excesses of up to 5 % of the inputs and loads,
+    and 10 % of the displacements, are left out.
+
+    Args:
+        motions: observed trials.
+        train: names of the trials that were learned from.
+        names: names of the tested trials.
+        first_frames: that do not count, see `Identified`.
+
+    Returns:
+        By trial that leaves it, the excess of its `inputs`, its `loads` and its `displacements`.
+    """
+    if not train:
+        return {}
+    trials, every = motions.trials, [*dict.fromkeys([*train, *names])]
+    rows, tested = trials.rows(every), counting(motions, train, names, first_frames)
+    rest = trials.held[rows] if trials.bound is None else trials.bound[None]
+    moved = trials.observed[rows] - rest[:, None]
+    frames = moved.shape[1]
+    kinds = [("displacements", moved.reshape(len(rows), frames, -1))]
+    kinds.append(("loads", np.tile(trials.payload[rows][:, None, None], (1, frames, 1))))
+    kinds += [("inputs", values) for name, values in driving(trials, every).items() if name in trials.inputs]
+    found = dict[str, dict[str, float]]()
+    for kind, values in kinds:
+        learned = values[: len(train), : motions.learned_steps(frames - 1) + 1]
+        for name, counts in zip(names, tested, strict=True):
+            excess = _excess(learned.reshape(-1, values.shape[2]), values[every.index(name)][counts])
+            if excess > _EXCESS[kind]:
+                of_trial = found.setdefault(name, {})
+                of_trial[kind] = max(excess, of_trial.get(kind, 0.0))
+    return found
+
+
+def _excess(inside: FloatArray, tested: FloatArray) -> float:
+    """Largest distance of values (K, C) from the range of others (L, C), over the largest of these.
+
+    The norms of rows without NaN are compared as well.
+    """
+    seen = np.isfinite(inside).any(axis=0) & np.isfinite(tested).any(axis=0)
+    if not seen.any():
+        return 0.0
+    known, new = inside[:, seen], tested[:, seen]
+    outside = np.maximum(new - np.nanmax(known, axis=0), np.nanmin(known, axis=0) - new)
+    furthest, largest = float(np.nanmax(outside, initial=0.0)), float(np.nanmax(np.abs(known)))
+    if largest == 0.0:
+        return float(furthest > 0.0)
+    before, after = (float(np.nanmax(np.linalg.norm(x, axis=1), initial=0.0)) for x in (known, new))
+    return max(furthest / largest, after / before - 1.0 if before > 0.0 else 0.0)
 
 
 def amplitudes(trials: Trials, names: Sequence[str]) -> dict[str, float]:

@@ -214,8 +214,12 @@ def summarise_trajectories(
 
 
 def summarise_folds(folds: Sequence[Mapping[str, ErrorSummary]]) -> dict[str, ErrorSummary]:
-    """Returns the errors of a cross-validation for every model: mean over the trials, deviation of the folds' means."""
-    return {model: _over_folds([fold[model] for fold in folds]) for model in folds[0]}
+    """Returns the errors of a cross-validation: mean over the trials, deviation of the folds' means.
+
+    The models are those of all folds: a law is used in some folds alone.
+    """
+    shared = [model for model in folds[0] if all(model in fold for fold in folds)]
+    return {model: _over_folds([fold[model] for fold in folds]) for model in shared}
 
 
 def published_errors(name: str) -> Mapping[str, PublishedError]:

@@ -1,4 +1,7 @@
-"""The section on the learned actuator: whether it is used, and what acts under commands that rise and fall."""
+"""The section on the learned actuator: whether it is used, and what acts under commands that rise and fall.
+
+A Gaussian process of the inputs changes them (`data.input_network`). Parts that no trial drives are left out.
+"""
 
 from typing import Final
 
@@ -31,8 +34,8 @@ def actuator_section(data: RunReport, canvas: Canvas) -> Part | None:
     words, filters = driven.quantity.plural, data.actuator[driven.quantity.name].filters
     means = f" and their exponential means over {in_a_row([f'{time:g} s' for time in filters])}" if filters else ""
     text = (
-        f"A network changes the {words} of the identified response. It takes all {words}{means}, and was trained "
-        f"through the simulator. {said}"
+        f"A Gaussian process changes the {words} of the identified response. It takes all {words}{means}, and was "
+        f"trained through the simulator. {said}"
     )
     blocks: list[Block] = [Text(unbroken(text)), *_curves(data, driven, canvas)]
     return Part("The learned actuator", blocks)
@@ -40,8 +43,9 @@ def actuator_section(data: RunReport, canvas: Canvas) -> Part | None:
 
 def _curves(data: RunReport, driven: Driven, canvas: Canvas) -> list[Drawn]:
     """Draws what acts in each part over its command, while the other parts have their mean commands."""
-    quantity, parts = driven.quantity, driven.channels[:_MOST]
-    commands, acting = risen_and_fallen(data, driven)
+    quantity, used = driven.quantity, [*driven.used[:_MOST]]
+    parts = [driven.channels[number] for number in used]
+    commands, acting = (values[:, used] for values in risen_and_fallen(data, driven))
     rows = -(-len(parts) // _COLUMNS)
     figure = figures.new_figure(1.0 + 2.2 * rows)
     grid = figure.subplots(rows, min(len(parts), _COLUMNS), squeeze=False, sharex=True, sharey=True)

@@ -1,7 +1,6 @@
 """The sections on the body and the inputs that drive it, and on its markers over time."""
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from typing import Any, Final
 
 import numpy as np
@@ -56,14 +55,15 @@ def body_section(data: RunReport, canvas: Canvas) -> Part | None:
     blocks: list[Block] = [
         canvas.rendered("body.png", picture.draw, lambda path, drawn: Drawn.of(picture.save(path, drawn), alt, caption))
     ]
-    limit = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
+    rule = "" if not driven.limit else f"; dashed, the limit of {quantity.shown(driven.limit)}"
+    left_out = f"; unused {quantity.per}s are left out" * (len(driven.used) < len(driven.channels))
     what, words = f"{quantity.plural.capitalize()} of {parts}", quantity.plural.capitalize()
     if over_time := input_sequences(driven, trials):
         figure, shown = _sequences(driven, trials.time_step, over_time), f"{what} over time: {', '.join(over_time)}."
         whose = "a few trials" if len(driven.values) > 1 else "the trial"
-        blocks.append(canvas.figure("inputs", figure, shown, unbroken(f"{words} of {whose}{limit}.")))
+        blocks.append(canvas.figure("inputs", figure, shown, unbroken(f"{words} of {whose}{left_out}{rule}.")))
     if driven.poses:
-        said = f"{words} of the poses; unused {quantity.per}s are left out{limit}."
+        said = f"{words} of the poses; unused {quantity.per}s are left out{rule}."
         figure, shown = _poses(driven, trials.names), f"{what} by pose: {', '.join(driven.poses)}."
         blocks.append(canvas.figure("pose_inputs", figure, shown, unbroken(said)))
     return Part(f"The body and its {quantity.plural}", blocks)
@@ -92,14 +92,16 @@ def _sequences(driven: Driven, time_step: float, sequences: Mapping[str, FloatAr
         _input_label(axes, driven)
         axes.set_title(title)
     panels[-1].set(xlabel="time [s]", xlim=(0.0, time_step * max(map(len, sequences.values()))))
-    _part_legend(figure, driven, range(len(driven.channels)))
+    _part_legend(figure, driven, driven.used)
     return figure
 
 
 def _inputs(axes: Axes, times: FloatArray, rows: FloatArray, driven: Driven) -> None:
-    """Draws steps of the inputs (K, C) between K + 1 times [s], and the limit as a dashed line."""
-    for values, colour in zip(rows.T, cycle(figures.CHAMBER_COLOURS), strict=False):
-        axes.stairs(driven.quantity.shown_factor * values, times, baseline=None, color=colour, linewidth=1.2)
+    """Draws steps of the inputs (K, C) of used parts between K + 1 times [s], and the limit as a dashed line."""
+    colours = figures.CHAMBER_COLOURS
+    for part in driven.used:
+        values, colour = driven.quantity.shown_factor * rows[:, part], colours[part % len(colours)]
+        axes.stairs(values, times, baseline=None, color=colour, linewidth=1.2)
     if driven.limit is not None:
         axes.axhline(driven.quantity.shown_factor * driven.limit, color=TONES["muted"].light, **_LIMIT)
     figures.few_ticks(axes.yaxis, 4)
@@ -113,8 +115,8 @@ def _poses(driven: Driven, tested: Sequence[str]) -> Figure:
     """Draws the last inputs of each pose as bars beside its name; parts without inputs are left out."""
     quantity, names = driven.quantity, [f"{name} (test)" if name in tested else name for name in driven.poses]
     values = quantity.shown_factor * np.stack([driven.values[name][-1] for name in driven.poses])
-    used = np.flatnonzero(values.any(axis=0))
-    count = max(1, len(used))
+    used: Sequence[int] = np.flatnonzero(values.any(axis=0)).tolist() or driven.used
+    count = len(used)
     figure = figures.new_figure(0.9 + len(names) * max(0.25, 0.1 * count))
     axes = figure.subplots()
     for place, part in enumerate(used):
@@ -128,7 +130,7 @@ def _poses(driven: Driven, tested: Sequence[str]) -> Figure:
     axes.set(xlabel=f"{quantity.words} [{quantity.shown_unit}]", ylim=(len(names) - 0.5, -0.5))
     figures.few_ticks(axes.xaxis, 6)
     axes.grid(visible=False, axis="y")
-    _part_legend(figure, driven, used.tolist() or range(len(driven.channels)))
+    _part_legend(figure, driven, used)
     return figure
 
 
@@ -165,7 +167,8 @@ def paths_section(data: RunReport, canvas: Canvas) -> Part | None:
             models = [m for m in models if m != "simulation"] or models
             caption += f"displacement of the markers from rest, and the {words} that drive it."
             alt += f"; below them the {words} of the {driven.quantity.per}s"
-        banded = [model for model in ("resphys", "actuator", "law", "sysid") if model in trials.half_widths][:1]
+        order = (data.metrics.get("recommended", ""), "resphys", "actuator", "law", "sysid")
+        banded = [model for model in order if model in trials.half_widths][:1]
         bands = {model: trials.half_widths[model][row][:, kept] for model in banded}
         hidden = len(shown) - len(kept)
         caption += _band_note(data, bands)
@@ -226,7 +229,7 @@ def marker_paths(
         for axes in panels[-1]:
             _inputs(axes, times, driven.values[trials.names[row]], driven)
         _input_label(panels[-1, 0], driven)
-        _part_legend(figure, driven, range(len(driven.channels)))
+        _part_legend(figure, driven, driven.used)
     for axes in panels[-1]:
         axes.set(xlabel="time [s]", xlim=(0.0, times[-1]))
     figure.align_ylabels(panels[:, 0])

@@ -9,6 +9,7 @@ from typing import NotRequired, TypedDict
 import numpy as np
 
 from ..data.input_network import InputNetwork
+from ..data.input_response import NO_INPUT
 from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..energies.catalogue import LawContent
@@ -18,7 +19,7 @@ from ..learning.baselines import BASELINES
 from ..learning.error_tables import ErrorTables
 from ..learning.identification.search import Identification
 from ..learning.metrics import PublishedError, mean_distance, published_errors
-from ..learning.scores import HeldOutTest, text_of
+from ..learning.scores import HeldOutTest
 from ..mesh.chambers import Chamber
 from ..mesh.volume_mesh import Mesh
 from ..settings.data_kinds import ReleaseFromLoad
@@ -50,6 +51,7 @@ class Placed(TypedDict):
 
     rms_mm: float  # largest residual of the registration of a trial
     turned_deg: float  # identified rotation of the markers
+    left_out_mm: NotRequired[dict[str, float]]  # residuals of markers that the registration leaves out, by label
 
 
 class MeshCheck(TypedDict, total=False):
@@ -106,9 +108,11 @@ class Metrics(ErrorTables, Usage, total=False):
     """Content of metrics.json, of a split or of all folds."""
 
     networks: dict[str, KeptWeights]  # by model
+    recommended: str  # model, see `ranking.recommended`; empty for none
     without_forces: bool  # whether no force is learned, as no forces are reconstructed
     parameters: dict[str, Mapping[str, float]]  # identified values, by model
     first_guesses: dict[str, Mapping[str, float]]
+    at_bounds: dict[str, dict[str, float]]  # identified values that lie on a bound of their range, by model
     law: UsedLaw
     # `mean_mm` and `max_mm`, distances between reconstructed and observed points of the training trials, by model
     reconstruction: dict[str, dict[str, float]]
@@ -201,6 +205,13 @@ class Driven:
     limit: float | None = None  # Largest allowed value.
     scaled: tuple[str, ...] = ()  # Names of the trials with higher inputs than in training.
     poses: tuple[str, ...] = ()  # Names of the poses, which the last inputs hold.
+
+    @cached_property
+    def used(self) -> tuple[int, ...]:
+        """Numbers of the parts that some trial drives by more than the noise of a gauge; all where none does."""
+        largest = np.max([np.abs(values).max(axis=0) for values in self.values.values()], axis=0)
+        driven = np.flatnonzero(largest > NO_INPUT * largest.max())
+        return tuple(driven.tolist()) or tuple(range(len(self.channels)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,21 +343,6 @@ def grouped_errors(metrics: Metrics, settings: RunSettings) -> dict[str, Errors]
     errors = next(filter(None, groups.values()), {})
     count = len(next(iter(errors.values()), ()))
     return {f"{count} test trial{'s' * (count != 1)}": errors} if errors else {}
-
-
-def unused(metrics: Metrics) -> dict[str, str]:
-    """Returns why learned models are not used, by model: in no fold are they clearly closer to held-out trials."""
-    tests: dict[str, list[HeldOutTest]] = {}
-    for fold in folds_in(metrics):
-        for model, kept in fold.get("networks", {}).items():
-            if (test := kept.get("test")) is not None:
-                tests.setdefault(model, []).append(test)
-    idle = {"resphys": "no force is learned"} if any(fold.get("without_forces") for fold in folds_in(metrics)) else {}
-    return idle | {
-        model: text_of(found[0]) if len(found) == 1 else f"it is clearly closer in none of the {len(found)} folds"
-        for model, found in tests.items()
-        if not any(test["used"] for test in found)
-    }
 
 
 def missing_baselines(metrics: Metrics) -> dict[str, str]:

@@ -34,6 +34,7 @@ _DASHED: Final = {
     "published": (0, (1, 1.2)),
     "sysid": (0, (4, 4)),
     "sysid_elastic": (0, (4, 2)),
+    "simfree": (0, (5, 1.5, 1, 1.5)),
     "resphys_uncorrected": (0, (4, 2)),
 }
 _LEAST_SPAN: Final = 5.0  # Of a logarithmic axis, end over end: at least two of its ticks.

@@ -35,6 +35,7 @@ _UNITS: Final = (  # By patterns of names, of which the first one that fits coun
     (r"(.+_)?(pressure|stress)_slew", "µs/Pa", 1e6),
     (r"(.+_)?tension_slew", "µs/N", 1e6),
     (r".+_slew", "µs per unit", 1e6),
+    (r"(fibre|tendon)_stiffness", "N/m", 1.0),
     (rf"muscle_contraction{_BAND}", "%", 100.0),
     (rf"(.+_)?(pressure|stress){_BAND}", "kPa", 1e-3),
     (rf"(.+_)?tension{_BAND}", "N", 1.0),

@@ -55,10 +55,11 @@ def motion_of(data: RunReport, *, every_model: bool = False) -> ComparedMotion |
         film = Film(trials.names[row], trials.times[row], {m: q[row] for m, q in trials.positions.items()})
         points = data.tip if len(data.tip) else np.flatnonzero(away >= away.max() - 1e-9)
         points = spread(points, _MOST_POINTS)
-    if film is None or film.trial not in trials.names or not shown_models(film.positions):
+    if film is None or film.trial not in trials.names:
         return None
-    row = trials.names.index(film.trial)
-    models = shown_models(film.positions)
+    row, models = trials.names.index(film.trial), shown_models(film.positions, data.metrics.get("recommended", ""))
+    if not models:
+        return None
     if every_model:
         models = [model for model in MODELS if model in film.positions and model in trials.positions]
     points = shown_markers(trials.target[row]) if points is None else points
@@ -88,10 +89,10 @@ def motion_section(data: RunReport, canvas: Canvas) -> Part | None:
     motion, trials = motion_of(data), data.trials
     if motion is None or trials is None:
         return None
-    models = list(motion.positions)
+    models, best = list(motion.positions), data.metrics.get("recommended", "")
     name = data.film.trial if data.film is not None and data.sees_markers else trials.names[trials.worst]
     colours = f"Grey: {MODELS[models[0]].name}. " if len(models) > 1 else ""
-    colours += f"Blue: {MODELS[models[-1]].name}."
+    colours += f"Blue: {MODELS[models[-1]].name}{', the recommended model' * (models[-1] == best)}."
     blocks: list[Block] = []
     # A film takes longer than the rest of the page; where vertices are observed, it adds nothing to the instants.
     if data.sees_markers and len(motion.times) > 1:
@@ -134,7 +135,8 @@ def _in_space(data: RunReport, name: str) -> list[Block]:
     alt = (
         f"An interactive view of the bodies of {', '.join(MODELS[model].name for model in motion.positions)} in motion."
     )
-    return [view_in_space("view", motion, shown_models(motion.positions), unbroken(caption), alt)]
+    shown = shown_models(motion.positions, data.metrics.get("recommended", ""))
+    return [view_in_space("view", motion, shown, unbroken(caption), alt)]
 
 
 def _instants_figure(

@@ -236,6 +236,7 @@ def write_page(
     run: RunSettings,
     verdict: Sequence[str],
     metrics: Usage,
+    conditions: Sequence[str] = (),
 ) -> None:
     """Draws the sections and writes their page, with the files of its figures in `figures/` beside it.
 
@@ -248,6 +249,7 @@ def write_page(
         run: Settings, with the title.
         verdict: Sentences below the title.
         metrics: Of the run.
+        conditions: Of the verdict, listed below it.
 
     Raises:
         DataFileError: A file could not be written.
@@ -281,6 +283,7 @@ def write_page(
         title=run.heading,
         experiment=run.name,
         verdict=verdict,
+        conditions=conditions,
         parts=parts,
         script=Markup(script),
         digest=digest,

@@ -13,8 +13,9 @@ from ..learning.identification.sensitivity import FreeFit
 from ..learning.metrics import PUBLISHED_WINDOWS_MM, ErrorSummary, PublishedError, published_errors
 from ..settings.run import RunSettings
 from .body_picture import registration_picture
-from .data import Driven, Errors, Metrics, RunReport, ShapeErrors, folds_in, grouped_errors, missing_baselines, unused
+from .data import Driven, Errors, Metrics, RunReport, ShapeErrors, folds_in, grouped_errors, missing_baselines
 from .page import Canvas, Cell, Drawn, Items, PageTable, Part, Row, Text
+from .ranking import unused
 from .verdict import error_cell, interval_text
 from .wording import (
     MODELS,
@@ -115,8 +116,9 @@ def trials_section(data: RunReport, canvas: Canvas) -> Part | None:
     folds = folds_in(data.metrics)
     trials = {row["name"]: row for fold in folds for row in fold.get("per_trajectory", ())}
     covered = data.metrics.get("intervals", {}).get("models", {})
+    order = (data.metrics.get("recommended", ""), *reversed(_CHAIN))
     by_trial: Mapping[str, float] = next(
-        (covered[m]["by_trial"] for m in reversed(_CHAIN) if "by_trial" in covered.get(m, {})), {}
+        (covered[m]["by_trial"] for m in order if "by_trial" in covered.get(m, {})), {}
     )
     small = {}
     for name, row in trials.items():

@@ -15,7 +15,8 @@ from ..settings.control import ControlSettings
 NO_BREAK_SPACE: Final = "\u00a0"
 NONE: Final = "\N{EN DASH}"
 MINUS: Final = "\N{MINUS SIGN}"
-_LEAST_DECIMAL: Final = 1e-4  # Smaller numbers are written with a power of ten.
+_LEAST: Final = 1e-3  # Smaller numbers are not written out.
+_CLEAREST: Final = 0.999  # Larger shares are not written out.
 
 
 class ComparedModel(NamedTuple):
@@ -84,7 +85,7 @@ TONES: Final[Mapping[str, Tone]] = {
     "reconstruction": Tone("#1d7a55", "#62d2a2"),
     "sysid": Tone("#7a4aa0", "#c9a2ea"),
     "law": Tone("#0f766e", "#5eead4"),
-    "actuator": Tone("#a3342f", "#f2a29d"),
+    "actuator": Tone("#e000e0", "#c44dff"),
     "simfree": Tone("#8f6a00", "#e2bd4f"),
     "resphys": Tone("#1a5fb4", "#7fb3f5"),
     "published": Tone("#b0307b", "#f08bc5"),
@@ -105,12 +106,11 @@ def model_words(model: str) -> str:
     return MODELS[model].words or MODELS[model].name
 
 
-def shown_models(positions: Collection[str]) -> list[str]:
-    """Returns the models that are drawn as bodies: the uncorrected one, then the best available one."""
-    groups = (
-        ("simulation", "published"),
-        ("resphys", "resphys_uncorrected", "actuator", "law", "sysid", "sysid_elastic"),
-    )
+def shown_models(positions: Collection[str], recommended: str = "") -> list[str]:
+    """Returns the models that are drawn as bodies: the uncorrected one, then the recommended or most corrected one."""
+    plain = ("simulation", "published")
+    corrected = ("resphys", "resphys_uncorrected", "actuator", "law", "sysid", "sysid_elastic")
+    groups = (plain, corrected if recommended in plain else (recommended, *corrected))
     return [model for group in groups for model in [m for m in group if m in positions][:1]]
 
 
@@ -141,14 +141,14 @@ def compared_controllers(control: ControlSettings) -> list[str]:
 
 
 def number_text(value: float | None) -> str:
-    """Returns a number with three digits, or two below 0.1, such as "1.07", "0.0038" or "4.3e-07"; None: diverged."""
+    """Returns a number with three digits, such as "1.07" or "0.0384", or "below 0.001"; None: diverged."""
     if value is None:
         return "diverged"
-    return f"{value:.1e}" if 0.0 < abs(value) < _LEAST_DECIMAL else f"{value:,.{_decimals(value)}f}"
+    return f"below {_LEAST:g}" if 0.0 < abs(value) < _LEAST else f"{value:,.{_decimals(value)}f}"
 
 
 def _decimals(value: float) -> int:
-    return max(0, (2 if abs(value) >= 0.1 else 1) - math.floor(math.log10(abs(value)))) if value else 0
+    return max(0, 2 - math.floor(math.log10(abs(value)))) if value else 0
 
 
 def mm_text(value: float | None) -> str:
@@ -167,10 +167,9 @@ def error_parts(summary: ErrorSummary) -> tuple[str, str]:
     mean, std = summary["mean"], summary["std"]
     if mean is None:
         return f"{summary['diverged']} of {summary['trajectories']} diverged", ""
-    if std is None:
+    if std is None or mean < _LEAST:
         return number_text(mean), ""
-    deviation = number_text(std) if mean < _LEAST_DECIMAL else f"{std:,.{_decimals(mean)}f}"
-    return number_text(mean), f"± {deviation}"
+    return number_text(mean), f"± {std:,.{_decimals(mean)}f}"
 
 
 def duration_text(seconds: float) -> str:
@@ -204,7 +203,9 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def share_text(share: float) -> str:
-    """Returns a share as a percentage, such as "63 %" or "99.8 %", with a digit of what is left of it."""
+    """Returns a share as a percentage, such as "63 %", "99.8 %" or "more than 99.9 %", with a digit of the rest."""
+    if _CLEAREST < share < 1.0:
+        return f"more than {100.0 * _CLEAREST:g} %"
     left = 100.0 * (1.0 - share)
     digits = max(0, -math.floor(math.log10(left))) if left > 0.0 else 0
     return f"{100.0 * share:.{digits}f} %".replace("-", MINUS)

@@ -75,7 +75,7 @@ def _film_of_trial(run: Path, settings: FilmSettings) -> tuple[str, RenderScene]
     metrics, models, seconds = read_json(run / METRICS), settings.models, settings.seconds
     if models is None:
         available = tuple(model for model in metrics["errors_mm"] if model not in BASELINES)
-        models = tuple(shown_models(metrics["errors_mm"])) or available[:2]
+        models = tuple(shown_models(metrics["errors_mm"], metrics.get("recommended", ""))) or available[:2]
     name = metrics["per_trajectory"][0]["name"] if settings.trial is None else settings.trial
     motion = motion_of(run, name, models, np.inf if seconds is None else seconds)
     return name, motion.film(seconds, settings.slower)

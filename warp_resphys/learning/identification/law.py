@@ -94,11 +94,6 @@ class LawClass:
     parameters: dict[str, float]
     residual: float
 
-    @property
-    def refined_groups(self) -> set[str]:
-        """Groups of terms when the law is refined, which adds viscosities."""
-        return {*self.groups, "viscosity"}
-
 
 class _Columns:
     """Columns of candidates for training and for held-out motions."""

@@ -283,9 +283,9 @@ class _LawSearch:
 
     def _enlarged(self, best: RefinedLaw, classes: Sequence[LawClass]) -> RefinedLaw:
         """Returns the best refined law of larger classes that balance the forces clearly better."""
-        residual = min(law.residual for law in classes if law.refined_groups == best.law.refined_groups)
+        residual = min(law.residual for law in classes if {*law.groups} == {*best.law.groups})
         for law in classes:
-            if law.refined_groups > best.law.refined_groups and law.residual < _BALANCED * residual:
+            if {*law.groups} > {*best.law.groups} and law.residual < _BALANCED * residual:
                 larger = self._refine(law)
                 if larger.score.error * _CLOSE < best.score.error:
                     best, residual = larger, law.residual
@@ -299,7 +299,8 @@ class _LawSearch:
             whole: whether to use the whole of training trials on which laws are tested as well.
         """
         guess = dict(law.parameters)
-        guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
+        if not self.motions.sees_states or "viscosity" in law.groups:
+            guess |= {name: guess.get(name, 0.0) for name in VISCOSITIES}
         others, searched = self._bounds_of_others, [name for name in guess if not name.startswith(_FIXED)]
         bounds = {name: self._bounds(name, guess[name]) for name in searched} | others
 

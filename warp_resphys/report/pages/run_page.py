@@ -9,6 +9,7 @@ from markupsafe import Markup
 from ...io.errors import number_of
 from ..actuator_section import actuator_section
 from ..body_section import body_section, paths_section
+from ..conditions import conditions
 from ..control_section import control_section
 from ..data import Metrics, RunReport, folds_in, trial_errors
 from ..error_section import error_section, training_section
@@ -16,6 +17,7 @@ from ..identification_section import identification_section
 from ..law_section import law_section
 from ..motion_section import motion_section
 from ..page import Canvas, Cell, PageTable, Part, Row, Text, write_page
+from ..ranking import LEAST_TRIALS
 from ..sections import (
     details_table,
     horizons_section,
@@ -24,7 +26,7 @@ from ..sections import (
     shapes_section,
     trials_section,
 )
-from ..verdict import LEAST_TRIALS, results_table, verdict
+from ..verdict import results_table, verdict
 from ..wording import MODELS, mm_text, unbroken
 
 _WITHOUT_RECORDINGS: Final = Markup(
@@ -43,8 +45,8 @@ _MOST_LABELS: Final = 6  # Markers that are named one by one.
 
 def write_report(path: Path, data: RunReport) -> None:
     """Writes the page, such as `report.html`, see `write_page`."""
-    said = verdict(data.metrics, data.settings)
-    write_page(path, lambda canvas: (s(data, canvas) for s in SECTIONS), data.settings, said, data.metrics)
+    said, holds = verdict(data.metrics, data.settings), conditions(data.metrics, data.settings)
+    write_page(path, lambda canvas: (s(data, canvas) for s in SECTIONS), data.settings, said, data.metrics, holds)
 
 
 def results_section(data: RunReport, canvas: Canvas) -> Part:

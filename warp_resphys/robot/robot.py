@@ -281,8 +281,8 @@ class Robot:
         after = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants).step(state, 0)
         if self.simulator.settings.on_failure == "raise" and bool((after.lost & ~state.lost).any()):
             raise ConvergenceError(
-                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths; "
-                "use shorter steps, lower inputs, or a force that was trained longer.",
+                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths from "
+                "where its base holds it at rest; use shorter steps, lower inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
             )

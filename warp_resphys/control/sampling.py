@@ -13,9 +13,9 @@ from ..data.input_response import InputResponse, draw_inputs, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
 from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.errors import ConvergenceError, InputError
 from ..learning.residuals.correction import Learned
-from ..robot.actuation import RobotInput
+from ..robot.actuation import Given, RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..settings.played import SequenceSettings
@@ -79,6 +79,22 @@ def driven_input(robot: Robot) -> RobotInput:
             f"{len(inputs) or 'none'}: choose a run with pressures, tendons or muscles."
         )
     return inputs[0]
+
+
+def settle_some(robot: Robot, batch: int, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns positions (B, N, 3) of `Robot.settle` [m], and (B,) bool, which environments are in equilibrium.
+
+    Raises:
+        InputError: an invalid input, as for `Robot.step`.
+        ConvergenceError: the simulator has no equilibrium even without the learned force.
+    """
+    try:
+        q = robot.settle(batch, **inputs).q
+    except ConvergenceError as error:
+        if not isinstance(error.report, torch.Tensor):
+            raise
+        return error.positions.detach(), error.report
+    return q, torch.ones(batch, dtype=torch.bool, device=q.device)
 
 
 def check_reducible(robot: Robot) -> None:
@@ -240,7 +256,7 @@ class Source:
         Returns:
             Positions (S, N, 3) [m], their commands (S, n), and the network's outputs (S, c) there, if there is one.
         """
-        q, rests = self.robot.settle_some(len(commands), **self.keywords(commands))
+        q, rests = settle_some(self.robot, len(commands), **self.keywords(commands))
         q, commands = q[rests], commands[rests.cpu().numpy()]
         if self.learned is None:
             return q, commands, None

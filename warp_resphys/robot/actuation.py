@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.base_motion import LARGEST_STEP
+from ..data.driving import time_since_change
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of, with_means
 from ..data.trials import PAYLOAD, payload_inputs
@@ -18,6 +19,7 @@ from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.contact.contact_points import MOTION
+from ..io.arrays import FloatArray
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR, command_of
 from ..stepping.inputs import Inputs
@@ -299,3 +301,11 @@ class Commands:
         """Positions (B, D, 3) of the fixed vertices for poses (B, 6) of the base [m]."""
         rest = self._simulator.rest_positions[self._simulator.fixed]
         return rest @ rotations(pose[:, 3:]).mT + pose[:, None, :3]
+
+
+def since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> FloatArray:
+    """Returns (T + 1, B) times since the last change of commands (T, B, ...) at T + 1 times [s]."""
+    values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
+    acting = [np.concatenate([series, series[-1:]]).reshape(times, batch, -1) for series in values]
+    at = time_step * np.arange(times, dtype=np.float64)
+    return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

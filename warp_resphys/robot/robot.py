@@ -11,14 +11,13 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csc_array
 
-from ..data.driving import time_since_change
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Simulator
 from ..dynamics.trajectory import Motion
 from ..energies.materials import MASS_DAMPING
 from ..io.errors import ConvergenceError, InputError
 from ..learning.evaluation import POSE_STEPS
-from ..learning.parameters import check_names, constants_of, identifiable_parameters, replaced
+from ..learning.parameters import TILTS, check_names, constants_of, identifiable_parameters, replaced
 from ..learning.residuals.correction import (
     DIVERGENCE_DISTANCE,
     CorrectedSimulator,
@@ -33,7 +32,7 @@ from ..stepping.inputs import Inputs
 from ..stepping.rollout import rollout, states
 from ..stepping.rotations import rotations
 from ..stepping.state import State
-from .actuation import BASE, Acting, Commands, Given, InputReader, inputs_of, moved_actuators
+from .actuation import BASE, Acting, Commands, Given, InputReader, inputs_of, moved_actuators, since_change
 from .description import Description
 
 
@@ -111,9 +110,22 @@ class Robot:
         """Returns the robot, stepped by another time integrator."""
         return self._changed(replace(self.simulator, integrator=integrator), self.parameters)
 
-    def _changed(self, simulator: Simulator, parameters: Mapping[str, torch.Tensor | float]) -> "Robot":
+    def in_gravity(self, gravity: ArrayLike) -> "Robot":
+        """Returns the robot under another gravity (3,) in axes of the world [m/s^2], without an identified tilt."""
+        pull = np.asarray(gravity, dtype=np.float64).tolist()
+        known = {name: value for name, value in self.parameters.items() if name not in TILTS}
+        kept = {name: value for name, value in self.description.parameters.items() if name not in TILTS}
+        description = replace(self.description, parameters=kept)
+        return self._changed(replace(self.simulator, gravity=pull), known, description)
+
+    def _changed(
+        self,
+        simulator: Simulator,
+        parameters: Mapping[str, torch.Tensor | float],
+        description: Description | None = None,
+    ) -> "Robot":
         other = object.__new__(Robot)
-        other.__dict__.update({**self.__dict__, "simulator": simulator})
+        other.__dict__.update({**self.__dict__, "simulator": simulator, "description": description or self.description})
         other._set_parameters(parameters)
         return other
 
@@ -246,21 +258,6 @@ class Robot:
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return body.with_memory({**start.memory_of(), **acting.memory, "left": left})
 
-    def settle_some(self, batch: int = 1, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns positions (B, N, 3) of `settle` [m], and (B,) bool, which environments are in equilibrium.
-
-        Raises:
-            InputError: an invalid input, as for `step`.
-            ConvergenceError: the simulator has no equilibrium even without the learned force.
-        """
-        try:
-            q = self.settle(batch, **inputs).q
-        except ConvergenceError as error:
-            if not isinstance(error.report, torch.Tensor):
-                raise
-            return error.positions.detach(), error.report
-        return q, torch.ones(batch, dtype=torch.bool, device=q.device)
-
     # Motion
 
     def step(self, state: State, **inputs: Given) -> State:
@@ -363,7 +360,7 @@ class Robot:
             name=f"{self.description.name}, {self.description.model}",
             markers=markers,
             labels=self.labels,
-            half_widths=self.half_widths(markers, _since_change(self.time_step, driven, *markers.shape[:2])),
+            half_widths=self.half_widths(markers, since_change(self.time_step, driven, *markers.shape[:2])),
             left=torch.stack([reached.left for reached in motion]),
             lost=torch.stack([reached.lost for reached in motion]),
             inputs=driven,
@@ -390,11 +387,3 @@ class Robot:
     def _read(self, inputs: Mapping[str, Given], batch: int) -> dict[str, torch.Tensor]:
         refuse_transforms()
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
-
-
-def _since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> NDArray[np.float64]:
-    """(T + 1, B) time since the last change of commands (T, B, ...) at T + 1 times [s]."""
-    values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
-    acting = [np.concatenate([series, series[-1:]]).reshape(times, batch, -1) for series in values]
-    at = time_step * np.arange(times, dtype=np.float64)
-    return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

@@ -109,9 +109,7 @@ class RobotScene:
         """Gravity (3,) of the scene [m/s^2], with the identified tilt of the robots' gravity."""
         pulls = {}
         for name, robot in self.robots.items():
-            known = constants_of(robot.simulator, robot.parameters).get("gravity")
-            pull = np.asarray(robot.simulator.gravity) if known is None else known[0].detach().double().cpu().numpy()
-            pulls[name] = self._poses[name][0] @ pull
+            pulls[name] = self._poses[name][0] @ robot.constants.gravity[0].detach().double().cpu().numpy()
         first, pull = next(iter(pulls.items()))
         for name, other in pulls.items():
             if not np.allclose(other, pull, atol=_SAME_GRAVITY):

@@ -19,9 +19,11 @@ from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.contact.contact_points import MOTION
+from ..energies.materials import MASS_DAMPING
 from ..io.arrays import FloatArray
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR, command_of
+from ..learning.residuals.correction import LearnedPredictor
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.rotations import rotations
@@ -183,6 +185,20 @@ class Acting:
     memory: dict[str, torch.Tensor]
     # (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved
     base: torch.Tensor | None
+
+    def remembered(self, state: State, predictor: LearnedPredictor | None, after: State) -> State:
+        """Returns the robot's state after a step, from the one before it and the body after it."""
+        memory = {**self.memory, "lost": after.lost, "left": state.left}
+        if predictor is not None and predictor.left_at is not None:
+            memory["left"] = state.left | (predictor.left_at >= 0)
+        return after.with_memory(memory)
+
+
+def values_of_material(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """Returns those of a robot's parameters that are its material's, without damping by mass."""
+    materials = simulator.materials.items()
+    material = {f"{region}_{name}" if region else name for region, used in materials for name in used.parameters}
+    return {name: float(parameters[name][0]) for name in material & parameters.keys() - {MASS_DAMPING}}
 
 
 def moved_actuators(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import warp_resphys
 from support.configured import settings
@@ -256,8 +257,8 @@ def test_one_way_a_robot_follows_the_arm_in_one_line():
     state = robot.begin(base=base_pose(arm, data, "flange", TURNED))
     for _ in range(3):
         mujoco.mj_step(arm, data)
-        mujoco.mj_forward(arm, data)
         state = robot.step(state, base=base_pose(arm, data, "flange", TURNED))
+    mujoco.mj_forward(arm, data)
     flange = data.body("flange")
     frame = flange.xmat.reshape(3, 3)
     turned = np.empty(9)
@@ -312,6 +313,87 @@ def test_an_arm_feels_the_ball_that_its_gripper_lifts():
     assert -state.wrench[0, 2] == pytest.approx(fingers + weights[ball].sum(), rel=5e-3)
     wanted = data.qfrc_bias - weights @ (q[:, :1] - data.xanchor[:, 0])
     np.testing.assert_allclose(data.actuator_force, wanted, rtol=5e-3, atol=2e-3)
+
+
+PUSHED = (
+    '<mujoco><option timestep="0.01" gravity="0 0 -9.81"/><worldbody><body name="arm"><joint name="j" axis="0 1 0" '
+    'damping="1"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".3"/><body name="flange" pos=".2 0 0">'
+    '<geom type="sphere" size=".02" mass=".2"/><body name="tool" pos="0 0 .05" euler="0 0 90"/></body></body>'
+    '<body name="hand" mocap="true" pos="0 0 .5"><geom type="sphere" size=".01"/><body name="palm"/></body></worldbody>'
+    '<actuator><position joint="j" kp="60" kv="1"/></actuator></mujoco>'
+)
+
+
+def settled(mount, data, steps=130):
+    state = mount.begin(data)
+    for _ in range(steps):
+        state = mount.step(state, [0.0])
+    return state, mount.data(state)
+
+
+def test_a_push_on_the_flange_acts_beside_the_robot():
+    """2 N upward at 0.2 m relieve the servo by 0.4 N m, 0.382 degrees; a moment of 0.3 N m about y loads it."""
+    mount = Mount(beam(0.01, damping=0.02), mujoco.MjModel.from_xml_string(PUSHED), "flange")
+    torques, angles, forces = [], [], []
+    for force, moment in ((0.0, 0.0), (2.0, 0.0), (0.0, 0.3)):
+        data = mujoco.MjData(mount.model)
+        data.xfrc_applied[mount.model.body("flange").id, [2, 4]] = force, moment
+        state, arm = settled(mount, data)
+        torques.append(arm.actuator_force[0])
+        angles.append(np.degrees(arm.qpos[0]))
+        forces.append(arm.xfrc_applied[mount.model.body("flange").id, 2] - state.wrench[0, 2])
+    np.testing.assert_allclose(forces, [0.0, 2.0, 0.0], atol=1e-12)
+    assert angles[0] - angles[1] == pytest.approx(np.degrees(0.4 / 60.0), rel=5e-3)
+    np.testing.assert_allclose(np.diff(torques), [0.4, -0.7], rtol=5e-3)
+
+
+def test_a_robot_with_tilted_gravity_is_turned_by_the_tilt():
+    """As it was recorded: with the pull of its own frame, which is the model's on an upright body."""
+    pull = np.array([-0.281, 0.153, -9.802])
+    level = beam(gravity=-np.linalg.norm(pull))
+    robot = level.in_gravity(pull)
+    arm = mujoco.MjModel.from_xml_string(ARM)
+    arm.opt.gravity[:] = level.simulator.gravity
+    mount = Mount(robot, arm, "flange", (0.1, 0, 0, 0, 0, 0))
+    state = mount.begin(at(arm))
+    np.testing.assert_allclose(state.wrench[0, :3], MASS * arm.opt.gravity, atol=1e-6)
+    turn = Rotation.from_rotvec(state.pose[0, 3:])
+    np.testing.assert_allclose(turn.apply(pull), arm.opt.gravity, atol=1e-9)
+    assert np.degrees(turn.magnitude()) == pytest.approx(1.87, abs=0.01)
+    recorded = robot.begin()
+    moved = turn.inv().apply(state.robot.q[0].numpy() - state.pose[0, :3])
+    np.testing.assert_allclose(moved, recorded.q[0], atol=1e-7)
+    np.testing.assert_allclose(mount.robot.simulator.gravity, arm.opt.gravity, atol=1e-9)
+    steep = level.in_gravity(np.linalg.norm(pull) * np.array([np.sin(0.2), 0.0, -np.cos(0.2)]))
+    refuses(InputError, "10 degrees apart at most, or mount robot.in_gravity", Mount, steep, arm, "flange")
+    scene = RobotScene({"left": (robot, np.zeros(6))})
+    refuses(InputError, "give the robots of the scene poses", Mount, scene, arm, "flange")
+
+
+def test_the_pose_of_a_base_is_that_of_the_positions_whatever_was_computed():
+    arm = mujoco.MjModel.from_xml_string(ARM)
+    data = mujoco.MjData(arm)
+    np.testing.assert_allclose(base_pose(arm, data, "flange", TURNED)[:3], [0.33, -0.02, 0.05], atol=1e-12)
+    mujoco.mj_forward(arm, data)
+    data.qpos[:] = 0.2, -0.6
+    np.testing.assert_array_equal(base_pose(arm, data, "flange"), base_pose(arm, at(arm, 0.2, -0.6), "flange"))
+    assert data.xpos[arm.body("flange").id, 2] == 0.0  # the data are left as they were
+
+
+def test_bodies_that_no_force_moves_or_without_mass_are_refused():
+    robot, arm = beam(0.01), mujoco.MjModel.from_xml_string(PUSHED)
+    refuses(InputError, "'hand' is a mocap body.*base_pose", Mount, robot, arm, "hand")
+    refuses(InputError, "'palm' is a mocap body, or fixed to one", Mount, robot, arm, "palm")
+    with pytest.raises(InputError, match="'tool' has no mass: mount the robot on 'flange'") as caught:
+        Mount(robot, arm, "tool", (0.01, 0, 0, 0, 0, 0))
+    pose = [float(x) for x in re.search(r"pose \[(.*)\]", str(caught.value))[1].split(",")]
+    np.testing.assert_allclose(pose, [0.0, 0.01, 0.05, 0.0, 0.0, np.pi / 2], atol=1e-5)
+    Mount(robot, arm, "flange", pose)
+    frame = (
+        '<link name="tool0"/><joint name="f" type="fixed"><parent link="tool"/><child link="tool0"/></joint></robot>'
+    )
+    fused = mujoco.MjModel.from_xml_string(URDF.replace("</robot>", frame))
+    refuses(InputError, "'tool0'.*fuses a link on a fixed joint of a URDF", Mount, robot, fused, "tool0")
 
 
 URDF = (

@@ -6,9 +6,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.chambered import KINDS, chambered
-from warp_resphys import Body, box_hexahedra
+from warp_resphys import Body, Scene, box_hexahedra, select_vertices
 from warp_resphys.data.base_motion import prescribed, rigid
-from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement
+from warp_resphys.dynamics.frames import BaseFrame, VertexFrames, base_movement, carried_rest
 from warp_resphys.io.settings import parse
 from warp_resphys.settings.performed import MotionSettings
 
@@ -78,3 +78,27 @@ def test_what_networks_are_told_of_a_base_are_its_velocities_and_gravity():
     np.testing.assert_allclose(movement[:, 3:6], np.tile(rate, (20, 1)), rtol=1e-4)
     np.testing.assert_allclose(movement[1:, 6:12], movement[:-1, :6], atol=1e-15)
     np.testing.assert_allclose(movement[:, 12:], turned[1:].inv().apply([0.0, -1.0, 0.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("place", "turns"),
+    [({"x": 0.0}, True), ({"x": 0.0, "y": 0.0}, False), ({"x": 0.0, "y": 0.0, "z": 0.0}, False)],
+    ids=["face", "edge", "corner"],
+)
+def test_rest_shapes_are_carried_by_their_bases(place, turns):
+    """Exactly by a face; by an edge or a corner, which leave a turn open, without more of it than they make."""
+    mesh = box_hexahedra((0.1, 0.03, 0.02), (4, 2, 1))
+    body, free = Body(mesh, fixed=select_vertices(mesh, **place)), Body(mesh)
+    angles = [[20.0, 130.0, -75.0], [0.0, 0.0, 0.0]]
+    turned = torch.from_numpy(Rotation.from_euler("xyz", angles, degrees=True).as_matrix())
+    rest, away = torch.from_numpy(mesh.vertices), torch.tensor([[[3.0, -2.0, 1.5]], [[0.0, 7.0, 0.0]]]).double()
+    wanted = rest @ turned.mT + away
+    carried = carried_rest(Scene({"free": free, "held": body}), wanted[:, body.fixed_vertices])
+    np.testing.assert_array_equal(carried[:, : len(rest)], rest.expand(2, -1, -1))
+    held = carried[:, len(rest) :]
+    np.testing.assert_allclose(held[:, body.fixed_vertices], wanted[:, body.fixed_vertices], atol=1e-9)
+    lengths, wanted_lengths = ((x[..., None, :] - x[..., None, :, :]).norm(dim=-1) for x in (held, rest[None]))
+    np.testing.assert_allclose(lengths, wanted_lengths.expand(2, -1, -1), atol=1e-9)
+    np.testing.assert_allclose(held[1], wanted[1], atol=1e-9)
+    if turns:
+        np.testing.assert_allclose(held[0], wanted[0], atol=1e-9)

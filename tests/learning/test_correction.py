@@ -15,6 +15,7 @@ from warp_resphys.learning.residuals.networks import NextState, ResidualForce, b
 from warp_resphys.learning.residuals.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
 from warp_resphys.stepping.rollout import rollout
+from warp_resphys.stepping.rotations import rotations
 
 MESH = box_hexahedra((0.1, 0.03, 0.03), (2, 1, 1))
 BODY, TIP = Body(MESH, fixed=select_vertices(MESH, x=0.0)), select_vertices(MESH, x=0.1)
@@ -130,6 +131,47 @@ def test_lost_environments_stand_at_rest_without_inputs(integrator):
     assert float(other.memory["viscous_strain"].abs().max()) > 1e-6
     for name, tensor in state.tensors().items():
         torch.testing.assert_close(tensor[0], other.tensors()[name][0], rtol=0.0, atol=1e-9)
+
+
+def travels(predict, steps=30):
+    """States of two beams of 0.1 m; the base of the second one goes 3 m and turns over."""
+    simulator = Simulator(BODY, Corotated(2e5, 0.3), solver=SolverSettings(on_failure="count"))
+    share = torch.linspace(0.0, 1.0, steps + 1, dtype=torch.float64)[1:, None]
+    share = share**2 * (3.0 - 2.0 * share)
+    turn = rotations(share * torch.tensor([0.0, 3.0, 0.0]))
+    away = REST[BODY.fixed_vertices] @ turn.mT + (share * torch.tensor([3.0, 0.0, 0.0]))[:, None]
+    inputs = Inputs(fixed_positions=torch.stack([REST[BODY.fixed_vertices].expand_as(away), away], 1))
+    step = correction.CorrectedSimulator(simulator, predict, inputs).step
+    with torch.no_grad():
+        return rollout(step, simulator.rest_state(2), range(steps), lambda now: now), turn[-1]
+
+
+def test_a_robot_goes_with_its_base_as_far_as_it_likes():
+    motion, _ = travels(None)
+    assert not motion[-1].lost.any()
+    assert float(motion[-1].q[1, :, 0].mean()) > 2.5
+
+
+def test_a_lost_environment_stands_at_rest_on_its_own_base():
+    motion, turn = travels(lambda state, step: state.q * (torch.nan if step == 20 else 0.0))
+    assert motion[20].lost.tolist() == [False, False]
+    assert motion[-1].lost.tolist() == [True, True]
+    np.testing.assert_allclose(motion[-1].q[0], REST, atol=1e-9)
+    np.testing.assert_allclose(motion[-1].q[1], REST @ turn.mT + torch.tensor([3.0, 0.0, 0.0]), atol=1e-8)
+    assert not motion[-1].v.any()
+
+
+@pytest.mark.parametrize(("apart", "lost"), [(0.0, False), (3.0, True)])
+def test_a_free_body_flies_as_far_as_it_likes_in_one_piece(apart, lost):
+    def predict(state, step):
+        following = state.q + torch.tensor([0.5, 0.0, 0.0])
+        following[:, -1, 2] += apart
+        return State(following, state.v)
+
+    free = Simulator(Body(MESH), Corotated(2e5, 0.3))
+    step = correction.CorrectedSimulator(free, predict).step
+    last = rollout(step, free.rest_state(), range(10), lambda now: now)[-1]
+    assert bool(last.lost) == lost
 
 
 def at_rest(*stiffnesses):

@@ -18,6 +18,7 @@ from ..io.errors import ConvergenceError, DataFileError
 from ..io.progress import Progress
 from ..io.safe_files import to_plain
 from ..learning.residuals.coders import Coder
+from ..robot.construction import Plain
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..stepping.state import State
@@ -130,7 +131,9 @@ def fingerprint(robot: Robot) -> str:
     arrays |= {} if about.bound is None else {"bound": about.bound.numpy(force=True)}
     if learned is not None:
         arrays |= {name: value.numpy(force=True) for name, value in learned.network.state_dict().items()}
-    plain = [about.settings.plain(), about.material.plain(), about.seen, about.placement, robot.labels]
+    of_simulator = Plain({})
+    plain = [*about.made_of(of_simulator), about.seen, about.placement, robot.labels]
+    arrays |= {name: tensor.numpy() for name, tensor in of_simulator.tensors.items()}
     plain += [{name: network.plain()} for name, network in about.actuator.items()]
     made = hashlib.sha256(json.dumps(to_plain([*plain, robot.simulator.integrator, robot.time_step])).encode())
     for name, array in sorted(arrays.items()):

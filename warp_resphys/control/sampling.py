@@ -12,10 +12,10 @@ import torch
 from ..data.input_response import InputResponse, draw_inputs, response_of
 from ..energies.materials import MASS_DAMPING, PRONY_RATIOS, PRONY_TIME, VISCOUS
 from ..energies.viscosity import relaxation
-from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.arrays import FloatArray, IntArray
+from ..io.errors import ConvergenceError, InputError
 from ..learning.residuals.correction import Learned
-from ..robot.actuation import RobotInput
+from ..robot.actuation import Given, RobotInput
 from ..robot.robot import Robot
 from ..settings.control import ReductionSettings
 from ..settings.played import SequenceSettings
@@ -79,6 +79,36 @@ def driven_input(robot: Robot) -> RobotInput:
             f"{len(inputs) or 'none'}: choose a run with pressures, tendons or muscles."
         )
     return inputs[0]
+
+
+def settle_some(robot: Robot, batch: int, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns positions (B, N, 3) of `Robot.settle` [m], and (B,) bool, which environments are in equilibrium.
+
+    Raises:
+        InputError: an invalid input, as for `Robot.step`.
+        ConvergenceError: the simulator has no equilibrium even without the learned force.
+    """
+    try:
+        q = robot.settle(batch, **inputs).q
+    except ConvergenceError as error:
+        if not isinstance(error.report, torch.Tensor):
+            raise
+        return error.positions.detach(), error.report
+    return q, torch.ones(batch, dtype=torch.bool, device=q.device)
+
+
+def linearised(
+    robot: Robot, state: State, **inputs: Given
+) -> tuple[scipy.sparse.csc_array, scipy.sparse.csc_array, IntArray]:
+    """Linearises a step of a robot's simulator about a state, without the learned force.
+
+    Returns:
+        The (3 F, 3 F) Hessian and the inertia in it [N/m], and the numbers of the F free vertices.
+    """
+    acting = robot.acting(state, **inputs).inputs
+    linear = robot.simulator.linearise(state, acting, robot.constants)
+    hessian, _ = linear.matrix(state.q)
+    return hessian, linear.inertia_matrix(state.q), linear.free.cpu().numpy()
 
 
 def check_reducible(robot: Robot) -> None:
@@ -180,7 +210,7 @@ class Source:
             return np.zeros(0), np.zeros((0, 0))
         nothing = self.keywords(np.zeros((1, self.parts)))
         still = self.robot.state(self.rest, **nothing)
-        conditions = self.robot.conditions(still, **nothing)
+        conditions = self.robot.acting(still, **nothing).conditions
         assert conditions is not None
         blocks = 1 + len(self.filters)
         changes = np.diag(np.tile(self.scale, blocks))
@@ -226,7 +256,7 @@ class Source:
     def _outputs(self, state: State, commands: dict[str, torch.Tensor]) -> FloatArray:
         """Outputs (B, c) of the network in a step from a state."""
         assert self.learned is not None
-        network, conditions = self.learned.network, self.robot.conditions(state, **commands)
+        network, conditions = self.learned.network, self.robot.acting(state, **commands).conditions
         like = network.rest
         conditions = None if conditions is None or network.actuation is None else conditions.to(like)
         inputs = network.encode(state.q.to(like), state.v.to(like), conditions)
@@ -240,7 +270,7 @@ class Source:
         Returns:
             Positions (S, N, 3) [m], their commands (S, n), and the network's outputs (S, c) there, if there is one.
         """
-        q, rests = self.robot.settle_some(len(commands), **self.keywords(commands))
+        q, rests = settle_some(self.robot, len(commands), **self.keywords(commands))
         q, commands = q[rests], commands[rests.cpu().numpy()]
         if self.learned is None:
             return q, commands, None
@@ -260,7 +290,7 @@ class Source:
         """Linearises about an equilibrium (1, N, 3) under commands (n,) and the force of network outputs (c,)."""
         robot, still, keywords = self.robot, torch.zeros_like(q), self.keywords(commands[None])
         state = robot.state(q, **keywords)
-        hessian, inertia, free = self._elastic.linearised(state, **keywords)
+        hessian, inertia, free = linearised(self._elastic, state, **keywords)
         stiffness = (hessian - inertia).tocsc()
         coordinates = (3 * free[:, None] + np.arange(3)).ravel()
         mass = scipy.sparse.diags_array(self.mass.cpu().numpy()[coordinates]).tocsc()
@@ -270,7 +300,7 @@ class Source:
         shapes = torch.zeros(q[0].numel(), modes, dtype=torch.float64, device=q.device)
         shapes[torch.as_tensor(coordinates, device=q.device)] = torch.as_tensor(vectors[:, order], device=q.device)
         modal_stiffness = np.diag(values[order])
-        damped, inertia = self._viscous.linearised(state, **keywords)[:2]
+        damped, inertia = linearised(self._viscous, state, **keywords)[:2]
         # The Hessian of a step of length s is M / s^2 + D / s + K.
         step = float(np.sqrt(mass.diagonal()[0] / inertia.diagonal()[0]))
         kept = vectors[:, order]
@@ -281,7 +311,7 @@ class Source:
         )
         for number, branch in enumerate(self._branches):
             branches[number] = (
-                kept.T @ ((branch.linearised(state, **keywords)[0] - hessian) @ kept) / float(gamma[number])
+                kept.T @ ((linearised(branch, state, **keywords)[0] - hessian) @ kept) / float(gamma[number])
             )
         columns, zero = shapes.mT.reshape(-1, *q.shape[1:]).to(q), q.new_zeros(modes)
 

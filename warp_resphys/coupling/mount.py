@@ -50,7 +50,7 @@ class MountedState(Brief):
     """State of a batch of E robots on their arms; a step makes a new one.
 
     Attributes:
-        arm: (E, S) states of MuJoCo, which `Mount.data` turns into `mujoco.MjData`.
+        arm: (E, S) states of MuJoCo without the wrench, which `Mount.data` turns into `mujoco.MjData`.
         robot: state of the robot, or of the scene of robots.
         pose: (E, 6) of the base [m, rad].
         velocity: (E, 6) mean twist of the base over the last step [m/s, rad/s].
@@ -81,7 +81,9 @@ class MountedState(Brief):
 class Mount:
     """A robot, or a scene of robots, whose base is on a body of a MuJoCo model.
 
-    The mass of the robot must not be in the model. Objects of a scene stay in the world.
+    The mass of the robot must not be in the model. Objects of a scene stay in the world. A robot whose gravity is
+    tilted, as that of recordings which were registered, is turned on the body by its tilt, so that it stands on an
+    upright body as it was recorded. External forces in `mujoco.MjData.xfrc_applied` act beside the robot's wrench.
 
     Args:
         robot: with fixed vertices, which are its base; of a scene, all robots.
@@ -110,8 +112,18 @@ class Mount:
             )
         if iterations < 2:
             raise InputError(f"iterations is {iterations}: give 2 or more.")
-        self.robot, self._iterations, self.time_step = robot, iterations, robot.simulator.time_step
-        self._body = MountingBody(model, body, pose, self.time_step, robot.simulator.gravity)
+        self._iterations, self.time_step = iterations, robot.simulator.time_step
+        pull = robot.constants.gravity[0].detach().double().cpu().numpy()
+        self._body = MountingBody(model, body, pose, self.time_step, pull)
+        if not np.array_equal(self._body.gravity, pull):
+            if isinstance(robot, RobotScene):
+                raise InputError(
+                    f"gravity is {np.round(pull, 3).tolist()} m/s^2 in the scene and "
+                    f"{np.round(model.opt.gravity, 3).tolist()} in the model: give the robots of the scene poses "
+                    "by which both are the same."
+                )
+            robot = robot.in_gravity(self._body.gravity)
+        self.robot = robot
 
     @property
     def model(self) -> Any:
@@ -119,8 +131,13 @@ class Mount:
         return self._body.model
 
     def data(self, state: MountedState, environment: int = 0) -> Any:
-        """Returns a new `mujoco.MjData` of an environment after `mj_forward`, to read or to draw the arm."""
-        return self._body.data(state.arm[environment])
+        """Returns a new `mujoco.MjData` of an environment after `mj_forward`, to read or to draw the arm.
+
+        Positions and velocities are those at the end of the step that led to the state. Accelerations, torques and
+        forces are those at this instant, the beginning of the next step: of the controls of the last step, and with the
+        robot's wrench of the last step beside the external force on the mounting body in ``xfrc_applied``.
+        """
+        return self._body.data(state.arm[environment], state.wrench[environment])
 
     @torch.no_grad()
     def begin(self, data: Any | Sequence[Any], **inputs: Any) -> MountedState:
@@ -129,7 +146,8 @@ class Mount:
         The robot's response is measured there, by 7 (K + 1) of its steps.
 
         Args:
-            data: `mujoco.MjData` with the arm's positions and controls, or one for each of the E environments.
+            data: `mujoco.MjData` with the arm's positions, controls and external forces, which stay, or one for each of
+                the E environments.
             inputs: constant inputs of the robot by name, as for `Robot.begin`, or by robot of a scene.
 
         Raises:

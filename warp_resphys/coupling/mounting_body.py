@@ -9,7 +9,6 @@ to in that time (staggered by half a step, as Lesoinne and Farhat, AIAA J. 36 (1
 act too late and add energy.
 """
 
-from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -21,7 +20,9 @@ from ..io.errors import ConvergenceError, InputError, did_you_mean, listed
 from ..robot.robot_scene import pose_of
 
 _WHOLE: Final = 1e-6  # deviation of the ratio of the time steps from a whole number
-_GRAVITY: Final = 0.01  # difference of gravity between model and robot [m/s^2]
+_GRAVITY: Final = 0.01  # difference of the strength of gravity between model and robot [m/s^2]
+_LARGEST_TILT: Final = 10.0  # of the robot's gravity from the model's [degrees]
+_DIGITS: Final = 6  # after the point, of a pose in a message
 HERE: Final = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # the pose (6,) of the frame itself
 
 
@@ -38,7 +39,11 @@ def _number(model: Any, body: str) -> int:
     """Returns the number of a body, or raises InputError with the names that there are."""
     names = [model.body(number).name for number in range(model.nbody)]
     if body not in names:
-        raise InputError(f"the model has no body {body!r}{did_you_mean(body, names)}: it has {listed(names)}.")
+        raise InputError(
+            f"the model has no body {body!r}{did_you_mean(body, names)}: it has {listed(names)}; MuJoCo fuses a link "
+            "on a fixed joint of a URDF with its parent (fusestatic of the compiler): name the parent, and give the "
+            "place of the link on it as pose."
+        )
     return names.index(body)
 
 
@@ -47,7 +52,7 @@ def base_pose(model: Any, data: Any, body: str, pose: ArrayLike = HERE) -> Float
 
     Args:
         model: `mujoco.MjModel`.
-        data: `mujoco.MjData` after `mujoco.mj_forward` or `mj_kinematics`.
+        data: `mujoco.MjData`, of which ``qpos`` and the poses of mocap bodies count.
         body: name of the body.
         pose: (6,) of the robot's frame in that of the body.
 
@@ -55,9 +60,62 @@ def base_pose(model: Any, data: Any, body: str, pose: ArrayLike = HERE) -> Float
         InputError: no such body, or a pose that is none.
     """
     rotation, shift = pose_of("the robot on its body", pose)
-    placed = data.body(_number(model, body))
+    mujoco, number = mujoco_package(), _number(model, body)
+    own = mujoco.MjData(model)
+    own.qpos[:], own.mocap_pos[:], own.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+    mujoco.mj_kinematics(model, own)
+    placed = own.body(number)
     turned = placed.xmat.reshape(3, 3)
     return np.concatenate([placed.xpos + turned @ shift, Rotation.from_matrix(turned @ rotation).as_rotvec()])
+
+
+def _check_movable(model: Any, body: str, pose: ArrayLike) -> None:
+    """Raises InputError for a body that no force moves, or that has no mass."""
+    number = _number(model, body)
+    root = int(model.body_weldid[number])
+    if root == 0:
+        raise InputError(f"the body {body!r} cannot move: mount the robot on one with a joint above it.")
+    if model.body_mocapid[root] >= 0:
+        raise InputError(
+            f"the body {body!r} is a mocap body, or fixed to one, which no force moves: give its pose to the robot as "
+            "the input base (base_pose), or mount the robot on a body with a joint above it."
+        )
+    if model.body_mass[number] > 0.0:
+        return
+    carrier = number
+    while carrier != root and not model.body_mass[carrier] > 0.0:
+        carrier = int(model.body_parentid[carrier])
+    if not model.body_mass[carrier] > 0.0:
+        raise InputError(f"the body {body!r} has no mass, so that a force has no effect: give it its mass.")
+    name, still = model.body(carrier).name, mujoco_package().MjData(model)
+    here, there = base_pose(model, still, body, pose), base_pose(model, still, name)
+    back = Rotation.from_rotvec(there[3:]).inv()
+    turn = back * Rotation.from_rotvec(here[3:])
+    inside = np.round([*back.apply(here[:3] - there[:3]), *turn.as_rotvec()], _DIGITS).tolist()
+    raise InputError(
+        f"the body {body!r} has no mass: mount the robot on {name!r}, to which it is fixed, with the pose {inside}."
+    )
+
+
+def _tilt(model: Any, gravity: ArrayLike) -> FloatArray:
+    """Returns the least rotation (3, 3) from a robot's gravity (3,) to that of a model [m/s^2], none if they are equal.
+
+    Raises:
+        InputError: they differ in strength, or in direction by more than `_LARGEST_TILT`.
+    """
+    down, pull = np.asarray(model.opt.gravity), np.asarray(gravity, dtype=np.float64)
+    if np.allclose(pull, down, rtol=0.0, atol=_GRAVITY):
+        return np.eye(3)
+    axis = _cross(pull, down)
+    sine, stronger = float(np.linalg.norm(axis)), float(np.linalg.norm(pull) - np.linalg.norm(down))
+    angle = float(np.arctan2(sine, pull @ down))
+    if abs(stronger) > _GRAVITY or np.degrees(angle) > _LARGEST_TILT:
+        raise InputError(
+            f"gravity is {np.round(down, 3).tolist()} m/s^2 in the model and {np.round(pull, 3).tolist()} for the "
+            f"robot: give both the same strength, and directions in axes of the world that are {_LARGEST_TILT:g} "
+            "degrees apart at most, or mount robot.in_gravity(model.opt.gravity)."
+        )
+    return np.asarray(Rotation.from_rotvec(axis * (angle / max(sine, 1e-300))).as_matrix())
 
 
 def twist(before: FloatArray, after: FloatArray, time_step: float) -> FloatArray:
@@ -83,24 +141,23 @@ class MountingBody:
         body: name of the body.
         pose: (6,) of the robot's frame in that of the body.
         time_step: H of the robot [s], a multiple of the model's.
-        gravity: (3,) of the robot [m/s^2].
+        gravity: (3,) of the robot [m/s^2]; the robot's frame turns on the body by the tilt from it to the model's.
+
+    Attributes:
+        gravity: (3,) of the robot in axes of the model's world [m/s^2].
 
     Raises:
-        InputError: MuJoCo is not installed, no such body, or one that cannot move, a pose that is none, a time step
-            that is no multiple of the model's, or another gravity than the model's.
+        InputError: MuJoCo is not installed, no such body, one that no force moves or without mass, a pose that is none,
+            a time step that is no multiple of the model's, or a gravity unlike the model's (`_tilt`).
     """
 
-    def __init__(
-        self, model: Any, body: str, pose: ArrayLike, time_step: float, gravity: Sequence[float] | FloatArray
-    ) -> None:
+    def __init__(self, model: Any, body: str, pose: ArrayLike, time_step: float, gravity: ArrayLike) -> None:
         self._mujoco = mujoco = mujoco_package()
         if not isinstance(model, mujoco.MjModel):
             raise InputError(f"the model is a {type(model).__name__}: give a mujoco.MjModel, as from `from_xml_path`.")
         self.model, self._body, self._time_step = model, _number(model, body), time_step
-        if model.body_weldid[self._body] == 0:
-            raise InputError(f"the body {body!r} cannot move: mount the robot on one with a joint above it.")
         rotation, self._shift = pose_of("the robot on its body", pose)
-        self._turn = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        _check_movable(model, body, pose)
         ratio = time_step / model.opt.timestep
         self._substeps = round(ratio)
         if self._substeps < 1 or abs(ratio - self._substeps) > _WHOLE * ratio:
@@ -108,12 +165,9 @@ class MountingBody:
                 f"the model has steps of {1e3 * model.opt.timestep:g} ms and the robot of {1e3 * time_step:g} ms: set "
                 "model.opt.timestep to that of the robot, or to a whole part of it."
             )
-        pull = np.asarray(model.opt.gravity)
-        if not np.allclose(pull, gravity, rtol=0.0, atol=_GRAVITY):
-            raise InputError(
-                f"gravity is {np.round(pull, 3).tolist()} m/s^2 in the model and {np.round(gravity, 3).tolist()} for "
-                "the robot: give both the same, in axes of the world."
-            )
+        tilt = _tilt(model, gravity)
+        self.gravity: FloatArray = tilt @ np.asarray(gravity, dtype=np.float64)
+        self._turn = Rotation.from_matrix(rotation @ tilt).as_quat(scalar_first=True)
         self._data, self._kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION
         self._size = mujoco.mj_stateSize(model, self._kind)
         warnings = mujoco.mjtWarning
@@ -126,12 +180,20 @@ class MountingBody:
         self._mujoco.mj_getState(self.model, data, state, self._kind)
         return state
 
-    def data(self, state: FloatArray) -> Any:
-        """Returns a new `mujoco.MjData` in a state (S,), with all that MuJoCo computes from it."""
+    def data(self, state: FloatArray, wrench: FloatArray) -> Any:
+        """Returns a new `mujoco.MjData` in a state (S,) under a wrench (6,), with all that MuJoCo computes from it."""
         data = self._mujoco.MjData(self.model)
         self._mujoco.mj_setState(self.model, data, state, self._kind)
+        self._add(data, wrench)
         self._mujoco.mj_forward(self.model, data)
         return data
+
+    def _add(self, data: Any, wrench: FloatArray) -> None:
+        """Adds a wrench (6,) to the external force on the body for the positions in the data."""
+        self._mujoco.mj_kinematics(self.model, data)
+        self._mujoco.mj_comPos(self.model, data)
+        arm = self._origin(data) - data.xipos[self._body]
+        data.xfrc_applied[self._body] += np.concatenate([wrench[:3], wrench[3:] + _cross(arm, wrench[:3])])
 
     def place(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Returns the frame (7,) of the base in a state (S,), see `twist`, and the mobility A (6, 6) of the body there.
@@ -147,20 +209,20 @@ class MountingBody:
         inertia += model.opt.timestep * np.diag(model.dof_damping)
         return self._ahead(), jacobian @ np.linalg.solve(inertia, jacobian.T)
 
-    def _origin(self) -> FloatArray:
+    def _origin(self, data: Any) -> FloatArray:
         """Returns the place (3,) of the base's origin for the positions in the data [m]."""
-        data, body = self._data, self._body
+        body = self._body
         return np.asarray(data.xpos[body] + data.xmat[body].reshape(3, 3) @ self._shift)
 
     def _jacobian(self) -> FloatArray:
         """Returns the Jacobian (6, nv) of the base."""
         jacobian = np.zeros((6, self.model.nv))
-        self._mujoco.mj_jac(self.model, self._data, jacobian[:3], jacobian[3:], self._origin(), self._body)
+        self._mujoco.mj_jac(self.model, self._data, jacobian[:3], jacobian[3:], self._origin(self._data), self._body)
         return jacobian
 
     def _ahead(self) -> FloatArray:
         """Returns the frame (7,) of the base, tau ahead of the positions in the data."""
-        origin, turn, swing = self._origin(), np.empty(4), np.empty(4)
+        origin, turn, swing = self._origin(self._data), np.empty(4), np.empty(4)
         self._mujoco.mju_mulQuat(turn, self._data.xquat[self._body], self._turn)
         if self._substeps > 1:
             moved = 0.5 * (self._substeps - 1) * self.model.opt.timestep * self._jacobian() @ self._data.qvel
@@ -176,17 +238,15 @@ class MountingBody:
         Args:
             state: (S,) at its start.
             ctrl: (nu,) controls; None for those in the state.
-            wrench: (6,) on the body, which replaces its external force in the state.
+            wrench: (6,) on the body, beside its external force in the state, which the new state has unchanged.
 
         Raises:
             ConvergenceError: MuJoCo's simulation has become unstable.
         """
         model, data = self.model, self._data
         self._mujoco.mj_setState(model, data, state, self._kind)
-        self._mujoco.mj_kinematics(model, data)
-        self._mujoco.mj_comPos(model, data)
-        arm = self._origin() - data.xipos[self._body]
-        data.xfrc_applied[self._body] = np.concatenate([wrench[:3], wrench[3:] + _cross(arm, wrench[:3])])
+        push = data.xfrc_applied[self._body].copy()
+        self._add(data, wrench)
         if ctrl is not None:
             data.ctrl[:] = ctrl
         data.warning.number[:] = 0
@@ -197,6 +257,7 @@ class MountingBody:
                 data.qpos.copy(),
                 None,
             )
+        data.xfrc_applied[self._body] = push
         after = self.state_of(data)
         self._mujoco.mj_kinematics(model, data)
         self._mujoco.mj_comPos(model, data)

@@ -9,8 +9,9 @@ import torch
 
 from ..fem.bodies import Body
 from ..fem.integration_points import mean_gradients
-from ..stepping.rotations import rotations
+from ..stepping.rotations import closest_rotation, rotations
 
+_LEAST_TURN = 1e-9  # weight of the identity in the rotation of a base, over the squared size of the body
 _ITERATIONS = 8  # of the polar decomposition; enough for stretches from 0.1 to 10
 _AT_ONCE = 100  # states processed together
 
@@ -58,6 +59,35 @@ class VertexFrames:
         parts = zip(*(field.split(_AT_ONCE) for field in (q, v, force)), strict=True)
         turned = [torch.einsum("snji,snj->sni", self.rotations(x + self._ahead * w), f) for x, w, f in parts]
         return torch.cat(turned)
+
+
+@torch.no_grad()
+def carried_rest(body: Body, fixed_positions: torch.Tensor) -> torch.Tensor:
+    """Returns the rest shapes (B, N, 3) that bodies have where their bases are [m].
+
+    The base of a body, or of each body of a scene, are its fixed vertices: its rest shape makes the rigid motion that
+    is closest to theirs. Vertices on one line, which leave a turn about it open, turn as little as they can. A body
+    without fixed vertices stays.
+
+    Args:
+        body: a body or a scene, with N vertices, of which D are fixed.
+        fixed_positions: (B, D, 3) where they are [m].
+    """
+    places = fixed_positions.double()
+    rest = torch.as_tensor(body.vertices).to(places)
+    carried, before = rest.expand(len(places), -1, -1).clone(), 0
+    for _, member, first in body.members:
+        vertices = torch.as_tensor(member.fixed_vertices, device=rest.device)
+        if not len(vertices):
+            continue
+        own = rest[first : first + member.n_vertices]
+        base, now = own[vertices], places[:, before : before + len(vertices)]
+        before += len(vertices)
+        centre, middle = base.mean(0), now.mean(1, keepdim=True)
+        least = _LEAST_TURN * (own.amax(0) - own.amin(0)).square().sum()
+        turn = closest_rotation((now - middle).mT @ (base - centre) + least * torch.eye(3).to(rest))
+        carried[:, first : first + member.n_vertices] = (own - centre) @ turn.mT + middle
+    return carried.to(fixed_positions)
 
 
 class BaseFrame:

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from ..control.plan import tracked_of
 from ..control.reduction import reduced_of
-from ..control.sampling import driven_input
+from ..control.sampling import driven_input, settle_some
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
@@ -199,7 +199,7 @@ def _reach(robot: Robot, mapping: ActionMapping, point: FloatArray, shown: list[
     shares[0] = 0.0
     with torch.no_grad():
         inputs = {driven_input(robot).name: low + shares * (high - low)}
-        q, settled = robot.settle_some(len(shares), **inputs)
+        q, settled = settle_some(robot, len(shares), **inputs)
         markers = robot.observe(robot.state(q[settled])).double().cpu().numpy()
     markers = markers if shown is None else markers[:, shown]
     return Reach(markers.reshape(len(markers), -1) @ point.T, 2.0 * shares[settled.cpu().numpy()] - 1.0)

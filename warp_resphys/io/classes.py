@@ -78,8 +78,8 @@ def _arguments(make: Callable[..., Any], leading: int, where: str) -> type[_Argu
         ) from error
 
 
-def imported(target: str, base: type[Any], prefix: str = "") -> Any:
-    """Imports a class that is derived from another one; errors begin with a prefix.
+def imported(target: str, base: type[Any] | tuple[type[Any], ...], prefix: str = "") -> Any:
+    """Imports a class that is derived from another one, or from one of several; errors begin with a prefix.
 
     Raises:
         InputError: it cannot be imported, or is something else.
@@ -95,7 +95,9 @@ def imported(target: str, base: type[Any], prefix: str = "") -> Any:
             "correct the package."
         ) from error
     if not (isinstance(found, type) and issubclass(found, base)):
-        raise InputError(f"{prefix}{target} is no subclass of {base.__module__}.{base.__qualname__}: name one.")
+        bases = base if isinstance(base, tuple) else (base,)
+        known = " or ".join(f"{one.__module__}.{one.__qualname__}" for one in bases)
+        raise InputError(f"{prefix}{target} is no subclass of {known}: name one.")
     return found
 
 

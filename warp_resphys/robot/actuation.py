@@ -11,6 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..data.base_motion import LARGEST_STEP
+from ..data.driving import time_since_change
 from ..data.input_network import InputNetwork
 from ..data.input_response import InputResponse, response_of, with_means
 from ..data.trials import PAYLOAD, payload_inputs
@@ -18,8 +19,11 @@ from ..dynamics.frames import base_movement
 from ..dynamics.simulator import Simulator
 from ..energies.base import Energy
 from ..energies.contact.contact_points import MOTION
+from ..energies.materials import MASS_DAMPING
+from ..io.arrays import FloatArray
 from ..io.errors import InputError, listed
 from ..learning.parameters import MASS_FACTOR, command_of
+from ..learning.residuals.correction import LearnedPredictor
 from ..stepping.inputs import Inputs
 from ..stepping.quantity import Quantity
 from ..stepping.rotations import rotations
@@ -182,6 +186,20 @@ class Acting:
     # (3, B, 6) displacement of the base from one step ago until after the step; None if it never moved
     base: torch.Tensor | None
 
+    def remembered(self, state: State, predictor: LearnedPredictor | None, after: State) -> State:
+        """Returns the robot's state after a step, from the one before it and the body after it."""
+        memory = {**self.memory, "lost": after.lost, "left": state.left}
+        if predictor is not None and predictor.left_at is not None:
+            memory["left"] = state.left | (predictor.left_at >= 0)
+        return after.with_memory(memory)
+
+
+def values_of_material(simulator: Simulator, parameters: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """Returns those of a robot's parameters that are its material's, without damping by mass."""
+    materials = simulator.materials.items()
+    material = {f"{region}_{name}" if region else name for region, used in materials for name in used.parameters}
+    return {name: float(parameters[name][0]) for name in material & parameters.keys() - {MASS_DAMPING}}
+
 
 def moved_actuators(
     description: Description, parameters: Mapping[str, torch.Tensor], here: Simulator, there: Simulator
@@ -299,3 +317,11 @@ class Commands:
         """Positions (B, D, 3) of the fixed vertices for poses (B, 6) of the base [m]."""
         rest = self._simulator.rest_positions[self._simulator.fixed]
         return rest @ rotations(pose[:, 3:]).mT + pose[:, None, :3]
+
+
+def since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> FloatArray:
+    """Returns (T + 1, B) times since the last change of commands (T, B, ...) at T + 1 times [s]."""
+    values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
+    acting = [np.concatenate([series, series[-1:]]).reshape(times, batch, -1) for series in values]
+    at = time_step * np.arange(times, dtype=np.float64)
+    return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

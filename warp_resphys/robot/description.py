@@ -6,13 +6,14 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 
 from ..data.input_network import InputNetwork
 from ..data.marker_view import ViewedMarkers
-from ..data.markers import Markers
+from ..data.markers import Markers, Observation
 from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
@@ -38,6 +39,7 @@ from ..settings.learning import NetworkSettings
 from ..settings.mesh import Place
 from ..settings.observed import MarkerSettings
 from ..settings.stage_keys import StageSettings
+from .construction import Plain, made
 
 log = logging.getLogger(__name__)
 
@@ -71,8 +73,8 @@ class Description:
 
     name: str  # of the experiment and the run
     model: str  # name of the experiment's model, such as ``resphys``
-    settings: SimulatorSettings  # of its simulator, without mesh and device
-    material: MaterialSettings  # of its body, before identification
+    settings: SimulatorSettings | None  # of its simulator, without mesh and device; None if it is `built`
+    material: MaterialSettings | None  # of its body, before identification; None if it is `built`
     mesh: Mesh  # rest shape
     # identified values by name, see `learning.parameters`
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -96,12 +98,50 @@ class Description:
     intervals: Intervals | None = None  # half-widths of the markers' prediction intervals, at `level`
     level: float = LEVEL  # nominal coverage of the intervals
     errors_mm: ErrorSummary | None = None  # of the model in the test trials
+    built: Simulator | None = None  # a simulator of Python, in place of settings and material
+    observation: Observation | None = None  # what is observed of it, in place of `markers` and `bound`
 
     def simulator(self, device: torch.device, on_failure: str) -> Simulator:
         """Builds the simulator."""
+        if self.built is not None:
+            solver = self.built.settings.changed(on_failure=on_failure)
+            if (solver, device) == (self.built.settings, self.built.device):
+                return self.built
+            return replace(self.built, device=device, solver=solver, relative_tolerance=None)
+        assert self.settings is not None
+        assert self.material is not None
         settings = self.settings.model_copy(update={"device": str(device)})
         body = build_body(settings, self.mesh)
         return build_simulator(settings, self.material, body, on_failure=on_failure)
+
+    def made_of(self, plain: Plain) -> list[Any]:
+        """Returns what the simulator is made of as plain data, whose arrays are added to `plain`."""
+        if self.settings is not None and self.material is not None:
+            return [self.settings.plain(), self.material.plain()]
+        return [plain.of(self.built, "simulator"), plain.of(self.observation, "markers")]
+
+    def stepped_by(self, simulator: Simulator, without: Sequence[str] = ()) -> "Description":
+        """Returns the description with integrator and gravity of a simulator, and without some parameters."""
+        kept = {name: value for name, value in self.parameters.items() if name not in without}
+        if self.settings is None:
+            return replace(self, built=simulator, parameters=kept)
+        gravity = tuple(np.asarray(simulator.gravity, dtype=np.float64).tolist())
+        settings = self.settings.model_copy(update={"integrator": simulator.integrator, "gravity": gravity})
+        return replace(self, settings=settings, parameters=kept)
+
+    def with_values(self, parameters: Mapping[str, torch.Tensor]) -> "Description":
+        """Returns the description with other values (1,) of parameters.
+
+        Raises:
+            InputError: one has values of several environments.
+        """
+        values = dict(self.parameters)
+        for name, value in parameters.items():
+            if len(value) > 1:
+                raise InputError(f"{name} has {len(value)} values, one for each environment: save a robot with one.")
+            if name not in values or not torch.equal(value, value.new_tensor([values[name]])):
+                values[name] = float(value)
+        return replace(self, parameters=values)
 
     def to(self, device: torch.device) -> "Description":
         """Returns the description with its networks on a device."""
@@ -121,18 +161,24 @@ class Description:
         """
         if self.learned is not None and isinstance(self.learned.network, NextState):
             raise InputError(f"{self.model} has no simulator, only a network for its mesh: load another model.")
+        if self.settings is None or self.material is None:
+            raise InputError(
+                f"{self.name} was made from a simulator of Python, which is on its body: make a Simulator of the other "
+                "body with robot.simulator.material, and Robot.of it."
+            )
         settings = self.settings.changed(**body)
         material = MaterialSettings.model_validate({**self.material.plain(), MASS_DAMPING: None})
         return Description(self.name, self.model, settings, material, mesh, parameters)
 
-    def observe(self) -> Markers | None:
+    def observe(self) -> Observation | None:
         """Returns the map from vertices to markers, in float64 on the CPU; None if every vertex is observed."""
-        if self.markers is None or self.bound is None:
-            return None
-        bound = bound_markers(self.markers, self.mesh, self.bound.numpy(), self.labels)
-        seen = ViewedMarkers.of(bound, marker_view_of(self.markers, self.labels, self.sets))
-        placed = self.placement
-        return seen if placed is None else PlacedMarkers.of(seen, Placement.from_plain(placed, self.labels))
+        seen = self.observation
+        if self.markers is not None and self.bound is not None:
+            bound = bound_markers(self.markers, self.mesh, self.bound.numpy(), self.labels)
+            seen = ViewedMarkers.of(bound, marker_view_of(self.markers, self.labels, self.sets))
+        if self.placement is None or not isinstance(seen, Markers):
+            return seen
+        return PlacedMarkers.of(seen, Placement.from_plain(self.placement, self.labels))
 
     def half_widths(self, markers: FloatArray, since: ArrayLike | None) -> FloatArray | None:
         """Half-widths (..., M) of prediction intervals, as for `Robot.half_widths`, of markers (..., M, 3) [m]."""
@@ -160,7 +206,7 @@ class Description:
         """Writes one safetensors file with JSON metadata.
 
         Raises:
-            InputError: the name has another extension.
+            InputError: the name has another extension, or the simulator has a part that cannot be saved.
             DataFileError: the file cannot be written.
         """
         if path.suffix != SUFFIX:
@@ -170,8 +216,12 @@ class Description:
         metadata["packages"] = packages_of([self.settings, self.material, self.markers, self._network()])
         metadata["intervals"] = None if self.intervals is None else self.intervals.plain()
         metadata["uncertainty"] = None if self.uncertainty is None else asdict(self.uncertainty)
-        tensors = {"vertices": torch.from_numpy(self.mesh.vertices), "cells": torch.from_numpy(self.mesh.cells)}
-        tensors |= {f"{_REGION}{name}": torch.from_numpy(cells) for name, cells in self.mesh.regions.items()}
+        regions = {f"{_REGION}{name}": cells for name, cells in self.mesh.regions.items()}
+        plain = Plain({"vertices": self.mesh.vertices, "cells": self.mesh.cells, **regions})
+        metadata["built"] = plain.of(self.built, "simulator")
+        metadata["observation"] = plain.of(self.observation, "markers")
+        metadata["packages"] |= plain.packages
+        tensors = plain.tensors
         tensors |= {} if self.bound is None else {"bound": self.bound}
         if self.learned is not None:
             network = self.learned.network
@@ -196,6 +246,7 @@ class Description:
             network = restore(network_of(fields["model"]), weights, stored)
             range_ = None if stored["range"] is None else Range.restore(stored["range"], network.linear)
             learned = Learned(network, range_, stored["force_frame"])
+        made_of = {key: made(fields.pop(key, None), tensors, path) for key in ("built", "observation")}
         intervals = fields.pop("intervals")
         actuator = {name: InputNetwork.of_plain(plain) for name, plain in fields.pop("actuator", {}).items()}
         for key, kind in _SETTINGS.items():
@@ -213,6 +264,7 @@ class Description:
             actuator=actuator,
             intervals=Intervals.from_plain(intervals),
             **fields,
+            **made_of,
         )
 
 

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csc_array
 
-from ..data.driving import time_since_change
+from ..data.markers import Observation
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Simulator
 from ..dynamics.trajectory import Motion
-from ..energies.materials import MASS_DAMPING
 from ..io.errors import ConvergenceError, InputError
 from ..learning.evaluation import POSE_STEPS
-from ..learning.parameters import check_names, constants_of, identifiable_parameters, replaced
+from ..learning.observed_motions import Identified
+from ..learning.parameters import TILTS, check_names, constants_of, identifiable_parameters, replaced
 from ..learning.residuals.correction import (
     DIVERGENCE_DISTANCE,
     CorrectedSimulator,
@@ -32,8 +31,19 @@ from ..stepping.inputs import Inputs
 from ..stepping.rollout import rollout, states
 from ..stepping.rotations import rotations
 from ..stepping.state import State
-from .actuation import BASE, Acting, Commands, Given, InputReader, inputs_of, moved_actuators
+from .actuation import (
+    BASE,
+    Acting,
+    Commands,
+    Given,
+    InputReader,
+    inputs_of,
+    moved_actuators,
+    since_change,
+    values_of_material,
+)
 from .description import Description
+from .of_simulator import description_of
 
 
 class Robot:
@@ -82,6 +92,30 @@ class Robot:
         self._reader = InputReader(self.inputs, self.simulator)
         self._set_parameters(parameters or {})
 
+    @classmethod
+    def of(
+        cls,
+        simulator: Simulator,
+        markers: Observation | Mapping[str, ArrayLike] | None = None,
+        parameters: Identified | Mapping[str, float] | None = None,
+        ranges: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+        name: str = "robot",
+    ) -> "Robot":
+        """Returns the robot of a simulator of Python, which can do what one of a run can, but has no trials.
+
+        Args:
+            simulator: of one body.
+            markers: of `bind_markers`, or places (3,) on the body at rest by label [m]; None: vertices are observed.
+            parameters: values in place of the simulator's, by name or from `identify`, with their uncertainty.
+            ranges: least and greatest value by input, a number or one for each part; environments need them.
+            name: in descriptions.
+
+        Raises:
+            InputError: no simulator of one body, or markers, parameters or ranges that do not fit it.
+        """
+        made = description_of(simulator, markers, parameters, ranges or {}, name)
+        return cls(made, simulator.device, simulator.settings.on_failure)
+
     def _set_parameters(self, parameters: Mapping[str, torch.Tensor | float]) -> None:
         check_names(parameters, identifiable_parameters(self.simulator))
         known = replaced(self.simulator, self.description.parameters, parameters)
@@ -104,15 +138,26 @@ class Robot:
         Raises:
             InputError: an unknown name, or a value out of range.
         """
-        return self._changed(self.simulator, replaced(self.simulator, self.parameters, parameters))
+        return self._changed(replaced(self.simulator, self.parameters, parameters))
 
     def integrated_by(self, integrator: str) -> "Robot":
         """Returns the robot, stepped by another time integrator."""
-        return self._changed(replace(self.simulator, integrator=integrator), self.parameters)
+        simulator = replace(self.simulator, integrator=integrator)
+        description = self.description.stepped_by(simulator)
+        return self._changed(self.parameters, simulator=simulator, description=description)
 
-    def _changed(self, simulator: Simulator, parameters: Mapping[str, torch.Tensor | float]) -> "Robot":
+    def in_gravity(self, gravity: ArrayLike) -> "Robot":
+        """Returns the robot under another gravity (3,) in axes of the world [m/s^2], without an identified tilt."""
+        pull = np.asarray(gravity, dtype=np.float64).tolist()
+        known = {name: value for name, value in self.parameters.items() if name not in TILTS}
+        simulator = replace(self.simulator, gravity=pull)
+        description = self.description.stepped_by(simulator, without=TILTS)
+        return self._changed(known, simulator=simulator, description=description)
+
+    def _changed(self, parameters: Mapping[str, torch.Tensor | float], **others: Any) -> "Robot":
+        """Returns a robot with other parameters and attributes."""
         other = object.__new__(Robot)
-        other.__dict__.update({**self.__dict__, "simulator": simulator})
+        other.__dict__.update(self.__dict__ | others)
         other._set_parameters(parameters)
         return other
 
@@ -133,10 +178,7 @@ class Robot:
                 lacks; or a robot whose network replaces the simulator.
             MeshError: the mesh cannot be simulated, or has no vertex where the body is fixed.
         """
-        materials = self.simulator.materials.items()
-        material = {f"{region}_{name}" if region else name for region, used in materials for name in used.parameters}
-        names = material & self.parameters.keys() - {MASS_DAMPING}
-        parameters = {name: float(self.parameters[name][0]) for name in names}
+        parameters = values_of_material(self.simulator, self.parameters)
         made = Robot(self.description.on(mesh, parameters, body), self.simulator.device)
         response, actuator = moved_actuators(self.description, self.parameters, self.simulator, made.simulator)
         description = replace(made.description, parameters=parameters | response, actuator=actuator)
@@ -161,10 +203,10 @@ class Robot:
         """Writes its description to one safe file (safetensors and JSON) that `loading.load` opens on any machine.
 
         Raises:
-            InputError: the name has another extension.
+            InputError: the name has another extension, something cannot be saved, or parameters differ by environment.
             DataFileError: the file cannot be written.
         """
-        return self.description.write(Path(path).expanduser())
+        return self.description.with_values(self.parameters).write(Path(path).expanduser())
 
     # Observation
 
@@ -244,21 +286,6 @@ class Robot:
         left = start.left if predictor.left_at is None else predictor.left_at >= 0
         return body.with_memory({**start.memory_of(), **acting.memory, "left": left})
 
-    def settle_some(self, batch: int = 1, **inputs: Given) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns positions (B, N, 3) of `settle` [m], and (B,) bool, which environments are in equilibrium.
-
-        Raises:
-            InputError: an invalid input, as for `step`.
-            ConvergenceError: the simulator has no equilibrium even without the learned force.
-        """
-        try:
-            q = self.settle(batch, **inputs).q
-        except ConvergenceError as error:
-            if not isinstance(error.report, torch.Tensor):
-                raise
-            return error.positions.detach(), error.report
-        return q, torch.ones(batch, dtype=torch.bool, device=q.device)
-
     # Motion
 
     def step(self, state: State, **inputs: Given) -> State:
@@ -279,29 +306,21 @@ class Robot:
         after = CorrectedSimulator(self.simulator, predictor, acting.inputs, self.constants).step(state, 0)
         if self.simulator.settings.on_failure == "raise" and bool((after.lost & ~state.lost).any()):
             raise ConvergenceError(
-                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths; "
-                "use shorter steps, lower inputs, or a force that was trained longer.",
+                f"the robot has diverged: a vertex moved further than {DIVERGENCE_DISTANCE:g} body lengths from "
+                "where its base holds it at rest; use shorter steps, lower inputs, or a force that was trained longer.",
                 state.q.detach(),
                 None,
             )
-        return self._remembered(state, acting, predictor, after)
+        return acting.remembered(state, predictor, after)
 
     def _acting(self, state: State, inputs: Mapping[str, Given]) -> tuple[Acting, LearnedPredictor | None]:
         """Returns what acts in a step under commands, and the predictor of its learned force."""
-        acting, learned = self._commands.act(state, self._read(inputs, state.batch)), self._learned
+        acting, learned = self.acting(state, **inputs), self._learned
         if learned is None:
             return acting, None
         conditions = None if learned.network.actuation is None else acting.conditions
         frame = None if acting.base is None else BaseFrame(acting.base, self.time_step, first=1)
         return acting, LearnedPredictor(learned.network, conditions, learned.range_, self.frames, frame)
-
-    @staticmethod
-    def _remembered(state: State, acting: Acting, predictor: LearnedPredictor | None, after: State) -> State:
-        """Returns the state after a step, from the one before it and the body after it."""
-        memory = {**acting.memory, "lost": after.lost, "left": state.left}
-        if predictor is not None and predictor.left_at is not None:
-            memory["left"] = state.left | (predictor.left_at >= 0)
-        return after.with_memory(memory)
 
     def drive(self, state: State, **inputs: Given) -> tuple[Inputs, Callable[[State], State]]:
         """Returns a step's inputs with the learned force, and a map from the body after it to the robot's state.
@@ -321,7 +340,7 @@ class Robot:
             force = predictor(state, 0)
             assert isinstance(force, torch.Tensor)
             total = total.plus(force, predictor.acts)
-        return total, lambda body: self._remembered(state, acting, predictor, body)
+        return total, lambda body: acting.remembered(state, predictor, body)
 
     def rollout(
         self,
@@ -361,38 +380,17 @@ class Robot:
             name=f"{self.description.name}, {self.description.model}",
             markers=markers,
             labels=self.labels,
-            half_widths=self.half_widths(markers, _since_change(self.time_step, driven, *markers.shape[:2])),
+            half_widths=self.half_widths(markers, since_change(self.time_step, driven, *markers.shape[:2])),
             left=torch.stack([reached.left for reached in motion]),
             lost=torch.stack([reached.lost for reached in motion]),
             inputs=driven,
             units={name: (self.inputs[name].unit, self.inputs[name].parts) for name in self.driven},
         )
 
-    # Linearisation and the network's inputs in a state
-
-    def conditions(self, state: State, **inputs: Given) -> torch.Tensor | None:
-        """Inputs (B, A) of the network beside the state in a step, as `Description` lists them."""
-        return self._commands.act(state, self._read(inputs, state.batch)).conditions
-
-    def linearised(self, state: State, **inputs: Given) -> tuple[csc_array, csc_array, NDArray[np.int64]]:
-        """Linearises a step of the simulator about a state, without the learned force.
-
-        Returns:
-            The (3 F, 3 F) Hessian and the inertia in it [N/m], and the numbers of the F free vertices.
-        """
-        acting = self._commands.act(state, self._read(inputs, state.batch)).inputs
-        linearised = self.simulator.linearise(state, acting, self.constants)
-        hessian, _ = linearised.matrix(state.q)
-        return hessian, linearised.inertia_matrix(state.q), linearised.free.cpu().numpy()
+    def acting(self, state: State, **inputs: Given) -> Acting:
+        """Returns what acts during a step from a state, except the learned force."""
+        return self._commands.act(state, self._read(inputs, state.batch))
 
     def _read(self, inputs: Mapping[str, Given], batch: int) -> dict[str, torch.Tensor]:
         refuse_transforms()
         return {name: self._reader.read(name, value, batch) for name, value in inputs.items()}
-
-
-def _since_change(time_step: float, driven: Mapping[str, torch.Tensor], times: int, batch: int) -> NDArray[np.float64]:
-    """(T + 1, B) time since the last change of commands (T, B, ...) at T + 1 times [s]."""
-    values = [commands.detach().cpu().double().numpy() for commands in driven.values()]
-    acting = [np.concatenate([series, series[-1:]]).reshape(times, batch, -1) for series in values]
-    at = time_step * np.arange(times, dtype=np.float64)
-    return time_since_change(np.broadcast_to(at[:, None], (times, batch)), acting)

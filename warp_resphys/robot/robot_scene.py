@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ..data.base_motion import in_frame
 from ..data.registration import RigidTransform
+from ..dynamics.frames import carried_rest
 from ..dynamics.simulator import Simulator
 from ..energies.contact.surface_contact import SurfaceContact
 from ..energies.materials import Material
@@ -108,9 +109,7 @@ class RobotScene:
         """Gravity (3,) of the scene [m/s^2], with the identified tilt of the robots' gravity."""
         pulls = {}
         for name, robot in self.robots.items():
-            known = constants_of(robot.simulator, robot.parameters).get("gravity")
-            pull = np.asarray(robot.simulator.gravity) if known is None else known[0].detach().double().cpu().numpy()
-            pulls[name] = self._poses[name][0] @ pull
+            pulls[name] = self._poses[name][0] @ robot.constants.gravity[0].detach().double().cpu().numpy()
         first, pull = next(iter(pulls.items()))
         for name, other in pulls.items():
             if not np.allclose(other, pull, atol=_SAME_GRAVITY):
@@ -174,10 +173,14 @@ class RobotScene:
                 if acting_on.fixed_positions is None and len(body.fixed_vertices):
                     places = self.simulator.rest_positions[first + body.fixed_vertices]
                     by_body[name] = acting_on.replace(fixed_positions=places.expand(state.batch, -1, -1))
-        new = self.simulator.step(state, self.scene.inputs(by_body), self.constants)
+        acting_on_all = self.scene.inputs(by_body)
+        new = self.simulator.step(state, acting_on_all, self.constants)
         lost = state.lost | ~new.converged
         if bool(lost.any()):
-            new = self.simulator.rest_state(state.batch).where(lost, new)
+            resting = self.simulator.rest_state(state.batch)
+            if acting_on_all.fixed_positions is not None:
+                resting = replace(resting, q=carried_rest(self.scene, acting_on_all.fixed_positions))
+            new = resting.where(lost, new)
         new = new.with_memory({"lost": lost})
         return self._with_robots(new, {name: after[name](self._in_frame(name, new)) for name in self.robots})
 

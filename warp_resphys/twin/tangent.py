@@ -14,6 +14,7 @@ import scipy.sparse
 import scipy.sparse.linalg
 import torch
 
+from ..control.sampling import linearised
 from ..energies.materials import VISCOUS
 from ..io.arrays import FloatArray, IntArray
 from ..robot.actuation import FORCE, Given, InputReader
@@ -134,7 +135,7 @@ def _vibrations(
 ) -> tuple[FloatArray, FloatArray, scipy.sparse.csc_array, IntArray]:
     """Eigenvalues (r,) [1/s^2], vectors (3 F, r), mass (3 F, 3 F) of the slowest vibrations; free vertices."""
     still = State(state.q, torch.zeros_like(state.v), memory=state.memory)
-    hessian, mass, free = robot.linearised(still, **inputs)
+    hessian, mass, free = linearised(robot, still, **inputs)
     step = make_integrator(robot.simulator.integrator).stage(still, robot.time_step).step
     stiffness, mass = (hessian - mass).tocsc(), scipy.sparse.csc_array(step**2 * mass)
     unknowns = mass.shape[0]

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import torch
 
-from ...dynamics.frames import BaseFrame, VertexFrames
+from ...dynamics.frames import BaseFrame, VertexFrames, carried_rest
 from ...dynamics.simulator import Constants, Simulator
 from ...io.arrays import Brief
 from ...io.errors import ConvergenceError, InputError, in_short
@@ -43,7 +43,8 @@ class CorrectedSimulator:
     """The steps of a simulator with a learned force, or of a network in its place, by their numbers.
 
     An environment has diverged when a step fails or a vertex is further than `DIVERGENCE_DISTANCE` body lengths from
-    its rest position: from then on it stands at rest and is `State.lost`, and gradients are meaningless there.
+    its rest position, in the frame of the fixed vertices or, without them, of the body's mean motion. From then on it
+    is `State.lost`: it stands at rest where its fixed vertices are, and gradients are meaningless there.
 
     Args:
         simulator: its solver settings must count failures rather than raise them.
@@ -62,18 +63,32 @@ class CorrectedSimulator:
         self.simulator, self._predict = simulator, predict
         self._inputs = Inputs() if inputs is None else inputs
         self._constants = simulator.prepare() if constants is None else constants
-        self._rest = simulator.rest_positions
-        self._length = float((self._rest.amax(0) - self._rest.amin(0)).max())
+        rest = simulator.rest_positions
+        self._length = float((rest.amax(0) - rest.amin(0)).max())
 
     def step(self, state: State, number: int) -> State:
         """Returns the state after the step of a number; differentiable."""
         lost = state.lost
         new, failed = self._advance(state, number, lost)
-        distance = (new.q - self._rest).abs().flatten(1).amax(1)
+        resting = self._resting(state.batch, self._inputs.at(number).fixed_positions)
+        distance = self._moved(new.q, resting.q).abs().flatten(1).amax(1)
         lost = lost | failed | ~(distance < DIVERGENCE_DISTANCE * self._length)
         if bool(lost.any()):
-            new = self.simulator.rest_state(state.batch).where(lost, new)
+            new = resting.where(lost, new)
         return new.with_memory({"lost": lost})
+
+    def _resting(self, batch: int, fixed_positions: torch.Tensor | None) -> State:
+        """Returns the body at rest where its fixed vertices (1 or B, D, 3) are [m]."""
+        at_rest = self.simulator.rest_state(batch)
+        if fixed_positions is None:
+            return at_rest
+        carried = carried_rest(self.simulator.body, self.simulator.tensor(fixed_positions))
+        return replace(at_rest, q=carried.expand(batch, -1, -1))
+
+    def _moved(self, q: torch.Tensor, resting: torch.Tensor) -> torch.Tensor:
+        """Returns displacements (B, N, 3) from rest, without the mean one of a body that nothing holds [m]."""
+        moved = (q - resting).detach()
+        return moved if len(self.simulator.fixed) else moved - moved.mean(1, keepdim=True)
 
     def _advance(self, state: State, number: int, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """Returns the next state, and which environments (B,) failed."""
@@ -87,11 +102,8 @@ class CorrectedSimulator:
                 raise InputError(f"the force of step {number} is {in_short(predicted)}: it must be {wanted}.")
             failed = lost | ~torch.isfinite(predicted).flatten(1).all(1)
             force = torch.where(failed[:, None, None], 0.0, predicted)
-        if bool(failed.any()):  # Lost environments stand at rest, without inputs.
-            rest = self._rest[self.simulator.fixed]
+        if bool(failed.any()):  # Lost environments stand at rest on their bases, without inputs.
             idle = {name: torch.where(failed[:, None], 0.0, value) for name, value in inputs.actuation.items()}
-            if inputs.fixed_positions is not None:
-                idle["fixed_positions"] = torch.where(failed[:, None, None], rest, inputs.fixed_positions)
             inputs = inputs.replace(**idle)
         new = self.simulator.step(state, inputs.plus(force, acts_of(self._predict)), self._constants)
         return new, failed | ~new.converged

@@ -7,12 +7,13 @@ that falls, a header that is repeated, a strain that falls back at once, and str
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from ..io.arrays import Brief, FloatArray
+from ..io.arrays import BoolArray, Brief, FloatArray
 from ..io.errors import DataFileError, did_you_mean, listed, warn
 from ..io.text import Rows, number, read_rows, read_text
 from ..settings.data_kinds import TableSettings
@@ -109,9 +110,8 @@ def _meanings(
         bare = named[column] if name == "strain" and not unit else bare
     for pair in _PAIRS:
         if (present := [name for name in pair if name in names.values()]) != present[:1] or not present:
-            wanted = f"{', '.join(pair[:-1])} and {pair[-1]}"
             raise DataFileError(
-                f"{path} has {len(present)} of the columns {wanted}, of which a test has one. It has "
+                f"{path} has {len(present)} of the columns {' and '.join(pair[:2])}, of which a test has one. It has "
                 f"{listed([*named.values()])}: name them in its header, as in 'time [s], strain, stress [kPa]', or in "
                 "data.table."
             )
@@ -167,6 +167,8 @@ def _is_text(rows: Rows, column: int) -> bool:
 
 _MEMBRANE: Final = ("thickness", "contact_radius", "ring1_radius", "ring1_width", "ring2_radius", "ring2_width")
 _LIFTED: Final = ("height_mm", "pressure_Pa", "lifted_force_N")
+_DIGITS: Final = 3  # of a weight [N]
+_SCATTER: Final = 0.01  # of a weight that is measured
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,29 @@ class MembraneTable(Brief):
     height: FloatArray  # (N,) of the cap above its place at rest [m]
     pressure: FloatArray  # (N,) [Pa]
     force: FloatArray  # (N,) weight of the cap [N]
+
+    def weights(self) -> tuple[dict[str, tuple[float, BoolArray]], list[str]]:
+        """Returns weights [N] and rows (N,) by a name of their own, such as '14.7 N', and what was left out.
+
+        A measured force scatters: where values repeat in fewer than five rows, those within 1 % of the next are one.
+        """
+        force, notes = self.force.round(_DIGITS), list[str]()
+        values, number_of_row, counts = np.unique(force, return_inverse=True, return_counts=True)
+        if (counts < LEAST).any():
+            number_of_row = np.cumsum(np.append(False, np.diff(values) > _SCATTER * values[1:]))[number_of_row]
+            values = np.bincount(number_of_row, force) / np.bincount(number_of_row)
+            scatter = max(float(np.ptp(force[number_of_row == k])) for k in range(len(values)))
+            if scatter:
+                notes.append(f"Forces that differ by less than {100.0 * _SCATTER:g} % count as one weight.")
+        few = np.bincount(number_of_row)[number_of_row] < LEAST
+        if few.any():
+            notes.append(
+                left_out(int(few.sum()), len(few), f"under {force[few][0]:g} N, fewer than {LEAST} of a weight")
+            )
+        kept, digits = np.unique(number_of_row[~few]), 3
+        while len({f"{values[k]:.{digits}g}" for k in kept}) < len(kept):
+            digits += 1
+        return {f"{values[k]:.{digits}g} N": (float(values[k]), number_of_row == k) for k in kept}, notes
 
 
 def read_membrane(path: Path) -> MembraneTable:
@@ -237,7 +262,7 @@ def _header(rows: Rows, path: Path) -> tuple[int, dict[int, str]]:
     """
     starts = [line for line in range(1, len(rows)) if _has_numbers(rows[line]) and not _has_numbers(rows[line - 1])]
     found = list[tuple[bool, int, int, dict[int, str]]]()
-    for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
+    for start, stop in pairwise([*starts, len(rows)]):
         above = [line for line in range(start) if any(rows[line])][-2:]
         head, units = rows[above[-1]] if above else [], [""] * len(rows[start])
         if len(above) > 1 and all(cell.strip("[]()") in _ALL_UNITS for cell in head if cell):

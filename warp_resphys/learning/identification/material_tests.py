@@ -26,7 +26,7 @@ from ...energies.catalogue import LawContent, LawTest, TriedClass, law_content
 from ...energies.convex_material import ConvexMaterial
 from ...energies.isochoric import KINDS, TERMS, bulk_of, path_of, shear_modulus, stress, stress_columns
 from ...io.arrays import BoolArray, Brief, FloatArray
-from ...io.errors import InputError, listed, warn
+from ...io.errors import InputError, listed
 from .law import branches_of
 from .specimens import MaterialTest
 
@@ -171,9 +171,7 @@ def identify_from_tests(
             "them, or no branches."
         )
     for name, test in tests.items():
-        test.check_modulus(name)
-        for note in test.left_out:
-            warn(f"{name}: {note}")
+        test.check(name)
     groups = [chosen for size in range(_LARGEST_CLASS + 1) for chosen in combinations(terms, size)]
     lower = [test.lower for test in tests.values()]
     tried, classes = [search.fit(chosen, lower) for chosen in groups], list[TriedClass]()

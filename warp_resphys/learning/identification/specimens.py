@@ -23,7 +23,7 @@ from ...energies.contact.obstacle_contact import Contact
 from ...energies.isochoric import KINDS, TERMS, stress_columns
 from ...fem.bodies import Body
 from ...io.arrays import BoolArray, Brief, FloatArray, IntArray
-from ...io.errors import ConvergenceError, InputError, ResphysWarning, number_of
+from ...io.errors import ConvergenceError, InputError, ResphysWarning, number_of, warn
 from ...mesh.boxes import box_hexahedra
 from ...mesh.rod import rod
 from ...mesh.selection import select_vertices
@@ -344,12 +344,14 @@ class MaterialTest(Brief):
             return np.asarray(self.used & (self.seconds <= first + _LOWER * (last - first)))
         return np.asarray(self.used & (size <= low + _LOWER * (high - low)))
 
-    def check_modulus(self, name: str) -> None:
-        """Refuses a shear modulus that no elastomer has, of a test of a name.
+    def check(self, name: str) -> None:
+        """Refuses a shear modulus that no elastomer has, of a test of a name, and warns of samples that are left out.
 
         Raises:
             InputError: it is outside of `SHEAR_MODULI`.
         """
+        for note in self.left_out:
+            warn(f"{name}: {note}")
         if self.kind not in KINDS or (isinstance(self.specimen, Specimen) and self.specimen.indenter is not None):
             return
         unit = stress_columns(self.kind, self.strain[self.used], ("c10",))["c10"]  # of a shear modulus of 2 Pa
@@ -358,7 +360,9 @@ class MaterialTest(Brief):
         low, high = SHEAR_MODULI
         if 0.0 < modulus < low or modulus > high:
             size = f"{modulus:.2g} Pa" if modulus < low else f"{1e-6 * modulus:.2g} MPa"
-            than = f"softer than all gels ({low:g} Pa)" if modulus < low else f"harder than rubber ({1e-6 * high:g} MPa)"
+            than = (
+                f"softer than all gels ({low:g} Pa)" if modulus < low else f"harder than rubber ({1e-6 * high:g} MPa)"
+            )
             raise InputError(
                 f"{name} has a shear modulus of about {size}, {than}: check the units of its stress or force, of its "
                 "strain (a fraction, not per cent) and of the specimen (m, not mm)."

@@ -54,7 +54,7 @@ def _end(strain: FloatArray, stress: FloatArray) -> int:
     count, still = len(strain), _STILL * float(np.ptp(strain)) if len(strain) else 0.0
     highest_after = np.maximum.accumulate(np.abs(stress)[::-1])[::-1]
     before_it = np.maximum.accumulate(stress)
-    for first in np.flatnonzero(highest_after[1:] <= _BROKEN * before_it[:-1]) + 1:
+    for first in (np.flatnonzero(highest_after[1:] <= _BROKEN * before_it[:-1]) + 1).tolist():
         start = max(first - _FALL, 0)
         last = start + int(np.argmax(stress[start:first]))
         before = float(stress[last])

@@ -1,12 +1,14 @@
 """The law of a material from tests of specimens: stages and results."""
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from ..data.material_tables import read_membrane, read_test
+from ..data.material_checks import MeasuredTable, check_unit
+from ..data.material_tables import read_measured, read_membrane
 from ..energies.catalogue import LawContent, law_path, read_law
 from ..energies.isochoric import bulk_of, shear_modulus
 from ..io.arrays import BoolArray, FloatArray
@@ -27,19 +29,12 @@ from ..report.pages.material_page import (
     write_material_report,
 )
 from ..settings.run import RunSettings
-from ..settings.specimen import (
-    MaterialTestData,
-    MaterialTestSettings,
-    MembraneSettings,
-    SimulatedTests,
-    SpecimenSettings,
-)
+from ..settings.specimen import MaterialTestData, MaterialTestSettings, MembraneSettings, SimulatedTests
 from ..settings.stage_keys import StageSettings
 from .files import LAW_FILE, METRICS, REPORT
 
 RESULTS = "material_tests.json"
 _CURVE, _DOTS = 81, 400  # points of a curve, and of the measured samples, in figures
-_DIGITS = 3  # of the weights of a membrane's cap [N]
 _REACH = 2.0  # ratio of the largest strain that is predicted to the largest that the law is identified from
 
 
@@ -63,21 +58,50 @@ def table_files(data: MaterialTestData) -> dict[str, list[Path]]:
     """
     if data.folder is None:
         return {}
-    folder, named = Path(data.folder).expanduser(), {test.file for test in data.tests.values()}
-    found = {}
+    folder = Path(data.folder).expanduser()
+    single = {name: folder / str(test.file) for name, test in data.tests.items() if (folder / str(test.file)).is_file()}
+    named, found = {path.resolve() for path in single.values()}, dict[str, list[Path]]()
     for name, test in data.tests.items():
         pattern = str(test.file)
-        files = [path for path in sorted(folder.glob(pattern)) if path.name == pattern or path.name not in named]
-        if not files:
-            raise DataFileError(f"there is no file {folder / pattern}: set data.folder and data.tests.{name}.file.")
-        found[name] = files
+        try:
+            matches = [] if name in single else sorted(folder.glob(pattern))
+        except (ValueError, NotImplementedError, IndexError):  # no pattern: an absolute path, '.' or 'a**'
+            matches = []
+        files = [path for path in matches if path.is_file() and path.resolve() not in named]
+        if name not in single and not files:
+            what = "is a folder, not a file" if (folder / pattern).is_dir() else "is no file"
+            raise DataFileError(f"{folder / pattern} {what}: set data.folder and data.tests.{name}.file.")
+        found[name] = files or [single[name]]
     return found
+
+
+def test_names(data: MaterialTestData, tables: Mapping[str, Sequence[Path]]) -> dict[tuple[str, Path], str]:
+    """Returns a name of its own for each table: that of its test, or where a pattern finds several that of the file.
+
+    Files of one name are named with their folders, and files that differ by their extension with it.
+    """
+    places = [(name, path) for name, paths in tables.items() for path in paths]
+    folder = Path(data.folder or "").expanduser()
+    several = {name for name, path in places if path != folder / str(data.tests[name].file)}
+    within = {path: Path(os.path.relpath(path, folder)) for _, path in places}
+    forms: list[Callable[[str, Path], str]] = [
+        lambda _, path: path.stem,
+        lambda _, path: within[path].with_suffix("").as_posix(),
+        lambda _, path: within[path].as_posix(),
+        lambda name, path: f"{name}, {within[path].as_posix()}",
+    ]
+    names = dict[tuple[str, Path], str]()
+    for form in forms:
+        names = {(name, path): form(name, path) if name in several else name for name, path in places}
+        if len({*names.values()}) == len(places):
+            break
+    return names
 
 
 def tests_of(
     data: MaterialTestData, poissons_ratio: float, seed: int
-) -> tuple[dict[str, MaterialTest], dict[str, MaterialTest]]:
-    """Returns the tests that the law is identified from, and those held out, read or simulated.
+) -> tuple[dict[str, MaterialTest], dict[str, MaterialTest], list[str]]:
+    """Returns the tests that the law is identified from, those held out, read or simulated, and what was left out.
 
     The samples in ``data.range`` count. A table of several is a test by its name, one of a membrane a test by weight.
 
@@ -87,39 +111,45 @@ def tests_of(
         ConvergenceError: a simulated specimen has no equilibrium.
     """
     fitted, held, tables = dict[str, MaterialTest](), dict[str, MaterialTest](), table_files(data)
+    names, notes = test_names(data, tables), list[str]()
     for number, (name, wanted) in enumerate(data.tests.items()):
         found = held if wanted.held_out else fitted
         for path in tables.get(name, [None]):
-            called = path.stem if path is not None and path.name != wanted.file else name
+            called = name if path is None else names[name, path]
             with naming(f"data.tests.{name}: "):
                 if wanted.membrane is not None and path is not None:
-                    found |= _inflated(path, called, data, wanted.membrane, poissons_ratio)
-                elif wanted.specimen is not None:
+                    tests, said = _inflated(path, called, data, wanted.membrane, poissons_ratio)
+                    found |= tests
+                else:
                     random = np.random.default_rng((seed, number))
-                    found[called] = _deformed(path, called, data, wanted, wanted.specimen, poissons_ratio, random)
-    return fitted, held
+                    found[called], said = _deformed(path, called, data, wanted, poissons_ratio, random)
+            notes += [f"{called}: {note}" for note in said]
+    notes += [f"{name}: {note}" for name, test in (fitted | held).items() for note in test.left_out]
+    return fitted, held, notes
 
 
 def _inflated(
     path: Path, name: str, data: MaterialTestData, wanted: MembraneSettings, poissons_ratio: float
-) -> dict[str, MaterialTest]:
-    """Returns the tests of a membrane under each weight, with the samples in ``data.range``."""
+) -> tuple[dict[str, MaterialTest], list[str]]:
+    """Returns the tests of a membrane under each weight, with the samples in ``data.range``, and what was left out."""
     table, tests = read_membrane(path), dict[str, MaterialTest]()
     strain = table.height / wanted.radius
     within = _counted(strain, data, name)
-    for force in np.unique(table.force.round(_DIGITS)):
-        rows = within & (np.abs(table.force - force) < 10.0**-_DIGITS)
-        if rows.sum() < LEAST_SAMPLES:
+    weights, notes = table.weights()
+    for called, (force, rows) in weights.items():
+        chosen = within & rows
+        if chosen.sum() < LEAST_SAMPLES:
             raise InputError(
-                f"data.range leaves {rows.sum()} samples under {force:g} N: give heights that were measured."
+                f"data.range leaves {chosen.sum()} samples under {called}: give heights that were measured."
             )
         membrane = Membrane(
-            *(wanted.radius, table.thickness, table.cap, float(force), table.rings),
+            *(wanted.radius, table.thickness, table.cap, force, table.rings),
             ring_modulus=wanted.ring_modulus,
             poissons_ratio=poissons_ratio,
         )
-        tests[f"{name}, {force:.3g} N"] = MaterialTest("bulge", strain[rows], table.pressure[rows], specimen=membrane)
-    return tests
+        test = MaterialTest("bulge", strain[chosen], table.pressure[chosen], specimen=membrane)
+        tests[f"{name}, {called}"] = test
+    return tests, notes
 
 
 def _counted(strain: FloatArray, data: MaterialTestData, name: str) -> BoolArray:
@@ -136,40 +166,40 @@ def _deformed(
     name: str,
     data: MaterialTestData,
     wanted: MaterialTestSettings,
-    size: SpecimenSettings,
     poissons_ratio: float,
     random: np.random.Generator,
-) -> MaterialTest:
-    """Returns a test of a specimen, read or simulated."""
+) -> tuple[MaterialTest, list[str]]:
+    """Returns a test of a specimen, read or simulated, and what was left out of its table."""
+    size = wanted.specimen
+    assert size is not None
     specimen = Specimen(size.length, size.section, poissons_ratio, size.indenter, size.cells)
-    simulated = specimen if size.is_simulated else None
+    simulated, lines, notes = specimen if size.is_simulated else None, None, list[str]()
     if path is not None:
-        strain, stress, seconds = _recorded(path, data, specimen)
+        strain, stress, table = _recorded(path, data, specimen)
+        seconds, lines, notes = table.columns.get("time"), table.lines, [*table.notes]
     else:
         assert data.simulated is not None
         (strain, stress), seconds = _played(wanted.kind, specimen, simulated, data.simulated, random), None
     counted = _counted(strain, data, name)
-    return MaterialTest(
+    test = MaterialTest(
         *(wanted.kind, strain, stress, seconds),
-        zero=wanted.zero * float(np.abs(stress[counted]).max()),
         toe=wanted.toe,
         compliance=wanted.compliance * specimen.area / size.length,
         specimen=simulated,
         counted=counted,
+        lines=lines,
     )
+    return replace(test, zero=wanted.zero * float(np.abs(stress[test.used]).max())), notes
 
 
-def _recorded(
-    path: Path, data: MaterialTestData, specimen: Specimen
-) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Returns strains, stresses [Pa] and times [s] (N,) of a table, without times that repeat one."""
-    read = read_test(path, data.table)
+def _recorded(path: Path, data: MaterialTestData, specimen: Specimen) -> tuple[FloatArray, FloatArray, MeasuredTable]:
+    """Returns strains and stresses (N,) [Pa] of a specimen, and the table that they are read from."""
+    table = read_measured(path, data.table)
+    read = table.columns
     strain = read["strain"] if "strain" in read else read["displacement"] / specimen.length
     stress = read["stress"] if "stress" in read else read["force"] / specimen.area
-    if (seconds := read.get("time")) is None or not len(seconds):
-        return strain, stress, None
-    later = np.append(True, seconds[1:] > np.maximum.accumulate(seconds)[:-1])
-    return strain[later], stress[later], seconds[later]
+    check_unit(table, strain, stress, path)
+    return strain, stress, table
 
 
 def _played(
@@ -194,7 +224,7 @@ def identify_material(context: StageContext) -> None:
     settings: StageSettings = context.settings
     data, wanted, material = settings.data, settings.law, settings.simulation.values
     ratio, density = material["poissons_ratio"], material["density"]
-    tests, held = tests_of(data, ratio, settings.seed)
+    tests, held, notes = tests_of(data, ratio, settings.seed)
     known = None if wanted.file is None else read_law(wanted.file)
     unscaled, factor = None, None
     if data.scaled:
@@ -215,7 +245,8 @@ def identify_material(context: StageContext) -> None:
     content["data"], content["versions"] = {"name": settings.name, "trials": [*tests]}, dict(package_versions())
     write_json(context.run_dir / LAW_FILE, content)
     write_json(
-        context.run_dir / RESULTS, {"tests": results, "machines": law.machines, "rates": law.rates, "factor": factor}
+        context.run_dir / RESULTS,
+        {"tests": results, "machines": law.machines, "rates": law.rates, "factor": factor, "left_out": notes},
     )
 
 
@@ -225,7 +256,8 @@ def _result(name: str, test: MaterialTest, models: Mapping[str, MeasuredLaw], he
     size, machine = np.abs(test.strain), law.machines.get(name, {})
     high = float(size[test.used].max())
     reach = high * (_REACH if test.specimen is None else 1.0)
-    beyond, seen = (size > high) & (size <= reach), size <= reach
+    seen = test.valid & (size <= reach)
+    beyond = seen & (size > high)
     zero, taut = machine.get("zero", 0.0), test.taut(machine)
     slow = test.specimen is None and not law.is_viscous
     in_time = law.is_viscous and test.specimen is None  # curves at the times of the test

@@ -2,12 +2,16 @@
 
 Windows programs write Windows-1252 (Motive, Nexus) or UTF-16 (Excel's "Unicode text"); German and other versions of
 Excel separate cells by semicolons or tabs and write decimal commas.
+
+Thousands may be grouped: 1,012.5 or 1.012,5 or 1'012.5 or 1 012.5. A number such as 1,012 is 1012 or 1.012. Other
+numbers decide: those of its column, such as 0,5, else those of the whole table; where none does, it is refused.
 """
 
 import codecs
 import csv
 import io
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -27,8 +31,15 @@ _START: Final = 4096  # bytes that show UTF-16 without a mark: every second one 
 _NO_TEXT: Final = re.compile("[\0-\x08\x0e-\x19\x1b-\x1f]")
 _LAST: Final = 50  # lines at the end, which hold numbers, and show what separates cells
 _SEPARATOR: Final = re.compile(r'\A"?sep=.*', re.IGNORECASE)  # Excel's first line
-_DECIMAL_COMMA: Final = re.compile(r"[-+]?(?:\d{1,3}(?:\.\d{3})+|\d*),\d+(?:[eE][-+]?\d+)?")
-_DECIMAL_POINT: Final = re.compile(r"[-+]?\d*\.\d+(?:[eE][-+]?\d+)?")
+_GROUPED: Final = re.compile(r"(?<=\d)['\u2019\u00a0\u2007\u2009\u202f ](?=\d{3}(?!\d))")  # marks between thousands
+_BLANK_GROUPS: Final = re.compile(rf"[-+]?\d{{1,3}}(?:{_GROUPED.pattern}\d{{3}})+(?:[.,]\d*)?")
+_DOUBTFUL: Final = re.compile(r"[-+]?[1-9]\d{0,2}[.,]\d{3}")  # thousands, or three decimals
+_DECIMALS: Final = {  # numbers whose decimal mark is certain
+    ".": re.compile(r"[-+]?(?:\d*|\d{1,3}(?:,\d{3})+)\.\d+(?:[eE][-+]?\d+)?|[-+]?\d{1,3}(?:,\d{3}){2,}"),
+    ",": re.compile(r"[-+]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][-+]?\d+)?|[-+]?\d{1,3}(?:\.\d{3}){2,}"),
+}
+_OTHER: Final = {".": ",", ",": "."}
+_HUNDREDS: Final = re.compile(r"[-+]?[1-9]\d{2}")  # as below a thousand in a column without decimals
 
 
 def read_text(path: str | Path) -> str:
@@ -79,12 +90,13 @@ def _encodings(content: bytes) -> Sequence[str]:
 
 
 def read_rows(path: str | Path) -> Rows:
-    """Returns the cells of each line of a table, without blanks around them and with decimal points.
+    """Returns the cells of each line of a table, without blanks around them, decimal commas and grouped thousands.
 
     Tabs, semicolons, commas or blanks separate cells, whichever comes first in half of the last lines.
 
     Raises:
-        DataFileError: The file cannot be read, is not text, or is damaged.
+        DataFileError: The file cannot be read, is not text, is damaged, or has a number such as 1,012 that may be 1012
+            or 1.012.
     """
     text = _SEPARATOR.sub("", read_text(path))
     lines = text.split("\n")
@@ -92,20 +104,63 @@ def read_rows(path: str | Path) -> Rows:
     common = (mark for mark in "\t;," if 2 * sum(mark in line for line in last) > len(last))
     delimiter = next(common, None)
     if delimiter is None:
-        return [line.lstrip("#").split() for line in lines]
+        return _with_points([re.findall(r"[^ \t\f\v]+", line.lstrip("#")) for line in lines], path)
     try:
         rows = [*csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True)]
     except csv.Error as error:
         raise DataFileError(f"{path} is no table ({error}): export it as CSV or TSV again.") from error
     rows = [[cell.strip() for cell in row] for row in rows]
-    # A comma in a cell between commas groups thousands if other numbers have a decimal point.
-    if delimiter == "," and any(_DECIMAL_POINT.fullmatch(cell) for row in rows for cell in row):
+    if _GROUPED.search(text):
+        rows = [[_GROUPED.sub("", cell) if _BLANK_GROUPS.fullmatch(cell) else cell for cell in row] for row in rows]
+    return _with_points(rows, path)
+
+
+def _with_points(rows: Rows, path: str | Path) -> Rows:
+    """Returns cells whose numbers have a decimal point and no marks between thousands."""
+    marks = defaultdict[int, set[str]](set)  # certain decimal marks by column
+    for row in rows:
+        for column, cell in enumerate(row):
+            seen = marks[column]
+            if ("." in cell and "." not in seen) or ("," in cell and "," not in seen):
+                mark = _certain(cell)
+                if mark is not None and _has_numbers(row):
+                    seen.add(mark)
+    everywhere = set[str]().union(*marks.values())
+    bare = {column for row in rows for column, cell in enumerate(row) if not everywhere and _HUNDREDS.fullmatch(cell)}
+    if "," not in everywhere and not bare and not any("," in cell for row in rows for cell in row):
         return rows
-    return [[_with_point(cell) if "," in cell else cell for cell in row] for row in rows]
+    result = list[list[str]]()
+    for line, row in enumerate(rows, start=1):
+        cells = list(row)
+        for column, cell in enumerate(row):
+            known = marks[column] or everywhere
+            if "," in cell or ("." in cell and ("," in known or column in bare)):
+                mark = _certain(cell)
+                if mark is None and _DOUBTFUL.fullmatch(cell) and _has_numbers(row):
+                    if len(known) != 1:
+                        whole, point = re.sub("[.,]", "", cell), cell.replace(",", ".")
+                        raise DataFileError(
+                            f"{path}, line {line}, column {column + 1}: '{cell}' is {whole} or {point}, and no other "
+                            f"number tells which: write {whole} without a mark between thousands, or {point}0, with a "
+                            "decimal point."
+                        )
+                    (mark,) = known
+                if mark is not None:
+                    cells[column] = cell.replace(_OTHER[mark], "").replace(",", ".")
+        result.append(cells)
+    return result
 
 
-def _with_point(cell: str) -> str:
-    return cell.replace(".", "").replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell
+def _certain(cell: str) -> str | None:
+    """Returns the decimal mark of a number, None where it is no number or may have grouped thousands instead."""
+    if _DOUBTFUL.fullmatch(cell):
+        return None
+    return next((mark for mark, form in _DECIMALS.items() if form.fullmatch(cell)), None)
+
+
+def _has_numbers(row: Sequence[str]) -> bool:
+    """Whether a line has two numbers or more, unlike one of a key and its value."""
+    return sum(cell.lstrip("+-.,")[:1].isdecimal() for cell in row) > 1
 
 
 def number(cell: str) -> float | None:

@@ -1,12 +1,14 @@
 """Settings of tests of specimens, from which the law of a material is identified."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from ..io.settings import Natural, NotNegative, Pair, Positive, Settings, Word, setting
 from .data_kinds import TableSettings
 from .performed import WithoutMotion, rising
+
+_LARGEST: Final = 1.0  # size of a specimen [m]; larger ones are in mm
 
 
 class SpecimenSettings(Settings):
@@ -27,6 +29,9 @@ class SpecimenSettings(Settings):
         box = (self.width is not None, self.thickness is not None)
         if box not in ((True, True), (False, False)) or box[0] == (self.diameter is not None):
             raise ValueError("diameter, or width and thickness: give one of them, in m.")
+        for name in ("length", "width", "thickness", "diameter", "indenter"):
+            if (size := getattr(self, name)) is not None and size > _LARGEST:
+                raise ValueError(f"{name} is {size:g} m: sizes are in m, write {1e-3 * size:g} for {size:g} mm.")
         return self
 
     @property
@@ -43,7 +48,7 @@ class SpecimenSettings(Settings):
 class MembraneSettings(Settings):
     """An inflated membrane; the head of its table has its thickness, cap and rings."""
 
-    radius: Positive = setting(description="of the disc within its clamp", unit="m")
+    radius: Annotated[Positive, Field(le=1.0)] = setting(description="of the disc within its clamp", unit="m")
     ring_modulus: Positive = setting(1.0e6, "shear modulus of its stiff rings", "Pa")
 
 

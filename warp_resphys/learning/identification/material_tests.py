@@ -154,7 +154,7 @@ def identify_from_tests(
             standard deviation (``shear_deviation``, or 5 %), and its viscosity and branches are part of the law.
 
     Raises:
-        InputError: no test, or branches without times.
+        InputError: no test, branches without times, or a shear modulus that no elastomer has.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
     if not tests:
@@ -170,6 +170,8 @@ def identify_from_tests(
             f"{listed(late or [*tests])}: times of a homogeneous test are missing, which relaxing branches need: give "
             "them, or no branches."
         )
+    for name, test in tests.items():
+        test.check(name)
     groups = [chosen for size in range(_LARGEST_CLASS + 1) for chosen in combinations(terms, size)]
     lower = [test.lower for test in tests.values()]
     tried, classes = [search.fit(chosen, lower) for chosen in groups], list[TriedClass]()

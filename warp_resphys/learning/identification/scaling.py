@@ -37,7 +37,8 @@ def scale_to_tests(
         poissons_ratio: of the material at small strains.
 
     Raises:
-        InputError: no test, a test with constants of a machine, or a law with branches or without elastic terms.
+        InputError: no test, a test with constants of a machine or with a shear modulus that no elastomer has, or a law
+            with branches or without elastic terms.
         ConvergenceError: a simulated specimen has no equilibrium.
     """
     law = {name: value for name, value in known["parameters"].items() if TERMS.fullmatch(name) and value}
@@ -47,6 +48,8 @@ def scale_to_tests(
         raise InputError("a law to be scaled has elastic terms alone, such as c10: take one without branches.")
     if machines := [name for name, test in tests.items() if test.deviations]:
         raise InputError(f"{machines[0]} has an unknown machine: set its zero, toe and compliance to 0 to scale a law.")
+    for name, test in tests.items():
+        test.check(name)
 
     def columns(x: float) -> dict[str, float]:
         scaled = {name: value * math.exp(x) for name, value in law.items()}

@@ -23,7 +23,7 @@ from ...energies.contact.obstacle_contact import Contact
 from ...energies.isochoric import KINDS, TERMS, stress_columns
 from ...fem.bodies import Body
 from ...io.arrays import BoolArray, Brief, FloatArray, IntArray
-from ...io.errors import ConvergenceError, InputError, ResphysWarning
+from ...io.errors import ConvergenceError, InputError, ResphysWarning, number_of, warn
 from ...mesh.boxes import box_hexahedra
 from ...mesh.rod import rod
 from ...mesh.selection import select_vertices
@@ -31,9 +31,12 @@ from ...mesh.volume_mesh import Mesh
 from ...settings.contact import Sphere
 from ...stepping.inputs import Inputs
 from .membranes import Membrane
+from .stray_samples import strays
 
 LEAST_SAMPLES: Final = 5  # of a test
 LARGEST_STRAIN: Final = 20.0  # of a silicone; larger ones are in per cent
+LARGEST_SIZE: Final = 1.0  # of a specimen [m]; larger ones are in mm
+SHEAR_MODULI: Final = (100.0, 1e8)  # of elastomers, from brush-like ones to rubber of Shore A 95 [Pa]
 NUISANCES: Final = ("zero", "toe", "compliance")
 _LEAST: Final = 0.02  # of the largest stress, below which errors are not relative to the stress
 _LOWER: Final = 0.6  # share of the range of strains from which classes are fitted to predict the rest
@@ -89,6 +92,8 @@ class Specimen(Brief):
         for name, size in sizes.items():
             if not (math.isfinite(size) and size > 0.0):
                 raise InputError(f"{name} of a specimen is {size:g}: give a positive length, in m.")
+            if name != "indenter" and size > LARGEST_SIZE:
+                raise InputError(f"{name} of a specimen is {size:g} m: give it in m, {1e-3 * size:g} for {size:g} mm.")
         if self.indenter is not None and len(self.section) == 1:
             raise InputError("an indenter presses on a block: give its width and thickness.")
 
@@ -233,7 +238,8 @@ class MaterialTest(Brief):
         compliance: that of the machine's displacement over the length of the specimen, by stress [1/Pa].
         specimen: simulated where the deformation is not homogeneous: between glued ends, under an indenter, or of a
             membrane under the weight of its cap.
-        counted: (N,) samples that a law is identified from; None: all. The others are its history.
+        counted: (N,) samples that a law is identified from; None: all but `strays`. The others are its history.
+        lines: (N,) of the samples in their file, for messages; None: they are counted from 1.
 
     Raises:
         InputError: an unknown kind; arrays that do not fit, are not finite, or have less than five samples that count;
@@ -249,6 +255,7 @@ class MaterialTest(Brief):
     compliance: float = 0.0
     specimen: Specimen | Membrane | None = None
     counted: BoolArray | None = None
+    lines: IntArray | None = None
 
     def __post_init__(self) -> None:
         """Checks the samples."""
@@ -291,7 +298,30 @@ class MaterialTest(Brief):
     @property
     def used(self) -> BoolArray:
         """(N,) samples that a law is identified from."""
-        return np.ones(len(self.strain), bool) if self.counted is None else np.asarray(self.counted)
+        return self.valid if self.counted is None else np.asarray(self.counted & self.valid)
+
+    @property
+    def valid(self) -> BoolArray:
+        """(N,) samples of the specimen, without `strays`."""
+        return ~np.logical_or.reduce([np.zeros(len(self.strain), bool), *self.strays.values()])
+
+    @cached_property
+    def strays(self) -> dict[str, BoolArray]:
+        """(N,) samples in dropouts and after a break, by a few words on them; see `stray_samples`."""
+        return strays(self.strain, self.stress)
+
+    @property
+    def left_out(self) -> list[str]:
+        """Sentences on `strays`."""
+        said = list[str]()
+        for words, rows in self.strays.items():
+            at, count = np.flatnonzero(rows), int(rows.sum())
+            named = f"sample {at[0] + 1}" if self.lines is None else f"line {self.lines[at[0]]}"
+            which = f"{named}, strain {self.strain[at[0]]:.3g}, stress {1e-3 * self.stress[at[0]]:.3g} kPa"
+            more = f", and {number_of(count - 1, 'other')}" if count > 1 else ""
+            total = number_of(len(rows), "sample")
+            said.append(f"{count} of {total} left out, {words}: {which}{more}.")
+        return said
 
     @property
     def weights(self) -> FloatArray:
@@ -313,6 +343,30 @@ class MaterialTest(Brief):
             first, last = self.seconds[self.used][[0, -1]]
             return np.asarray(self.used & (self.seconds <= first + _LOWER * (last - first)))
         return np.asarray(self.used & (size <= low + _LOWER * (high - low)))
+
+    def check(self, name: str) -> None:
+        """Refuses a shear modulus that no elastomer has, of a test of a name, and warns of samples that are left out.
+
+        Raises:
+            InputError: it is outside of `SHEAR_MODULI`.
+        """
+        for note in self.left_out:
+            warn(f"{name}: {note}")
+        if self.kind not in KINDS or (isinstance(self.specimen, Specimen) and self.specimen.indenter is not None):
+            return
+        unit = stress_columns(self.kind, self.strain[self.used], ("c10",))["c10"]  # of a shear modulus of 2 Pa
+        loaded = unit > 0.0
+        modulus = 2.0 * abs(float(np.median(self.stress[self.used][loaded] / unit[loaded]))) if loaded.any() else 0.0
+        low, high = SHEAR_MODULI
+        if 0.0 < modulus < low or modulus > high:
+            size = f"{modulus:.2g} Pa" if modulus < low else f"{1e-6 * modulus:.2g} MPa"
+            than = (
+                f"softer than all gels ({low:g} Pa)" if modulus < low else f"harder than rubber ({1e-6 * high:g} MPa)"
+            )
+            raise InputError(
+                f"{name} has a shear modulus of about {size}, {than}: check the units of its stress or force, of its "
+                "strain (a fraction, not per cent) and of the specimen (m, not mm)."
+            )
 
     def taut(self, machine: Machine) -> FloatArray:
         """Returns the strains (N,) of the specimen, by the constants of the machine."""

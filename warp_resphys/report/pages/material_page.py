@@ -44,6 +44,7 @@ class MaterialMetrics(Usage, total=False):
     machines: dict[str, dict[str, float]]  # constants of the machines by test
     rates: list[float] | None  # least and largest rate of strain [1/s]
     factor: float | None  # of the law that was scaled
+    left_out: list[str]  # sentences on what was left out of the tests
     parameters: Mapping[str, float]
 
 
@@ -74,8 +75,9 @@ def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings
     branches = sum(name.startswith("prony_time") for name in law["parameters"])
     terms = [within_sentence(wording(name)[0][0]) for name in names]
     words = in_a_row([*terms, *([f"{branches} relaxing branch{'es' * (branches > 1)}"] if branches else [])])
+    notes = metrics.get("left_out", [])
     if (factor := metrics.get("factor")) is not None:
-        return _scaled_verdict(metrics, factor)
+        return [*_scaled_verdict(metrics, factor), *notes]
     shown = {part: _mean(metrics, part) for part in _PARTS}
     part = "beyond" if shown["beyond"]["law"] is not None else "range"
     errors = {model: value for model, value in shown[part].items() if value is not None}
@@ -91,7 +93,7 @@ def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings
         true, found = played.material, law["parameters"]
         off = [f"{name} {100.0 * (found.get(name, 0.0) / x - 1.0):+.2f} %" for name, x in true.items() if x]
         said.append(f"Errors of the coefficients, which are known here: {in_a_row(off)}.")
-    return said
+    return [*said, *notes]
 
 
 def _scaled_verdict(metrics: MaterialMetrics, factor: float) -> list[str]:

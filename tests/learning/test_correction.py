@@ -11,6 +11,7 @@ from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, Sta
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
 from warp_resphys.learning.residuals import correction
+from warp_resphys.learning.residuals.feedback import equilibrium_under_feedback
 from warp_resphys.learning.residuals.networks import NextState, ResidualForce, build_model
 from warp_resphys.learning.residuals.training import Samples, Trainer
 from warp_resphys.settings.learning import NetworkSettings, TrainerSettings
@@ -184,7 +185,7 @@ def at_rest(*stiffnesses):
         return k * (s.rest_positions - state.q)
 
     guess = s.rest_state(len(stiffnesses))
-    return s, correction.equilibrium_under_feedback(s, Inputs(), s.prepare(), guess, force), force
+    return s, equilibrium_under_feedback(s, Inputs(), s.prepare(), guess, force), force
 
 
 @pytest.mark.parametrize("stiffnesses", [(0.0,), (0.0, 1.0, 30.0), (-0.5, 5.0)])
@@ -211,7 +212,7 @@ def test_a_force_that_turns_round_has_no_equilibrium():
         return push
 
     with pytest.raises(ConvergenceError) as caught:
-        correction.equilibrium_under_feedback(s, Inputs(), s.prepare(), s.rest_state(), force)
+        equilibrium_under_feedback(s, Inputs(), s.prepare(), s.rest_state(), force)
     assert caught.value.report.tolist() == [False]
 
 

@@ -19,7 +19,8 @@ from ..stepping.inputs import Inputs
 from ..stepping.state import State
 from .evaluation import TrialRollout, evaluate
 from .observed_motions import Identified, ObservedMotions
-from .residuals.correction import Learned, equilibrium_under_feedback
+from .residuals.correction import Learned
+from .residuals.feedback import equilibrium_under_feedback
 from .trial_batch import TrialBatch
 
 _MOST_TRIALS: Final = 8  # in which equilibria are sought

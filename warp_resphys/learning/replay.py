@@ -24,7 +24,8 @@ from ..stepping.inputs import Inputs
 from ..stepping.rollout import on_steps, rollout, sample, states
 from ..stepping.state import State
 from .parameters import HUNG, MASS_FACTOR, check_names, constants_of, identifiable_parameters, split_name
-from .residuals.correction import acts_of, equilibrium_under_feedback
+from .residuals.correction import acts_of
+from .residuals.feedback import equilibrium_under_feedback
 from .sensing import readings
 from .start import Start
 from .trial_batch import TrialBatch

@@ -19,7 +19,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
 from ..experiment.experiment import SIMFREE, Experiment, network_of
-from ..experiment.files import COMPARE, ERRORS, fold_folder, read_if_there
+from ..experiment.files import COMPARE, ERRORS, METRICS, fold_folder, read_if_there
 from ..io.arrays import FloatArray
 from ..io.classes import check_packages
 from ..io.errors import DataFileError, InputError, listed, number_of
@@ -54,9 +54,10 @@ _NEEDED: Final = {
 }
 _NETWORK: Final = "network."
 _REGION: Final = "region."
+FORCES: Final = ("resphys", "resphys_uncorrected")  # models with a learned force
 _PLAIN: Final = (  # fields that are written unchanged
     *("name", "model", "settings", "material", "parameters", "payload_at", "markers", "labels", "sets"),
-    *("placement", "filters", "sees_payload", "told_of_base", "seen", "level", "errors_mm"),
+    *("placement", "filters", "sees_payload", "told_of_base", "seen", "level", "errors_mm", "recommended"),
 )
 
 _SETTINGS: Final[Mapping[str, type[Settings]]] = {
@@ -98,6 +99,7 @@ class Description:
     intervals: Intervals | None = None  # half-widths of the markers' prediction intervals, at `level`
     level: float = LEVEL  # nominal coverage of the intervals
     errors_mm: ErrorSummary | None = None  # of the model in the test trials
+    recommended: str | None = None  # model that the report of its run recommends; None if it is not known
     built: Simulator | None = None  # a simulator of Python, in place of settings and material
     observation: Observation | None = None  # what is observed of it, in place of `markers` and `bound`
 
@@ -192,7 +194,10 @@ class Description:
         counts = {"marker": len(owners(self.labels)) - bodies, "rigid body": bodies}
         seen = " and ".join(number_of(count, what) for what, count in counts.items() if count) or "no markers"
         vertices = f"{len(self.mesh.vertices)} vertices"
-        lines = [f"Robot {self.name}, {self.model}: {vertices}, {seen}, steps of {1e3 * time_step:g} ms", *inputs]
+        advice = "" if self.recommended is None else f" (the report recommends {self.recommended})"
+        advice = " (recommended)" if self.recommended == self.model else advice
+        body = f"{vertices}, {seen}, steps of {1e3 * time_step:g} ms"
+        lines = [f"Robot {self.name}, {self.model}{advice}: {body}", *inputs]
         lines += [f"  identified {name}: {value:.6g}" for name, value in self.parameters.items()]
         if self.errors_mm is not None and self.errors_mm["mean"] is not None:
             lines.append(f"  mean error in the test trials: {self.errors_mm['mean']:.3g} mm")
@@ -304,12 +309,12 @@ def _settings_of(record: Mapping[str, Any]) -> StageSettings:
     return parse(StageSettings, {**settings, "reads": [*settings["reads"], "reconstruction"]})
 
 
-def describe(folder: Path, model: str) -> Description:
+def describe(folder: Path, model: str | None = None) -> Description:
     """Returns the description of a robot of a finished run.
 
     Args:
         folder: of the run, or of one of its folds.
-        model: one of those that the experiment compares.
+        model: one of those that the experiment compares; None: the one that its report recommends.
 
     Raises:
         DataFileError: the run is missing, unfinished or changed, or it is a cross-validation.
@@ -317,8 +322,11 @@ def describe(folder: Path, model: str) -> Description:
         MeshError: the file with its mesh is missing.
     """
     experiment = finished_experiment(folder, model)
-    settings = experiment.settings
-    models = experiment.models
+    settings, metrics = experiment.settings, read_if_there(folder / METRICS)
+    models, advised = experiment.models, metrics.get("recommended") or None
+    model = advised if model is None else model
+    if model is None:
+        raise DataFileError(f"{folder} recommends no model: name one of {listed(models)}, or run its command again.")
     if model not in models:
         raise InputError(f"the model is {model!r}: {folder} has {listed(models)}.")
     kind, _ = experiment.sources(model)
@@ -328,11 +336,14 @@ def describe(folder: Path, model: str) -> Description:
     errors: ErrorTables = read_if_there(folder / ERRORS)
     calibrated = errors["intervals"]["models"].get(model, {}) if "intervals" in errors else {}
     learned, actuation = experiment.learned(model), settings.actuation
+    if learned is None and model in FORCES and experiment.has_forces:
+        log.warning("%s: the force of %s was learned and is not used; its report says why", folder, model)
     base = None if learned is None else experiment.motions.base_movement_mask(simulator)
     moved = trials.contact_at(trials.names, simulator.body, trials.time_step)
     return Description(
         name="/".join(folder.resolve().parts[-2:]),
         model=model,
+        recommended=advised,
         settings=experiment.settings_of(kind),
         material=experiment.material_of(kind),
         mesh=simulator.body.mesh,

@@ -28,9 +28,9 @@ def load(path: str | Path, model: str | None = None, device: str = "cpu", on_fai
 
     Args:
         path: of the run folder, such as ``runs/sopra/default``, of one of its folds, or of the file.
-        model: ``resphys`` (default), the identified simulator with its learned force; ``actuator``, with its learned
-            actuator alone; ``sysid``, the identified simulator; ``simulation``, the uncorrected one; ``simfree``, a
-            network alone. A file contains one model.
+        model: ``resphys``, the identified simulator with its learned force; ``actuator``, with its learned actuator
+            alone; ``sysid``, the identified simulator; ``simulation``, the uncorrected one; ``simfree``, a network
+            alone. None: the one that the report of the run recommends. A file contains one model.
         device: of the simulation: ``cpu``, ``cuda`` or ``auto``.
         on_failure: ``raise``, or ``count``, see `Robot`.
 
@@ -52,7 +52,7 @@ def load(path: str | Path, model: str | None = None, device: str = "cpu", on_fai
         return Robot(description, where, on_failure)
     if not place.is_dir():
         raise DataFileError(f"{place} does not exist: name a run folder, or a file that `Robot.save` wrote.")
-    return Robot(describe(place, model or "resphys"), where, on_failure, folder=place)
+    return Robot(describe(place, model), where, on_failure, folder=place)
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,8 @@ from ..io.errors import ConvergenceError, InputError
 from ..learning.evaluation import POSE_STEPS
 from ..learning.observed_motions import Identified
 from ..learning.parameters import TILTS, check_names, constants_of, identifiable_parameters, replaced
-from ..learning.residuals.correction import (
-    DIVERGENCE_DISTANCE,
-    CorrectedSimulator,
-    LearnedPredictor,
-    equilibrium_under_feedback,
-    force_frames,
-)
+from ..learning.residuals.correction import DIVERGENCE_DISTANCE, CorrectedSimulator, LearnedPredictor, force_frames
+from ..learning.residuals.feedback import equilibrium_under_feedback
 from ..learning.residuals.networks import NextState
 from ..mesh.volume_mesh import Mesh
 from ..stepping.adjoints import refuse_transforms

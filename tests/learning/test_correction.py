@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from support.slopes import check_slopes
 from warp_resphys import Body, Corotated, Inputs, Simulator, SolverSettings, State, box_hexahedra, select_vertices
 from warp_resphys.io.errors import ConvergenceError, InputError
 from warp_resphys.io.safe_files import read_checkpoint, write_checkpoint
@@ -199,6 +200,24 @@ def test_the_force_and_the_weight_are_in_balance(stiffnesses):
     free = at_rest(0.0)[1].q
     if 0.0 in stiffnesses:
         torch.testing.assert_close(state.q[:1], free, rtol=0.0, atol=1e-9)
+
+
+def test_an_equilibrium_is_found_where_its_iteration_would_grow_and_has_gradients():
+    """A spring at the tip, 40 times as stiff as the beam: each equilibrium overshoots the one before."""
+    s, *_ = at_rest(0.0)
+
+    def tip(values):
+        def force(state, number=0):
+            pull = torch.zeros_like(state.q)
+            pull[:, TIP] = values["stiffness"] * (s.rest_positions[TIP] - state.q[:, TIP])
+            return pull
+
+        constants = s.prepare({"youngs_modulus": values["youngs_modulus"]})
+        at = equilibrium_under_feedback(s, Inputs(), constants, s.rest_state(), force)
+        return at.q[:, TIP, 2].mean() * 1e3 + at.reaction.moment().square().sum()
+
+    values = {"stiffness": torch.tensor(100.0).double(), "youngs_modulus": torch.tensor([[1e5]]).double()}
+    check_slopes(tip, values, {"stiffness": 3.0, "youngs_modulus": 3e3}, tolerance=1e-4)
 
 
 def test_a_force_that_turns_round_has_no_equilibrium():

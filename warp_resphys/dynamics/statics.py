@@ -27,6 +27,7 @@ SHIFT = 1e-6  # m, along every axis, against which friction acts that is to hold
 _HELD_BY = 3  # vertices with friction, against all displacements and turns
 _MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
 _REMEDY = "the equilibrium does not settle: lower the friction, the tension or the internal forces"
+_EXACT = 1e-12  # relative tolerance of an equilibrium, whose reactions balance its loads as exactly
 _LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
 
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]
@@ -98,6 +99,8 @@ class StaticEquilibrium(TimeStep):
         equations, workspace = self.equations, self.workspace
         most = min(equations.settings.max_iterations, _MOST_ITERATIONS)
         settings = equations.settings.changed(name="newton", on_failure="raise", max_iterations=most)
+        if equations.rest_positions.dtype == torch.float64:  # Newton's method gets there in about one iteration more.
+            settings = settings.changed(relative_tolerance=min(settings.relative_tolerance, _EXACT))
         terms, fixed = self.terms(share, near=near), self.fixed_positions(share)
         with _progress_of(workspace.parts[0][1].potential, share, most):
             x, report, self._gradient = equilibrium(workspace, "statics", settings, terms, start, fixed)

@@ -91,7 +91,8 @@ class Acceptance:
         except ConvergenceError as error:
             rests = error.report.tolist() if isinstance(error.report, torch.Tensor) else [False] * below.batch
             named = [name for name, there in zip(run.replay.trials.names, rests, strict=True) if not there]
-            yield f"{where} ({listed(named)}) the robot has no equilibrium with it"
+            of_some = f" ({listed(named)})" if any(rests) else ""
+            yield f"{where}{of_some} the robot has no equilibrium with it"
             return
         assert state is not None
         with_it, without = (self._distance_mm(run, one, observed) for one in (state, below))

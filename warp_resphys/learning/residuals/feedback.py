@@ -4,21 +4,26 @@ They are fixed points of equilibria under constant forces, which Anderson's acce
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from ...dynamics.simulator import Constants, Simulator
+from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError
 from ...stepping.inputs import Inputs
 from ...stepping.state import State
 from .correction import acts_of
 
 _ITERATIONS = 50
-_TOLERANCE = 1e-8  # m
+_TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-8}  # m
 _PATIENCE = 20  # iterations without progress, after which the search ends
 _MEMORY = 6  # iterations that are combined
 _RIDGE = 1e-12
+_MOST_STEPS = 500  # of a motion after which a body must rest
+_SETTLED = 1e-9  # relative residual of a gradient
 
 
 def equilibrium_under_feedback(
@@ -27,8 +32,10 @@ def equilibrium_under_feedback(
     """Returns the state of rest under constant inputs and a force (B, N, 3) [N] that depends on the state.
 
     It is the fixed point of equilibria under constant forces. Each iteration evaluates the force, solves the
-    equilibrium under it and accelerates the sequence of positions. It ends when no position moves by more than 1e-8 m,
-    or at once where the force does not depend on the positions.
+    equilibrium under it and accelerates the sequence of positions. It ends when no position moves by more than 1e-9 m,
+    in single precision 1e-8 m, or at once where the force does not depend on the positions. Where the iteration stalls,
+    the body first moves until it rests. For a loss with the gradient w by the fixed point x = S(x), that by what S
+    depends on besides x is that of S for g = w + (dS/dx)^T g.
 
     Args:
         simulator: of the body.
@@ -38,35 +45,102 @@ def equilibrium_under_feedback(
         predict: predictor of the force, called with step zero.
 
     Raises:
-        ConvergenceError: there is no equilibrium, or the iteration does not converge; its report says which
-            environments converged, (B,).
+        ConvergenceError: there is no equilibrium, or none is found; the report says which environments rest, (B,).
     """
-    acts, acceleration, stalled = acts_of(predict), _AndersonAcceleration(), 0
-    state = solution = guess
-    current: torch.Tensor | None = None
-    smallest: torch.Tensor | None = None
-    for number in range(_ITERATIONS):
-        previous, current = current, predict(state, 0)
-        if previous is not None and torch.equal(current, previous) and torch.equal(predict(solution, 0), current):
-            return solution
-        solution = simulator.static_equilibrium(inputs.plus(current, acts), constants, start=state.q.detach())
-        change = solution.q - state.q
-        size = change.detach().abs().amax((1, 2))
-        done = size < _TOLERANCE
-        if bool(done.all()):
-            return solution
-        better = smallest is None or bool(((size < smallest) & ~done).any())
-        smallest = size if smallest is None else torch.minimum(size, smallest)
-        stalled = 0 if better else stalled + 1
-        if stalled == _PATIENCE or number == _ITERATIONS - 1:
-            break
-        state = State(torch.where(done[:, None, None], solution.q, acceleration.next(state.q, change)), state.v)
-    assert smallest is not None
-    raise ConvergenceError(
-        "a pose and the force that depends on it did not settle: the force is too large to be a correction.",
-        solution.q,
-        smallest < _TOLERANCE,
-    )
+    problem = _Feedback(simulator, inputs, constants, predict)
+    with torch.no_grad():
+        found, rests = problem.iterate(guess)
+        if not bool(rests.all()):
+            found, rests = problem.iterate(problem.relaxed(found))
+    if not bool(rests.all()):
+        count = f"{int((~rests).sum())} of {len(rests)} poses"
+        raise ConvergenceError(
+            f"{count} and the force that depends on them did not settle: the force is too large to be a correction.",
+            found.q,
+            rests,
+        )
+    if not torch.is_grad_enabled():
+        return found
+    near = found.q.clone().requires_grad_()
+    solution, again = problem.solve(found.detach()), problem.solve(State(near, found.v)).q
+    if not solution.q.requires_grad or not again.requires_grad:
+        return solution
+
+    def through(gradient: torch.Tensor) -> torch.Tensor:
+        return problem.adjoint(gradient, near, again)
+
+    solution.q.register_hook(through)
+    return problem.solve(State(solution.q, found.v))
+
+
+class _Feedback:
+    """Equilibria under forces of given states (arguments: `equilibrium_under_feedback`)."""
+
+    def __init__(
+        self, simulator: Simulator, inputs: Inputs, constants: Constants, predict: Callable[[State, int], Any]
+    ) -> None:
+        self._simulator, self._inputs, self._constants = simulator, inputs, constants
+        self._predict, self._acts = predict, acts_of(predict)
+        self._tolerance = _TOLERANCES[simulator.dtype]
+
+    def solve(self, state: State) -> State:
+        """Returns the equilibrium under the force in a state."""
+        return self._under(self._predict(state, 0), state)
+
+    def _under(self, force: torch.Tensor, state: State) -> State:
+        acting = self._inputs.plus(force, self._acts)
+        return self._simulator.static_equilibrium(acting, self._constants, start=state.q.detach())
+
+    def iterate(self, state: State) -> tuple[State, torch.Tensor]:
+        """Returns the equilibria that changed least in the iteration, and (B,) bool, which environments rest there."""
+        acceleration, stalled = _AndersonAcceleration(), 0
+        best = solution = state
+        smallest = state.q.new_full((state.batch,), torch.inf)
+        current: torch.Tensor | None = None
+        for _ in range(_ITERATIONS):
+            previous, current = current, self._predict(state, 0)
+            constant = previous is not None and torch.equal(current, previous)
+            if constant and torch.equal(self._predict(solution, 0), current):
+                return solution, torch.ones_like(smallest, dtype=torch.bool)
+            solution = self._under(current, state)
+            change = solution.q - state.q
+            size = change.abs().amax((1, 2))
+            closer = size < smallest
+            best, smallest = solution.where(closer, best), torch.minimum(size, smallest)
+            stalled = 0 if bool((closer & (size >= self._tolerance)).any()) else stalled + 1
+            if bool((smallest < self._tolerance).all()) or stalled == _PATIENCE:
+                break
+            state = State(acceleration.next(state.q, change), state.v)
+        return best, smallest < self._tolerance
+
+    def relaxed(self, state: State) -> State:
+        """Returns the state in which the body rests after moving under the force, or the last one."""
+        moving = replace(self._simulator, integrator="implicit_euler")
+        state = State(state.q, torch.zeros_like(state.q))
+        for number in range(_MOST_STEPS):
+            before, force = state.q, self._predict(state, 0)
+            state = moving.step(state, self._inputs.plus(force, self._acts), self._constants)
+            still = float((state.q - before).abs().max()) < self._tolerance
+            if number and still:
+                break
+        return State(state.q, torch.zeros_like(state.q))
+
+    @staticmethod
+    def adjoint(gradient: torch.Tensor, near: torch.Tensor, again: torch.Tensor) -> torch.Tensor:
+        """Returns g = w + (dS/dx)^T g (B, N, 3), for w (B, N, 3) and S(x) at x, by GMRES, as S depends on few modes."""
+        from scipy.sparse.linalg import LinearOperator, gmres
+
+        def product(values: FloatArray) -> FloatArray:
+            total = torch.as_tensor(values).to(near).view_as(near)
+            (back,) = torch.autograd.grad(again, near, total, retain_graph=True)
+            return (total - back).flatten().double().cpu().numpy()
+
+        right = gradient.detach().flatten().double().cpu().numpy()
+        matrix = LinearOperator((right.size, right.size), matvec=product, dtype=np.float64)
+        found, unsettled = gmres(matrix, right, right, rtol=_SETTLED, restart=_ITERATIONS, maxiter=4)
+        if unsettled:
+            raise ConvergenceError("the gradient of a pose and its force did not settle.", near.detach(), None)
+        return torch.as_tensor(found).to(near).view_as(near)
 
 
 class _AndersonAcceleration:

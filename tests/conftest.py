@@ -22,8 +22,10 @@ from hydra.plugins.config_source import ConfigSource
 from support.command_line import enable_loggers
 from support.main_job import IN_RUN, TINY, files, run, without_reports
 from support.scenes import body_scene
-from warp_resphys.io import atomic
+from warp_resphys.data.recordings import recording_files
+from warp_resphys.io import atomic, decoding
 from warp_resphys.io.settings import Settings
+from warp_resphys.mesh import readers
 from warp_resphys.mesh.boxes import box_hexahedra
 from warp_resphys.report import figures, render
 
@@ -33,8 +35,12 @@ torch.set_num_threads(1)
 
 NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
 STRUCTURAL = {"test_arguments", "test_modules", "test_threads"}  # of these folders, without numbers of libraries
-# folders and modules of tests
-LOOK_AT_PICTURES = {"report", "test_environments", "test_film", "test_control_run", "test_inspect_mesh"}
+# modules of tests
+LOOK_AT_PICTURES = {
+    *("test_bodies", "test_figures", "test_render", "test_report", "test_environments", "test_film"),
+    *("test_control_run", "test_inspect_mesh"),
+}
+DECODE_IN_PROCESSES = {"test_damaged_files", "test_foreign_recordings", "test_mesh", "test_recordings"}  # as users do
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
@@ -76,11 +82,18 @@ def reference_data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def can_draw() -> None:
+def renderer() -> Iterator[render.Renderer]:
+    """One drawing process, which takes seconds to start."""
+    with render.Renderer() as drawing:
+        yield drawing
+
+
+@pytest.fixture(scope="session")
+def can_draw(renderer: render.Renderer) -> None:
     """Skips where bodies cannot be drawn."""
     mesh = box_hexahedra(divisions=(1, 1, 1))
     try:
-        render.draw(body_scene(mesh))
+        render.draw(body_scene(mesh), renderer)
     except render.DrawingError as error:
         pytest.skip(str(error))
 
@@ -152,8 +165,21 @@ def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def _pictures(request, kept_renderers):
     """Coarse pictures, but for tests that look at them."""
-    looks = {request.path.parent.name, request.path.stem} & LOOK_AT_PICTURES
-    with contextlib.nullcontext() if looks else coarse_pictures(kept_renderers):
+    with contextlib.nullcontext() if request.path.stem in LOOK_AT_PICTURES else coarse_pictures(kept_renderers):
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _files_are_decoded_here(request):
+    """Files of other programs, but where damaged ones are read: a process for each takes half a second."""
+
+    def here(library: str, path: Path, *names: str) -> decoding.Arrays:
+        return decoding.decoded(library, str(path), *names)
+
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.stem not in DECODE_IN_PROCESSES:
+            patch.setattr(readers, "decode", here)
+            patch.setattr(recording_files, "decode", here)
         yield
 
 

@@ -31,17 +31,17 @@ def motion(frames=3, model="simulation"):
     return ComparedMotion(mesh, times, sag(bound, times, 0.05), positions, markers, bound, DOWN)
 
 
-def halves(scene):
+def halves(scene, renderer):
     """(F, 2, H, W, 4) of each frame the two views."""
-    return np.stack(np.split(render.draw(scene).astype(int), 2, axis=2), axis=1)
+    return np.stack(np.split(render.draw(scene, renderer).astype(int), 2, axis=2), axis=1)
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_instants_show_bodies_dots_and_rings():
+def test_instants_show_bodies_dots_and_rings(renderer):
     shown = motion(2)
     shown.positions["resphys"][1] *= 1e200
     shown.markers["resphys"][1] = np.nan
-    pixels = halves(shown.scene())
+    pixels = halves(shown.scene(), renderer)
     assert pixels.shape[:2] == (2, 2)
     solid = pixels[..., 3] > 200
     blue = solid & (pixels[..., 2] > pixels[..., 0] + 40)
@@ -55,13 +55,13 @@ def test_instants_show_bodies_dots_and_rings():
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body():
+def test_one_marker_alone_is_seen_from_a_distance_that_shows_its_body(renderer):
     several = motion(2)
     markers = {model: each[:, :1] for model, each in several.markers.items()}
     alone = replace(several, measured=several.measured[:, :1], markers=markers, bound=several.bound[:1])
     _, near = alone.scene().views
     assert near.half_height >= 0.03 * 0.1
-    assert (halves(alone.scene())[0, 0, ..., 3] > 200).mean() > 0.3
+    assert (halves(alone.scene(), renderer)[0, 0, ..., 3] > 200).mean() > 0.3
 
 
 def test_second_view_is_from_below():
@@ -98,11 +98,11 @@ def test_picture_of_an_arm_has_markers_where_it_is_whole(tmp_path):
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys):
+def test_film_moves_and_is_slower_than_the_motion(tmp_path, capsys, renderer):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     shown = motion(4)
     shown.measured[2, 1] = np.nan
-    render.write_film(tmp_path / "motion.mp4", shown.film())
+    render.write_film(tmp_path / "motion.mp4", shown.film(), renderer)
     assert "4/4 frames" in capsys.readouterr().err
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "motion.mp4"))
     about = next(reader)

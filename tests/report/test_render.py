@@ -35,11 +35,11 @@ def share(pixels: np.ndarray, colour: np.ndarray) -> float:
 
 @pytest.mark.usefixtures("can_draw")
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES.keys())
-def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh) -> None:
+def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh, renderer: render.Renderer) -> None:
     # Each visible face has one colour, in the share of the picture that it covers.
     faces = {(1.0, 0.0, 0.0): 0.03 * 0.03, (0.0, -1.0, 0.0): 0.1 * 0.03, (0.0, 0.0, 1.0): 0.1 * 0.03}  # [m²]
     covered = {normal: area * float(np.dot(normal, VIEWER)) for normal, area in faces.items()}
-    (picture,) = render.draw(body_scene(mesh, views=2))
+    (picture,) = render.draw(body_scene(mesh, views=2), renderer)
     pictures = np.split(picture / 255.0, 2, axis=1)
     for pixels in pictures:
         for normal, area in covered.items():
@@ -55,9 +55,9 @@ def test_a_body_is_drawn_whole_to_scale_and_shaded(mesh: Mesh) -> None:
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_the_undeformed_outline_shows_where_the_body_has_left() -> None:
+def test_the_undeformed_outline_shows_where_the_body_has_left(renderer: render.Renderer) -> None:
     mesh = box_hexahedra(divisions=(3, 1, 1))
-    (pixels,) = render.draw(body_scene(mesh, moved=(0.0, 0.0, 0.05)))
+    (pixels,) = render.draw(body_scene(mesh, moved=(0.0, 0.0, 0.05)), renderer)
     pixels = pixels / 255.0
     assert share(pixels, np.asarray(matplotlib.colors.to_rgb(OUTLINE))) > 0.03
 

@@ -207,24 +207,41 @@ def _main(memory: str, seconds: str, library: str, path: str, *names: str) -> in
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)  # discards what the libraries print
     os.dup2(nowhere, 2)
-    too_much = f"it takes more than {int(memory) >> 20} MiB of memory"
     try:
-        decoders: dict[str, Callable[..., Arrays]] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays, "h5py": hdf5_arrays}
-        arrays: dict[str, Any] = {**decoders[library](path, *names)}
+        arrays: dict[str, Any] = {**decoded(library, path, *names)}
         np.savez(answer, **arrays)
         answer.close()
         return 0
     except MemoryError:
-        message = too_much
+        message = f"it takes more than {int(memory) >> 20} MiB of memory"
+    except DecodingError as error:
+        message = str(error)
+    reason.write(message.encode(errors="replace"))
+    reason.close()
+    return 1
+
+
+def decoded(library: str, path: str, *names: str) -> Arrays:
+    """Reads a file in this process, without limits; see `decode`.
+
+    Raises:
+        DecodingError: The library refuses the file.
+        MemoryError: The file claims more memory than there is.
+    """
+    decoders: dict[str, Callable[..., Arrays]] = {"ezc3d": c3d_arrays, "meshio": mesh_arrays, "h5py": hdf5_arrays}
+    try:
+        return decoders[library](path, *names)
+    except MemoryError:
+        raise
     except ModuleNotFoundError as error:
         message = f"install the Python package {error.name} to read it"
     except DecodingError as error:
         message = str(error)
     except Exception as error:
-        message = too_much if "bad_alloc" in str(error) else f"{type(error).__name__}: {error}"
-    reason.write((" ".join(message.split())[:300] or "no reason given").encode(errors="replace"))
-    reason.close()
-    return 1
+        if "bad_alloc" in str(error):
+            raise MemoryError from error
+        message = f"{type(error).__name__}: {error}"
+    raise DecodingError(" ".join(message.split())[:300] or "no reason given")
 
 
 if __name__ == "__main__":

@@ -208,6 +208,36 @@ def test_there_are_silicones_and_an_unknown_one_is_refused_with_their_names():
         law_path("dragon_skin_99")
 
 
+@pytest.mark.parametrize(
+    ("stretches", "inside"),
+    [
+        ((2.0, 0.5**0.5, 0.5**0.5), {"tension"}),
+        ((0.5**0.5, 2.0, 0.5**0.5), {"tension"}),  # along another axis
+        ((0.5, 2.0**0.5, 2.0**0.5), {"compression"}),
+        ((1.4, 1.4, 1.4**-2), {"compression"}),  # tension in two directions
+        ((2.0, 1.0, 0.5), {"shear"}),
+        ((1.0, 1.0, 1.0), {"tension", "shear", "compression"}),
+        ((0.97, 1.015, 1.015), {"tension", "shear", "compression"}),  # strains so small that all modes are alike
+    ],
+)
+def test_a_load_of_another_mode_is_outside_of_the_range_of_a_law(tmp_path, stretches, inside):
+    mesh = wr.box_hexahedra((0.1, 0.1, 0.1), (1, 1, 1))
+    states = mesh.vertices[None] * np.array(stretches)
+
+    def within(*modes):
+        law = written(tmp_path, stretches=[0.5, 2.0], modes=modes)
+        return wr.energies.share_outside_law(law, mesh, states) == 0.0
+
+    assert {mode for mode in ("tension", "shear", "compression") if within(mode)} == inside
+    assert within("tension", "compression")  # Shear is between them.
+    assert wr.energies.share_outside_law(written(tmp_path, stretches=[0.5, 2.0]), mesh, states) == 0.0
+
+
+def test_silicones_from_tensile_tests_are_tested_in_tension_alone():
+    assert read_law("dragon_skin_10_tensile")["modes"] == ["tension"]
+    assert "modes" not in read_law("dragon_skin_10")  # from a beam that bends
+
+
 NUMBER = r"parameters\.c10 is .*: a law has a finite number there"
 UNITS, STRETCHES = (
     "units is .*: give the unit of each parameter",
@@ -224,6 +254,11 @@ UNITS, STRETCHES = (
             ("stretches", pair, STRETCHES)
             for pair in ([True, 2.0], [1.1, 0.9], [0.0, 1.1], [0.9, math.inf], [0.9], 1.1)
         ),
+        *(
+            ("modes", value, r"modes is .*: give a list of 'tension', 'shear', 'compression'")
+            for value in ([], "tension")
+        ),
+        ("modes", ["torsion"], "modes is"),
         *(
             (key, value, "not a law of this version")
             for key, value in (("format", 0), ("parameters", {}), ("model", 3))

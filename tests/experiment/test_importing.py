@@ -21,6 +21,7 @@ from warp_resphys.experiment.checks import check_run
 from warp_resphys.experiment.files import DATASET, QUALITY, REGISTRATION, TRUTH
 from warp_resphys.experiment.laboratory import laboratory_simulator, make_setup
 from warp_resphys.experiment.recordings.importing import import_recordings, sessions_text
+from warp_resphys.experiment.recordings.registered_trials import moves
 from warp_resphys.experiment.splits import trials_of
 from warp_resphys.io.resuming import StageContext, fingerprint, run_stages
 from warp_resphys.io.safe_files import read_hdf5, read_json
@@ -357,6 +358,54 @@ def test_the_tutorial(shared_data, tmp_path, monkeypatch):
     for line, (name, trial) in zip(log, quality.items(), strict=True):
         rms = registration[name]["rms_mm"]
         assert line == f"import: {name} is released in frame {trial['release_frame']:.1f}, registered to {rms:.2f} mm"
+
+
+def moving(*starts, jumps=()):
+    """A recording (120, M, 3) at 100 Hz of markers that move by 2 mm from their frames on, and of jumps [m].
+
+    A marker of whom the start is None rests. A jump is a marker, its first and last frame, and its size.
+    """
+    positions = np.random.default_rng(0).normal(scale=2e-5, size=(120, len(starts), 3))
+    for marker, start in enumerate(starts):
+        if start is not None:
+            positions[start:, marker, 0] += np.minimum(2e-3, 4e-4 * np.arange(1, 121 - start))
+    for marker, first, last, size in jumps:
+        positions[first:last, marker, 1] += size
+    return Recording(tuple("ABC"[: len(starts)]), positions, 100.0, Path("swing.csv"))
+
+
+@pytest.mark.parametrize(
+    ("recording", "onset"),
+    [
+        (moving(60, 60, 60), 60),
+        (moving(60, 60, 60, jumps=[(1, 7, 8, 3.4e-4)]), 60),  # of one marker in one frame
+        (moving(60, 60, 60, jumps=[(1, 7, 120, 3.4e-4)]), 60),  # of one marker, which stays there
+        (moving(60, 60, 60, jumps=[(0, 7, 9, 1e-2), (1, 7, 9, 1e-2)]), 60),  # of two, for a moment
+        (moving(60, 60, None), 60),
+        (moving(60, 64, 64), 64),  # two of them have to move
+        (moving(None, None, 60, jumps=[(2, 7, 8, 3.4e-4)]), 60),  # the only one that ever moves
+        (moving(60, jumps=[(0, 7, 8, 3.4e-4)]), 60),
+    ],
+)
+def test_a_motion_begins_where_several_markers_leave_their_places_for_good(recording, onset):
+    left = moves(recording, 5)
+    assert np.argmax(left) == pytest.approx(onset, abs=1)
+    assert not left[: onset - 1].any()
+    assert left[onset + 5 :].all()
+
+
+def test_a_body_that_rests_does_not_move_and_hidden_markers_are_no_motion():
+    assert not moves(moving(None, None), 5).any()
+    positions = moving(60, 60).positions.copy()
+    positions[20:30, 0] = np.nan
+    hidden = Recording(("A", "B"), positions, 100.0, Path("swing.csv"))
+    assert np.argmax(moves(hidden, 5)) == pytest.approx(60, abs=1)
+
+
+def test_the_onset_of_the_inflated_segment_is_that_of_its_pressure(shared_data):
+    """Not a jump of one marker by 0.34 mm, half a second before."""
+    recording = read_recording(shared_data / "segment_sessions" / "100mbar_V3.c3d").select(TIPS)
+    assert np.argmax(moves(recording, 5)) / recording.rate == pytest.approx(0.58, abs=0.03)
 
 
 @pytest.mark.parametrize(("ratio", "count"), [(0.25, 24), (1.0, 6)])

@@ -55,6 +55,7 @@ def test_a_table_gives_a_law(run):
     for name, true in SILICONE.items():
         assert law["parameters"][name] == pytest.approx(true, abs=3.0 * law["deviation"][name])
     assert law["stretches"] == pytest.approx([2.0**-0.5, 2.0], rel=0.01)
+    assert law["modes"] == ["tension"]
     errors = metrics["tests"]["tension"]["errors"]
     assert errors["range"]["law"] < 0.01 < errors["range"]["neo_hookean"]
     assert errors["beyond"]["law"] < 0.1 * errors["beyond"]["neo_hookean"]

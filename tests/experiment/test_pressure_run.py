@@ -21,13 +21,14 @@ from warp_resphys.data.trials import Trials
 from warp_resphys.experiment import learning_stages
 from warp_resphys.experiment.experiment import Experiment
 from warp_resphys.experiment.recordings.importing import import_recordings
+from warp_resphys.experiment.run_metrics import placement
 from warp_resphys.io.resuming import StageContext, run_stages
 from warp_resphys.io.safe_files import read_array, read_checkpoint, read_hdf5, read_json, write_json
 from warp_resphys.io.settings import parse
 from warp_resphys.learning.error_tables import ComparedModels
 from warp_resphys.learning.residuals import fitting
 from warp_resphys.learning.residuals.correction import force_frames
-from warp_resphys.report.data import unused
+from warp_resphys.report.ranking import shown_metrics, unused
 from warp_resphys.robot.description import finished_experiment
 from warp_resphys.settings.stage_keys import StageSettings
 
@@ -95,7 +96,9 @@ def test_without_reconstruction_the_actuator_is_all_that_is_learned(finished, tm
     assert results["networks"].keys() == {"actuator"}
     assert "reconstruction" not in results
     assert warp_resphys.load(tmp_path / "run").description.learned is None
-    assert unused(results) == {"resphys": "no force is learned"}
+    assert unused(results) == {}
+    assert "resphys" not in shown_metrics(results)["errors_mm"]
+    assert results["recommended"] != "resphys"
 
 
 def test_a_run_from_before_the_choice_of_a_reconstruction_has_its_force(finished, tmp_path):
@@ -238,6 +241,33 @@ def test_recordings_are_read_whole_without_a_number_of_steps_or_from_where_somet
     np.testing.assert_allclose(read.observed, expected.observed, atol=1e-9)
     np.testing.assert_allclose(read.inputs["pressure"], expected.inputs["pressure"])
     assert "t000.h5: 'T1', 'T2', 'T3' never move by more than" in recordings.refused()
+
+
+def exchanged(recording, one="B1", other="B2"):
+    """The recording with the labels of two markers on the clamp exchanged."""
+    names = {one: other, other: one}
+    return dataclasses.replace(recording, labels=tuple(names.get(label, label) for label in recording.labels))
+
+
+def test_the_registration_of_every_trial_is_said_and_markers_that_it_leaves_out_are_warned_of(recordings, caplog):
+    caplog.set_level("INFO")
+    recordings.imported()
+    fits = read_json(recordings.folder / "registration.json")
+    lines = [f"import: {name} is registered to {fit['rms_mm']:.2f} mm" for name, fit in fits.items()]
+    assert [record.message for record in caplog.records if "registered" in record.message] == lines
+    assert [record for record in caplog.records if record.levelname == "WARNING"] == []
+    recordings.write(exchanged)
+    recordings.imported()
+    (warning,) = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    fits = read_json(recordings.folder / "registration.json")
+    assert [fit["outliers"] for fit in fits.values()] == 4 * [["B1", "B2"]]
+    away = [max(fit["residual_mm"][label] for fit in fits.values()) for label in ("B1", "B2")]
+    assert min(away) > 30.0
+    assert warning.startswith(
+        "import: the registration of t000, t001, t002, t003 leaves out "
+        f"B1 ({away[0]:.1f} mm), B2 ({away[1]:.1f} mm) from the nominal position: check names"
+    )
+    assert placement(fits, {})["left_out_mm"] == dict(zip(("B1", "B2"), away, strict=True))
 
 
 def test_constant_inputs_are_pulses(recordings):

@@ -113,11 +113,30 @@ def test_where_the_force_fades_out_the_law_remains_and_stretches_beyond_the_trai
     assert table.rows[0].cells == [Cell("1 of 2", "from the start (up)")]
     assert table.note.endswith("fades out, and the law remains.")
     stretches = {"all test trials": (0.7, 1.4), "the training": (0.9, 1.1)}
-    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches))
+    metrics = {"law": {}}
+    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches, metrics=metrics))
     assert said.startswith("In 12 % of the cells and times of all test trials, a principal stretch lies outside of ")
-    assert "0.90 to 1.10" in said
+    assert said.endswith("0.90 to 1.10: there it extrapolates.")
+    metrics["law"]["modes"] = ["tension", "shear"]
+    said = law_section.outside_text(SimpleNamespace(outside=0.123, stretches=stretches, metrics=metrics))
+    assert said.endswith("0.90 to 1.10 in tension and shear, or the load is another one: there it extrapolates.")
     assert law_section.outside_text(SimpleNamespace(outside=0.001, stretches=stretches)) == ""
     assert law_section.outside_text(SimpleNamespace(outside=None, stretches={})) == ""
+
+
+def test_a_class_is_named_with_the_viscosity_that_its_law_has():
+    tried = [{"groups": ["elastic"], "parameters": {"c10": 1e4, "bulk_viscosity": x}} for x in (0.0, 200.0)]
+    (table,) = law_section._classes({"groups": ["elastic"], "classes": tried})
+    assert [row.head for row in table.rows] == ["With elastic terms", "With elastic terms and viscosity"]
+
+
+def test_a_term_with_the_coefficient_zero_is_not_listed():
+    parameters = {"c10": 4e4, "c20": 0.0, "shear_viscosity": 0.0, "fibre_azimuth_1": 0.0, "fibre_slack_1": 0.0}
+    content = {"parameters": parameters, "deviation": {"c10": 1.0, "c20": 1.0, "fibre_azimuth_1": 0.1}}
+    heads = [row.head for row in law_section._terms_table(content).rows]
+    assert heads == ["Neo-Hookean term", "Fibres 1: azimuth"]  # An angle may be zero.
+    said = law_section.not_needed_text(content, LawSettings(terms=["c20", "c01"], families=0))
+    assert "second-order term in I₁, Mooney-Rivlin term, viscosity in shear" in said
 
 
 @pytest.mark.parametrize("direction", [None, ALONG, ACROSS])

@@ -20,6 +20,7 @@ from warp_resphys.io.safe_files import read_json, write_json
 from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
+from warp_resphys.report.motion_section import motion_of
 from warp_resphys.report.page import Canvas, Drawn
 from warp_resphys.report.pages import run_page
 from warp_resphys.report.wording import NONE, number_text
@@ -76,6 +77,21 @@ class TestArms:
         page.says("Longer than the training", "First 1 s", "A line ends", "of 494 vertices", "9.89 ± 5.02")
         assert page.text.count("1 of 3 diverged") == 3
         assert "No recordings are configured" not in page.text
+
+    def test_the_film_shows_the_model_that_is_recommended(self, tmp_path):
+        write_arm_run(tmp_path, ARM, models=("simulation", "sysid", "resphys"))
+        read = RunReader(tmp_path, ARM).report()
+        assert read.metrics["recommended"] == "resphys"
+        assert [*motion_of(read).positions] == ["simulation", "resphys"]
+        errors = read_json(tmp_path / "errors.json")
+        for row in errors["per_trajectory"]:
+            row["errors_mm"]["sysid"] = 0.5 * row["errors_mm"]["resphys"]
+        write_json(tmp_path / "errors.json", errors)
+        better = RunReader(tmp_path, ARM).report()
+        assert better.metrics["recommended"] == "sysid"
+        assert [*motion_of(better).positions] == ["simulation", "sysid"]
+        without = RunReader(tmp_path, ARM.changed(reconstruction=None)).report()
+        assert "resphys" not in {**without.trials.positions, **without.film.positions, **without.metrics["errors_mm"]}
 
     @pytest.mark.usefixtures("no_figures")
     def test_higher_pressures(self, tmp_path):

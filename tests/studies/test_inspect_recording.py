@@ -50,7 +50,7 @@ def test_table_and_files(tmp_path, path):
     assert len({len(row.rstrip()) for row in rows[2:4]}) == 1
     assert any("tip is hidden for up to 20 frames; 20 frames are masked." in row for row in rows)
     assert any("base 1 jumps once, by 1.73 mm, in frame 90." in row for row in rows)
-    assert "Released in frame 60." in text
+    assert "Motion starts in frame 60." in text
     written = json.loads((tmp_path / "out" / "quality.json").read_text())
     assert written["release_frame"] == pytest.approx(60.4, abs=0.25)
     assert written["markers"][1]["jumps"] == [{"frame": 90, "mm": pytest.approx(1.73, abs=0.02)}]

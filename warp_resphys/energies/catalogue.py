@@ -8,7 +8,7 @@ from typing import Any, Final, NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fem.integration_points import principal_stretches, share_outside
+from ..fem.integration_points import LODE, principal_stretches, share_outside
 from ..io.classes import imported
 from ..io.errors import DataFileError, InputError, listed
 from ..io.safe_files import read_json
@@ -105,6 +105,7 @@ class LawContent(TypedDict):
     loss: NotRequired[float]
     classes: NotRequired[list[TriedClass]]
     stretches: NotRequired[list[float]]  # least and largest in the trials that it was identified from
+    modes: NotRequired[list[str]]  # of loading in these, see `fem.integration_points.LODE`; all by default
     data: NotRequired[dict[str, str | list[str]]]  # `name` of the run that identified it, and its training `trials`
     versions: NotRequired[dict[str, str]]
     file: NotRequired[str]  # of a law of another run
@@ -153,6 +154,9 @@ def read_law(name: str) -> LawContent:
         raise DataFileError(
             f"{path}: stretches is {known['stretches']!r}: give the least and the largest stretch, or leave it out."
         )
+    modes = known.get("modes", [*LODE])
+    if not isinstance(modes, list) or not modes or not {*map(str, modes)} <= LODE.keys():
+        raise DataFileError(f"{path}: modes is {modes!r}: give a list of {listed([*LODE])}, or leave it out.")
     absent = dict.fromkeys(("c10", "bulk_1"), 0.0) if known["model"] == ConvexMaterial.model else {}
     return {**known, "model": known["model"], "parameters": absent | parameters}
 
@@ -164,7 +168,7 @@ def unit_of(name: str) -> str:
 
 
 def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> float:
-    """The share of cells and states in which a law extrapolates, by the stretches at the centres of cells.
+    """The share of cells and states in which a law extrapolates, by stretches and loading at the centres of cells.
 
     Args:
         name: as for `law_path`.
@@ -181,7 +185,12 @@ def share_outside_law(name: str, mesh: Mesh, positions: NDArray[np.float64]) -> 
     stretches = principal_stretches(mesh, positions)
     if not np.isfinite(stretches).any():
         raise InputError("positions has no finite state, so that there are no stretches: give states of a motion.")
-    return share_outside(stretches, *law["stretches"])
+    return share_outside(stretches, law["stretches"], modes_of(law))
+
+
+def modes_of(law: LawContent) -> list[str]:
+    """Returns the loading modes of the range of a law."""
+    return law.get("modes", [*LODE])
 
 
 def read_material(name: str) -> Material:

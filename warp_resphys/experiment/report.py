@@ -16,7 +16,7 @@ from ..data.recordings.marker_quality import Quality
 from ..data.registration import RegistrationSummary
 from ..data.rigid_bodies import as_markers, owners
 from ..data.trials import STATIC, Trials
-from ..energies.catalogue import LawContent
+from ..energies.catalogue import LawContent, modes_of
 from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..fem.bodies import Body
 from ..fem.integration_points import principal_stretches, share_outside
@@ -294,7 +294,7 @@ class RunReader:
         if trials.labels and film is not None:
             name, bodies = f"the trial {film.trial}", next(reversed([*film.positions.values()]))
         values = principal_stretches(self.body.mesh, bodies.reshape(-1, *bodies.shape[-2:]))
-        outside = None if learned is None else share_outside(values, *trained["the training"])
+        outside = None if learned is None else share_outside(values, trained["the training"], modes_of(law))
         return {
             "stretches": {name: (float(np.nanmin(values)), float(np.nanmax(values))), **trained},
             "outside": outside,

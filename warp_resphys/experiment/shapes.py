@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ..dynamics.simulator import Simulator
+from ..energies.catalogue import modes_of
 from ..fem.integration_points import principal_stretches, share_outside
 from ..io.errors import ConvergenceError, InputError
 from ..io.parts import Checkpoint
@@ -105,7 +106,7 @@ def _compared(experiment: Experiment, settings: StageSettings, shape: ShapeSetti
     moved = 1e3 * float(np.linalg.norm(observed - mesh.vertices, axis=-1).max())
     result: ShapeErrors = {"vertices": len(mesh.vertices), "moved_mm": moved, "errors_mm": errors}
     if experiment.has_law and "stretches" in (law := read_json(experiment.folder / LAW_FILE)):
-        result["outside"] = share_outside(principal_stretches(mesh, observed), *law["stretches"])
+        result["outside"] = share_outside(principal_stretches(mesh, observed), law["stretches"], modes_of(law))
     return result
 
 

@@ -5,8 +5,9 @@ A *point* has the rest-space gradients of the shape functions of its cell's node
 energy. Gauss points, element centres and averages over vertex patches all have this form.
 """
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self, get_args
+from typing import Final, Literal, Self, get_args
 
 import numpy as np
 import scipy.sparse
@@ -18,6 +19,9 @@ from ..mesh.volume_mesh import Mesh, check_mesh
 
 VolumeIntegration = Literal["centre", "full"]
 VOLUME_INTEGRATIONS: tuple[VolumeIntegration, ...] = get_args(VolumeIntegration)
+# Lode's parameter of a loading mode: tension extends one direction, compression (or biaxial tension) two.
+LODE: Final = {"tension": -1.0, "shear": 0.0, "compression": 1.0}
+_ALIKE: Final = 0.05  # strain up to which all modes are alike
 _MOST_STATES = 400
 
 
@@ -296,7 +300,24 @@ def principal_stretches(mesh: Mesh, positions: NDArray[np.float64]) -> NDArray[n
     return values
 
 
-def share_outside(stretches: NDArray[np.float64], low: float, high: float) -> float:
-    """Returns the share of cells and states (S, C, 3) with a principal stretch outside of a range."""
-    beyond = (stretches.min(-1) < low) | (stretches.max(-1) > high)
-    return float(beyond[np.isfinite(stretches).all(-1)].mean())
+def share_outside(
+    stretches: NDArray[np.float64], between: Sequence[float], modes: Collection[str] = tuple(LODE)
+) -> float:
+    """Returns the share of cells and states with a principal stretch outside of a range, or another loading mode.
+
+    The mode is Lode's parameter (2 e_2 - e_1 - e_3) / (e_1 - e_3) of the logarithms e of the stretches, see `LODE`. It
+    may be half a step beyond those of the modes. Strains of up to 5 % are alike in all modes.
+
+    Args:
+        stretches: (S, C, 3) principal stretches.
+        between: least and largest stretch of the range.
+        modes: those of the range, of `LODE`.
+    """
+    known = np.sort(stretches[np.isfinite(stretches).all(-1)])
+    least, middle, largest = np.log(np.maximum(known, 1e-12)).T
+    lode = (2.0 * middle - least - largest) / np.maximum(largest - least, 1e-12)
+    ends = [LODE[mode] for mode in modes]
+    other = (lode < min(ends) - 0.5) | (lode > max(ends) + 0.5)
+    small = np.abs(known - 1.0).max(axis=1, initial=0.0) <= _ALIKE
+    outside = (known[:, 0] < between[0]) | (known[:, 2] > between[1]) | (other & ~small)
+    return float(outside.mean())

@@ -16,7 +16,7 @@ import torch
 
 from ..energies.catalogue import LawContent, make_material
 from ..io.arrays import FloatArray
-from ..learning.identification.law import VISCOSITIES
+from ..learning.identification.law import VISCOSITIES, is_shape
 from ..settings.body import MaterialSettings
 from ..settings.learning import LawSettings
 from . import figures
@@ -124,7 +124,7 @@ def _terms_table(law: LawContent) -> PageTable:
     bounds = [name for name in law.get("at_bounds", ()) if name in known]
     for name, value in known.items():
         deviation = law.get("deviation", {}).get(name)
-        if not value and not deviation:  # Of a family of fibres that has no such part.
+        if not value and not (deviation and is_shape(name)):  # A term that is not there; an angle may be zero.
             continue
         (words, unit, factor), meaning = wording(name)
         cells = [identified_cell(value, factor, deviation), Cell(unit or NONE)]
@@ -139,15 +139,18 @@ def outside_text(data: RunReport) -> str:
         return ""
     low, high = data.stretches["the training"]
     (where, _), *_ = data.stretches.items()
+    modes = data.metrics["law"].get("modes", ())
+    kinds = f" in {in_a_row(modes)}" if modes else ""
     return (
         f"In {100.0 * data.outside:.0f} % of the cells and times of {where}, a principal stretch lies outside of those "
-        f"that the law was learned at, {low:.2f} to {high:.2f}: there it extrapolates."
+        f"that the law was learned at, {low:.2f} to {high:.2f}{kinds}{', or the load is another one' * bool(modes)}: "
+        "there it extrapolates."
     )
 
 
 def not_needed_text(law: LawContent, settings: LawSettings) -> str:
     """Returns a sentence on the terms of the library that the law does not have; empty if it has all of them."""
-    parameters = law["parameters"]
+    parameters = {name: value for name, value in law["parameters"].items() if value}
     names = [name for name in settings.terms if name not in parameters]
     exponents = [str(n) for name in names for n in ogden_terms({name: 0.0})]
     absent = [within_sentence(wording(name)[0][0]) for name in names if not ogden_terms({name: 0.0})]
@@ -248,7 +251,9 @@ def _classes(law: LawContent) -> list[Block]:
     columns = ["Coefficients", *(["Force residual"] if weak else []), "Validation error"]
     rows, chosen = [], next((tried_class for tried_class in tried if tried_class["groups"] == law["groups"]), None)
     for tried_class in tried:
-        words = in_a_row([_GROUPS.get(group, group) for group in tried_class["groups"]])
+        viscous = any(tried_class["parameters"].get(name) for name in VISCOSITIES)
+        groups = dict.fromkeys([*tried_class["groups"], *(["viscosity"] if viscous else [])])
+        words = in_a_row([_GROUPS.get(group, group) for group in groups])
         head = f"With {words}" if words else "Shape and volume alone (neo-Hookean)"
         cells = [
             Cell(

@@ -95,7 +95,7 @@ def recording_quality(recording: Recording, result: Quality) -> Figure:
                 released = result.release_frame / result.rate_hz
                 axes.axvline(released, color=TONES["ink"].light, linewidth=0.9, linestyle="--")
         _draw_seen(last, recording, bridged, result)
-        last.set_xlabel("time [s]; dashed: release" if result.release_frame is not None else "time [s]")
+        last.set_xlabel("time [s]; dashed: motion starts" if result.release_frame is not None else "time [s]")
         last.set_xlim(0.0, len(recording.positions) / recording.rate)
         handles = [mpl.lines.Line2D([], [], color=colour, label=label) for label, colour in colours.items()]
         columns = min(len(handles), _LEGEND_COLUMNS)
@@ -164,7 +164,7 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     lines += [f"Force sensor {name}: {_ranges(loads)}." for name, loads in recording.loads.items()]
     if release is not None:
         rest = release.rest
-        lines.append(f"Released in frame {release.frame:.2f}; held still in frames {rest[0]} to {rest[1] - 1}.")
+        lines.append(f"Motion starts in frame {release.frame:.2f}; still in frames {rest[0]} to {rest[1] - 1}.")
     lines += result.warnings
     lines += [
         f"{source}: the base is shifted by up to {shift.max():.2f} mm; its markers moved by up to "

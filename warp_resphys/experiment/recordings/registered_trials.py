@@ -3,12 +3,13 @@
 import logging
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import median_filter, minimum_filter1d
 
 from ...data.base_motion import followed, in_frame, prescribed, prescribed_all, rigid
 from ...data.input_response import NO_INPUT, check_inputs
@@ -31,6 +32,8 @@ _LEAST_RATE = 40.0  # Hz; the release is estimated from the first tenth of a sec
 _MILLI = 1e3
 _SHARE_AT_REST = 0.1  # of the largest displacement of a marker: up to there, the body counts as at rest
 _NOISE = 2e-4  # m; likewise
+_SUSTAINED = 0.05  # s for which markers must have moved
+_MOST_LINES = 6  # driven trials whose registrations have a line each
 _START = Release(0.0, (0, 1))  # of a recording that begins with its release
 
 
@@ -100,12 +103,8 @@ class RegisteredTrials(Reader):
         """Leaves out frames of a body at rest that are earlier than `data.lead` before its inputs or markers change."""
         if self.data.lead is None or self.data.folder is None:
             return recording
-        changes, resting = np.zeros(len(recording.positions), dtype=np.bool_), self._rest_frames(recording)
-        paths = recording.select(self.tracked_in(trial))
-        for path, known in zip(paths.positions.swapaxes(0, 1), paths.seen.T, strict=True):
-            if known.any():
-                moved = np.linalg.norm(path - np.median(path[known][:resting], axis=0), axis=1)
-                changes |= moved > max(_SHARE_AT_REST * np.nanmax(moved), _NOISE)
+        resting = self._rest_frames(recording)
+        changes = moves(recording.select(self.tracked_in(trial)), resting)
         if recording.actuation is not None and self.data.valve == "recorded":
             changes |= ~self._is_at_rest(recording.actuation - recording.actuation[0])
         before = max(int(np.ceil(self.data.lead * recording.rate)), resting)
@@ -222,14 +221,35 @@ class RegisteredTrials(Reader):
                 expected[count:][seen] = np.nanmean(np.stack(standing)[:, seen], axis=0)
             found[row] = self._register(row, expected, only_reference=enough and not shows)
             standing += [found[row].positions[count:]] if shows else []
-            if (release := self.releases[row]) is not None:
-                fit = found[row]
-                off = f"; left out: {listed(fit.outliers)}" if fit.outliers else ""
-                log.info(
-                    "import: %s is released in frame %.1f, registered to %.2f mm%s",
-                    *(trial.name, release.frame, _MILLI * fit.rms, off),
-                )
+        self._report(found)
         return [found[row] for row in range(len(self.trials))]
+
+    def _report(self, found: Mapping[int, Registration]) -> None:
+        """Logs how well the trials are registered, one line each or one for many, and warns of markers left out."""
+        fits = {row: fit for row, fit in sorted(found.items()) if fit.inliers.any()}
+        driven = [row for row in fits if not self.trials[row].is_released]
+        if len(driven) > _MOST_LINES:
+            sizes = [_MILLI * fits[row].rms for row in driven]
+            log.info("import: %d trials are registered to %.2f to %.2f mm", len(driven), min(sizes), max(sizes))
+        off = defaultdict[tuple[str, ...], list[int]](list)
+        for row, fit in fits.items():
+            name, release, size = self.trials[row].name, self.releases[row], _MILLI * fit.rms
+            if release is not None:
+                log.info("import: %s is released in frame %.1f, registered to %.2f mm", name, release.frame, size)
+            elif len(driven) <= _MOST_LINES:
+                log.info("import: %s is registered to %.2f mm", name, size)
+            if fit.outliers:
+                off[fit.outliers].append(row)
+        for labels, rows in off.items():
+            columns = [fits[rows[0]].names.index(label) for label in labels]
+            away = _MILLI * np.max([fits[row].residual[columns] for row in rows], axis=0)
+            marks = [f"{label} ({distance:.1f} mm)" for label, distance in zip(labels, away, strict=True)]
+            names = [self.trials[row].name for row in rows]
+            log.warning(
+                "import: the registration of %s leaves out %s from the nominal position: check names (exchanged ones "
+                "too), positions and unit",
+                *(", ".join(names) if len(names) <= _MOST_LINES else f"{len(names)} trials", ", ".join(marks)),
+            )
 
     def _register(self, row: int, expected: FloatArray, only_reference: bool) -> Registration:
         """Registers the markers of a trial at rest to their expected places (M', 3) [m].
@@ -295,6 +315,27 @@ class RegisteredTrials(Reader):
                     "keep it still until the release, or in the first data.rest_seconds."
                 )
         return replace(moving, base=base, obstacles=obstacles)
+
+
+def moves(recording: Recording, resting: int) -> BoolArray:
+    """Returns whether a body has left its rest, (T,): two or more of its markers have, for a twentieth of a second.
+
+    A jump of one marker, or of several in a single frame, is no motion. Where only one marker ever leaves its place, it
+    decides alone.
+
+    Args:
+        recording: with the markers on the body.
+        resting: number of frames at its start in which the body rests.
+    """
+    frames, away = max(round(_SUSTAINED * recording.rate), 2), list[BoolArray]()
+    for path, known in zip(recording.positions.swapaxes(0, 1), recording.seen.T, strict=True):
+        if known.any():
+            moved = np.nan_to_num(np.linalg.norm(path - np.median(path[known][:resting], axis=0), axis=1))
+            beyond = moved > max(_SHARE_AT_REST * median_filter(moved, frames).max(), _NOISE)
+            away.append(minimum_filter1d(beyond, frames, origin=-(frames // 2), mode="nearest"))
+    count = np.sum(away, axis=0) if away else np.zeros(len(recording.positions))
+    movers = sum(bool(one.any()) for one in away)
+    return np.asarray((count >= min(2, movers)) & (count > 0))
 
 
 def _central(recording: Recording, tracked: Sequence[str], centre: Callable[..., Any], while_it: str) -> FloatArray:

@@ -294,6 +294,8 @@ class _LawSearch:
     def _refine(self, law: LawClass, whole: bool = False) -> RefinedLaw:
         """Returns a law that is refined through the simulator, with the other identified parameters.
 
+        Where markers are seen, every class has viscosities; with whole states, only one with that group.
+
         Args:
             law: first guess.
             whole: whether to use the whole of training trials on which laws are tested as well.

@@ -25,6 +25,7 @@ import scipy.optimize
 from ...energies.catalogue import LawContent, LawTest, TriedClass, law_content
 from ...energies.convex_material import ConvexMaterial
 from ...energies.isochoric import KINDS, TERMS, bulk_of, path_of, shear_modulus, stress, stress_columns
+from ...fem.integration_points import LODE
 from ...io.arrays import BoolArray, Brief, FloatArray
 from ...io.errors import InputError, listed
 from .law import branches_of
@@ -33,6 +34,14 @@ from .specimens import MaterialTest
 BEYOND: Final = 0.25  # see `MeasuredLaw.interval`
 SAMPLES: Final = 20  # independent samples of a curve
 NOISE: Final = 0.01  # relative error that has the weight of one standard deviation of a prior
+# Loading modes by kind of test.
+_MODES: Final = {
+    "tension": "tension",
+    "planar": "shear",
+    "shear": "shear",
+    "compression": "compression",
+    "biaxial": "compression",
+}
 _CLOSE: Final = 1.25  # ratio to the smallest error beyond that range that a smaller class may have
 _EXACT: Final = 0.1 * NOISE  # error beyond the range that no larger class needs to lower
 _NEEDLESS: Final = 1e-3  # coefficient over the shear modulus that is left out
@@ -57,6 +66,7 @@ class MeasuredLaw(Brief):
             of the strains, ``validation`` that in the upper part.
         groups: terms of the chosen one, besides c10.
         stretches: least and largest principal stretch, of simulated specimens as if they deformed homogeneously.
+        modes: of loading of the specimens, see `fem.integration_points.LODE`.
         largest: largest strain of the tests.
         rates: least and largest rate of strain [1/s]; None without times.
         columns: coefficients by the names of `energies.isochoric.stress_columns`.
@@ -70,6 +80,7 @@ class MeasuredLaw(Brief):
     classes: list[TriedClass]
     groups: list[str]
     stretches: tuple[float, float]
+    modes: list[str]
     largest: float
     rates: tuple[float, float] | None
     columns: dict[str, float] = field(repr=False)
@@ -130,6 +141,7 @@ class MeasuredLaw(Brief):
             "validation": tested,
             "classes": self.classes,
             "stretches": [*self.stretches],
+            "modes": self.modes,
         }
 
 
@@ -293,6 +305,7 @@ class _Search:
             classes=classes,
             groups=classes[best]["groups"],
             stretches=(float(min(map(np.min, stretches))), float(max(map(np.max, stretches)))),
+            modes=[mode for mode in LODE if mode in {_MODES[kind] for kind in kinds}],
             largest=max(float(np.abs(strain).max()) for strain in strains),
             rates=(float(min(map(np.median, rates))), float(max(map(np.median, rates)))) if rates else None,
             columns=fit.law,

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from ...energies.catalogue import LawContent
+from ...energies.catalogue import LawContent, modes_of
 from ...energies.isochoric import TERMS, bulk_of
 from ...io.arrays import FloatArray
 from ...io.errors import ConvergenceError, InputError
@@ -108,6 +108,7 @@ def _scaled(
         classes=[],
         groups=groups,
         stretches=(low, high),
+        modes=modes_of(known),
         largest=max(float(np.abs(test.strain[test.used]).max()) for test in tests.values()),
         rates=None,
         columns=columns,

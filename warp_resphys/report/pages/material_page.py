@@ -71,7 +71,8 @@ def _models(metrics: MaterialMetrics) -> list[str]:
 
 def material_verdict(metrics: MaterialMetrics, law: LawContent, run: RunSettings) -> list[str]:
     """Returns how accurate the law is, beside the simplest ones, and advice."""
-    names = [name for name in law["parameters"] if not name.startswith(("density", "bulk_1", "prony"))]
+    terms_of = {name: value for name, value in law["parameters"].items() if value}
+    names = [name for name in terms_of if not name.startswith(("density", "bulk_1", "prony"))]
     branches = sum(name.startswith("prony_time") for name in law["parameters"])
     terms = [within_sentence(wording(name)[0][0]) for name in names]
     words = in_a_row([*terms, *([f"{branches} relaxing branch{'es' * (branches > 1)}"] if branches else [])])

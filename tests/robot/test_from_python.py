@@ -1,7 +1,9 @@
 """Robots of simulators of Python: saved, loaded, drawn, mounted, environments, twins, without a run."""
 
 import json
+import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import meshio
 import numpy as np
@@ -20,6 +22,10 @@ from warp_resphys.io.errors import DataFileError
 
 pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.ResphysWarning")  # few cells
 GUIDES = [[x, 0.0, -0.006] for x in (0.0, 0.03, 0.06)]
+ARM = (
+    '<mujoco><option timestep=".01" gravity="0 0 -9.80709"/><worldbody><body name="arm"><joint axis="0 1 0" '
+    'damping=".1"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".3"/></body></worldbody></mujoco>'
+)
 PLACES = {"tip": (0.06, 0.0, 0.01), "side": (0.045, 0.01, 0.0)}
 
 
@@ -191,16 +197,28 @@ def test_on_an_arm_in_five_lines():
     mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
     mount = pytest.importorskip("warp_resphys.coupling").Mount
     simulator = finger()
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><option timestep=".01" gravity="0 0 -9.80709"/><worldbody><body name="arm"><joint axis="0 1 0" '
-        'damping=".1"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".3"/></body></worldbody></mujoco>'
-    )
+    model = mujoco.MjModel.from_xml_string(ARM)
     arm = mount(Robot.of(simulator), model, "arm", (0.2, 0, 0, 0, 0, 0))
     state = arm.begin(mujoco.MjData(model))
     weight = 9.80709 * float(simulator.prepare().load_mass.sum())
     np.testing.assert_allclose(state.wrench[0, :3], [0.0, 0.0, -weight], atol=1e-6)
     state = arm.step(state, tendon_tension=[1.0])
     assert arm.data(state).qvel[0] > 0.0
+
+
+def test_the_code_of_the_page_runs(tmp_path, monkeypatch):
+    mujoco = pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    page = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf-8")
+    section = page.partition("## From a simulator in Python\n")[2].partition("\n## ")[0]
+    monkeypatch.chdir(tmp_path)
+    Path("arm.xml").write_text(ARM.replace('name="arm"', 'name="flange"'))
+    monkeypatch.setattr(wr, "film", lambda motion, path: None)
+    names = {"wr": wr}
+    for block in re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL):
+        exec(block.replace("layers=8", "layers=2"), names)
+    assert names["mount"].data(names["state"]).qvel[0] > 0.0
+    assert names["twin"].estimator.robot.labels == ("tip",)
+    assert isinstance(names["arm"], mujoco.MjModel)
 
 
 def test_as_a_twin_and_in_a_scene(robot):

@@ -43,6 +43,7 @@ from .mesh.rod import rod as rod
 from .mesh.selection import select_vertices as select_vertices
 from .mesh.volume_mesh import Mesh as Mesh
 from .mesh.volume_mesh import quadratic as quadratic
+from .report.motion_film import film as film
 from .robot.loading import load as load
 from .robot.loading import recorded_trial as recorded_trial
 from .robot.loading import trial_names as trial_names

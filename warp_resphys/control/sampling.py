@@ -76,7 +76,8 @@ def driven_input(robot: Robot) -> RobotInput:
     if len(inputs) != 1:
         raise InputError(
             f"a reduced model needs a robot whose trials are driven by one input, and {robot.description.name} has "
-            f"{len(inputs) or 'none'}: choose a run with pressures, tendons or muscles."
+            f"{len(inputs) or 'none'}: choose a run with pressures, tendons or muscles, or give Robot.of the ranges of "
+            "one input."
         )
     return inputs[0]
 

@@ -159,9 +159,10 @@ class Motion:
             ax.legend(ax.plot(self.times, np.stack([*loads.values()][:3], axis=1)), ["x", "y", "z"])
             ax.set(xlabel="time [s]", ylabel="reaction [N]")
             return ax
-        q, labels = self._of(self.q, environment) - self.body.vertices, self.labels if vertices is None else ()
+        q = self.of_environment(self.q, environment) - self.body.vertices
+        labels = self.labels if vertices is None else ()
         if labels:
-            markers = self._of(self.markers, environment)
+            markers = self.of_environment(self.markers, environment)
             moved = markers - markers[0]
         else:
             furthest = np.linalg.norm(q, axis=2).max(axis=0).argmax()
@@ -198,13 +199,13 @@ class Motion:
             InputError: an unknown environment, or a motion without reaction.
             DataFileError: the file cannot be written.
         """
-        markers, columns = self._of(self.markers, environment), dict[str, FloatArray]()
+        markers, columns = self.of_environment(self.markers, environment), dict[str, FloatArray]()
         if half_widths and self.half_widths is not None:
             widths = zip(self.labels, self.half_widths[:, environment].T, strict=True)
             columns |= {f"{label} half-width [m]": width for label, width in widths}
         for name, (unit, parts) in self.units.items():
             if name in self.inputs:
-                columns |= input_columns(name, parts, unit, self._of(self.inputs[name], environment))
+                columns |= input_columns(name, parts, unit, self.of_environment(self.inputs[name], environment))
         if reaction:
             columns |= self._loads(environment)
         return write_csv(Path(path), self.times, self.labels, markers, columns)
@@ -224,11 +225,12 @@ class Motion:
             InputError: an unknown environment or another extension.
             DataFileError: the files cannot be written.
         """
-        q, v, markers = (self._of(values, environment) for values in (self.q, self.v, self._labelled))
+        q, v, markers = (self.of_environment(values, environment) for values in (self.q, self.v, self.labelled))
         fields = dict[str, FloatArray]()
         if self.reaction is not None:
+            held, forces = self.reaction.vertices.cpu(), self.of_environment(self.reaction.forces, environment)
             fields["reaction"] = np.zeros_like(q)
-            fields["reaction"][1:, self.reaction.vertices.cpu()] = self._of(self.reaction.forces, environment)
+            fields["reaction"][1:, held] = forces
         return write_vtk(
             Path(path), self.body.mesh, self.times, q, v, markers, self.surface(environment).solids, fields
         )
@@ -244,11 +246,11 @@ class Motion:
             InputError: an unknown environment, another extension, or the extra is missing.
             DataFileError: the file cannot be written.
         """
-        q, markers = (self._of(values, environment) for values in (self.q, self._labelled))
+        q, markers = (self.of_environment(values, environment) for values in (self.q, self.labelled))
         return write_usd(Path(path), self.body.mesh, self.times, q, markers, self.surface(environment).solids)
 
     @property
-    def _labelled(self) -> torch.Tensor:
+    def labelled(self) -> torch.Tensor:
         """Markers (T + 1, B, M, 3); M = 0 if these are the vertices."""
         return self.markers if self.labels else self.markers[:, :, :0]
 
@@ -257,11 +259,15 @@ class Motion:
         if self.reaction is None or not len(self.body.fixed_vertices):
             raise InputError("this motion has no reaction: nothing holds the body at fixed vertices, or no step did.")
         clamp = self.reaction.at(self.body.fixed_vertices)
-        values = self._of(torch.cat([clamp.force, clamp.moment()], -1), environment)
+        values = self.of_environment(torch.cat([clamp.force, clamp.moment()], -1), environment)
         return dict(zip(_LOADS, np.concatenate([np.full((1, 6), np.nan), values]).T, strict=True))
 
-    def _of(self, series: torch.Tensor, environment: int) -> FloatArray:
-        """Values (T, ...) of an environment, from those of all (T, B, ...)."""
+    def of_environment(self, series: torch.Tensor, environment: int) -> FloatArray:
+        """Returns values (T, ...) of an environment, from those of all (T, B, ...).
+
+        Raises:
+            InputError: an unknown environment.
+        """
         if not 0 <= environment < self.q.shape[1]:
             raise InputError(f"environment is {environment}: there are {self.q.shape[1]}, numbered from 0.")
         return _array(series[:, environment])

@@ -14,6 +14,7 @@ from ..control.plan import tracked_of
 from ..control.reduction import reduced_of
 from ..control.sampling import driven_input, settle_some
 from ..control.worlds import Laboratory, ReducedWorld, RobotWorld, World, laboratory_robot, laboratory_settings
+from ..experiment.build import choose_device
 from ..io.arrays import FloatArray
 from ..io.errors import InputError
 from ..robot.actuation import BASE
@@ -36,7 +37,7 @@ _BASE_SPEED: Final = 0.2  # largest speed of a base [m/s]
 
 def make_vector(
     task: str,
-    run: str | Path,
+    run: str | Path | Robot,
     num_envs: int = 8,
     model: str | None = None,
     world: str = "simulator",
@@ -54,12 +55,12 @@ def make_vector(
     forces: bool = False,
     squeeze: float = 0.0,
 ) -> RobotVectorEnv:
-    """Makes a vector environment of robots of a run, or of a file, with a task.
+    """Makes a vector environment of robots of a run, of a file, or of Python, with a task.
 
     Args:
         task: ``reach``, ``follow``, ``swing_up``, which moves the base, ``grasp``, by two fingers (`GraspWorld`), or
             ``pick_and_place``, by two fingers on an arm (`ArmWorld`).
-        run: the run folder, or a file of `Robot.save`.
+        run: the run folder, a file of `Robot.save`, or a robot, which needs ranges of its input if it is of `Robot.of`.
         num_envs: B.
         model: of the run; ``resphys`` if omitted.
         world: ``simulator``; ``reduced``, the reduced model, which is fast and has fixed parameters (computing it takes
@@ -88,7 +89,7 @@ def make_vector(
     seconds = (5.0 if arms else 2.0) if seconds is None else seconds
     actions, up = max(round(seconds / action_time), 1), _up(robot)
     shown = None if robot.labels else _spread_vertices(robot)
-    bodies, mapping = _bodies(task, robot, Path(run).expanduser(), num_envs, world, spread, axis, shown, seed, frames)
+    bodies, mapping = _bodies(task, robot, num_envs, world, spread, axis, shown, seed, frames)
     rest = bodies.markers(bodies.rest)[0]
     last = {"grasp": 3, "pick_and_place": 6}.get(task)  # coordinates of the task among those of the markers
     point = _tip(robot, rest, tracked, shown) if last is None else np.eye(last, rest.size, rest.size - last)
@@ -111,14 +112,21 @@ def _lift(robot: Robot, count: int, up: FloatArray, place: FloatArray, grasps: b
 
 
 def _loaded(
-    task: str, run: str | Path, model: str | None, world: str, device: str, action_time: float
+    task: str, run: str | Path | Robot, model: str | None, world: str, device: str, action_time: float
 ) -> tuple[Robot, int]:
     """Returns the robot of a run, which must suit the task, and the number of steps of an action."""
     if task not in TASKS:
         raise InputError(f"the task is {task!r}: choose {', '.join(TASKS)}.")
     if world not in WORLDS:
         raise InputError(f"the world is {world!r}: choose {', '.join(WORLDS)}.")
-    robot = load(run, model, device, "count")
+    if isinstance(run, Robot):
+        if model not in (None, run.description.model):
+            raise InputError(f"the model is {model!r}, but the robot is {run.description.model!r}: leave model out.")
+        robot = Robot(run.description, choose_device(device), "count", run.parameters, run.folder)
+    else:
+        robot = load(run, model, device, "count")
+    if world == "laboratory" and robot.folder is None:
+        raise InputError("only a run folder has a laboratory: choose world simulator or reduced.")
     frames = round(action_time / robot.time_step)
     if frames < 1 or abs(frames * robot.time_step - action_time) > 1e-9:
         raise InputError(
@@ -132,7 +140,6 @@ def _loaded(
 def _bodies(
     task: str,
     robot: Robot,
-    run: Path,
     count: int,
     world: str,
     spread: float,
@@ -147,7 +154,7 @@ def _bodies(
     """
     bodies: World[Any]
     if task in ("grasp", "pick_and_place"):
-        return _grippers(task, robot, run, count, world, frames)
+        return _grippers(task, robot, count, world, frames)
     if task == "swing_up":
         along = np.concatenate([np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis), np.zeros(3)])[None]
         bodies = RobotWorld(robot, BASE, count, spread, along, shown)
@@ -159,14 +166,14 @@ def _bodies(
     elif world == "simulator":
         bodies = RobotWorld(robot, driven.name, count, spread, shown=shown)
     else:
-        bodies = Laboratory(laboratory_settings(run), run, driven.name, count, seed, "count")
+        assert robot.folder is not None
+        settings = laboratory_settings(robot.folder)
+        bodies = Laboratory(settings, robot.folder, driven.name, count, seed, "count")
     low, high = np.array(driven.low), np.array(driven.high)
     return bodies, ActionMapping(low, high, (high - low) / _RISE, np.zeros(len(low)), frames)
 
 
-def _grippers(
-    task: str, robot: Robot, run: Path, count: int, world: str, frames: int
-) -> tuple[World[Any], ActionMapping]:
+def _grippers(task: str, robot: Robot, count: int, world: str, frames: int) -> tuple[World[Any], ActionMapping]:
     """Grippers of two fingers each, and the map from actions to their input and height, or the angles of their arms."""
     driven = driven_input(robot)
     if world == "reduced":
@@ -178,7 +185,8 @@ def _grippers(
         )
     time_step = robot.time_step
     if world == "laboratory":
-        robot = laboratory_robot(laboratory_settings(run), upright=True, on_failure="count")
+        assert robot.folder is not None
+        robot = laboratory_robot(laboratory_settings(robot.folder), upright=True, on_failure="count")
     low, high = np.array(driven.low), np.array(driven.high)
     rate = (high - low) / _RISE
     bodies: World[Any]
@@ -239,7 +247,7 @@ def _tip(robot: Robot, markers: FloatArray, tracked: Sequence[str] | None, shown
 class RobotEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """A single robot as a Gymnasium environment, with the arguments of `make_vector`."""
 
-    def __init__(self, task: str, run: str | Path, render_mode: str | None = None, **settings: Any) -> None:
+    def __init__(self, task: str, run: str | Path | Robot, render_mode: str | None = None, **settings: Any) -> None:
         self._one = make_vector(
             task, run, 1, render_mode=render_mode, autoreset_mode=gym.vector.AutoresetMode.DISABLED, **settings
         )

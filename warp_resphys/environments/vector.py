@@ -123,26 +123,26 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
 
     @override
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | IntArray | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begins new episodes of all robots, with newly drawn parameters, or of those in ``options["reset_mask"]``.
 
         Args:
-            seed: of the first robot, followed by the next integers for the others; or a seed for each robot.
+            seed: of the first robot, followed by the next integers for the others; or a seed for each robot. Robots
+                that the mask leaves out keep their random numbers.
             options: ``reset_mask``, (B,) bool.
 
         Raises:
-            InputError: a mask of another shape or type.
+            InputError: a mask of another shape or type, or seeds that are none.
         """
-        count = self.num_envs
-        if seed is not None or self._random is None:
-            first = int(np.random.default_rng().integers(2**31)) if seed is None else seed
-            seeds = first if isinstance(first, Sequence) else range(first, first + count)
-            self._random = [np.random.default_rng(number) for number in seeds]
-        mask = (options or {}).get("reset_mask")
+        count, mask = self.num_envs, (options or {}).get("reset_mask")
         chosen = np.ones(count, dtype=np.bool_) if mask is None else np.asarray(mask)
         if chosen.shape != (count,) or chosen.dtype != np.bool_:
             raise InputError(f"reset_mask must be a boolean array of shape ({count},).")
+        if seed is not None or self._random is None:
+            drawn = _generators(seed, count)
+            kept = drawn if self._random is None else self._random
+            self._random = [new if begins else old for new, old, begins in zip(drawn, kept, chosen, strict=True)]
         if chosen.all():
             self.world.vary(self._random)
         self._begin(chosen)
@@ -275,6 +275,23 @@ class RobotVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
             infos |= {"final_info": {"error_mm": infos["error_mm"], "_error_mm": over}, "_final_info": over}
             self._begin(over)
         return self._observed(), rewards, terminated, truncated, infos
+
+
+def _generators(seed: int | Sequence[int | None] | IntArray | None, count: int) -> list[np.random.Generator]:
+    """Returns a generator for each of B robots, from the seed of the first one or a seed for each; None: any.
+
+    Raises:
+        InputError: seeds that are no whole numbers from zero on, or another number of them.
+    """
+    first = np.random.default_rng().integers(2**31) if seed is None else seed
+    given = np.asarray(first, dtype=object)
+    seeds = [*given] if given.ndim else [given.item()]
+    known = [isinstance(number, int | np.integer) and number >= 0 for number in seeds if number is not None]
+    if not all(known) or (not known and not given.ndim) or len(seeds) != (count if given.ndim else 1):
+        raise InputError(f"seed is {seed!r}: give a whole number from zero on, or {count} of them, one for each robot.")
+    if not given.ndim:
+        seeds = [int(seeds[0]) + number for number in range(count)]
+    return [np.random.default_rng(number) for number in seeds]
 
 
 class Camera:

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ..io.errors import InputError
+from ..mesh.motion_files import write_vtu
 from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
@@ -197,7 +198,7 @@ class Body:
 
         Args:
             state: a state of the simulator or of a robot, or positions (N, 3) or (B, N, 3) [m]; at rest if omitted.
-            environment: index of the environment.
+            environment: its index.
             screenshot: PNG file to draw off screen.
             plotter: a ``pyvista.Plotter`` to which the body is only added.
             options: of ``pyvista.Plotter.add_mesh``.
@@ -208,16 +209,44 @@ class Body:
         Raises:
             InputError: positions of another body, or an unknown environment.
         """
-        q = self.vertices if state is None else torch.as_tensor(getattr(state, "q", state)).detach().cpu().numpy()
-        if q.shape[-2:] != self.vertices.shape or q.ndim > 3 or not 0 <= environment < (len(q) if q.ndim == 3 else 1):
-            raise InputError(
-                f"positions to draw have shape {q.shape}, and environment is {environment}: give {self.vertices.shape} "
-                "positions, or such an array for each environment."
-            )
-        at = np.asarray(q[environment] if q.ndim == 3 else q, dtype=np.float64)
+        at = self._at(self.vertices if state is None else getattr(state, "q", state), environment)
         meshes = ((at[first:][: member.n_vertices], member.mesh) for _, member, first in self.members)
         parts = ((points, mesh.cells, mesh.element, mesh.regions) for points, mesh in meshes)
         return plot_parts(parts, at[self.fixed_vertices], screenshot, plotter, **options)
+
+    def write_vtk(self, path: str | Path, state: Any = None, environment: int = 0) -> Path:
+        """Writes the body in a state to a file for ParaView, as `Motion.write_vtk` does for a motion.
+
+        The vertices have their ``displacement``, and of a state the ``velocity`` and any ``reaction`` [N].
+
+        Args:
+            path: path of the ``.vtu`` file.
+            state: as for `plot`.
+            environment: index of the environment.
+
+        Raises:
+            InputError: positions of another body, an unknown environment, or another extension.
+            DataFileError: the file cannot be written.
+        """
+        at = self._at(self.vertices if state is None else getattr(state, "q", state), environment)
+        moving = {"velocity": self._at(state.v, environment)} if hasattr(state, "v") else {}
+        fields = {"displacement": at - self.vertices, **moving}
+        reaction = getattr(state, "reaction", None)
+        if reaction is not None:
+            fields["reaction"] = np.zeros_like(at)
+            fields["reaction"][reaction.vertices.cpu()] = reaction.forces[environment].detach().cpu().numpy()
+        blocks = [(body.mesh.element.file_type, body.mesh.cells + first) for _, body, first in self.members]
+        return write_vtu(Path(path).expanduser(), at, blocks, fields)
+
+    def _at(self, values: Any, environment: int) -> NDArray[np.float64]:
+        """Returns vectors (N, 3) of an environment, from those of one or of several (B, N, 3)."""
+        q = torch.as_tensor(values).detach().cpu().numpy()
+        if q.shape[-2:] != self.vertices.shape or q.ndim > 3 or not 0 <= environment < (len(q) if q.ndim == 3 else 1):
+            raise InputError(
+                f"positions have shape {q.shape}, and environment is {environment}: give {self.vertices.shape} "
+                "positions, or such an array for each environment."
+            )
+        return np.asarray(q[environment] if q.ndim == 3 else q, dtype=np.float64)
 
     @property
     def n_vertices(self) -> int:

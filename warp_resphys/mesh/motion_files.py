@@ -88,17 +88,32 @@ def write_vtk(
     return path
 
 
+def write_vtu(path: Path, points: FloatArray, cells: Sequence[tuple[str, IntArray]], fields: Mapping[str, Any]) -> Path:
+    """Writes a file for ParaView.
+
+    Args:
+        path: path of the ``.vtu`` file.
+        points: (N, 3) [m].
+        cells: names of their kinds in files, and their points, in blocks.
+        fields: values (N, ...) at the points by name.
+    """
+    import meshio
+
+    if path.suffix != ".vtu":
+        raise InputError(f"{path} does not end in .vtu: give such a name, which ParaView opens as one mesh.")
+    with atomic_path(path) as partial:
+        meshio.write(partial, meshio.Mesh(points, [*cells], point_data=dict(fields)), file_format="vtu")
+    return path
+
+
 def _write_series(
     path: Path, times: FloatArray, points: FloatArray, cells: tuple[str, IntArray], fields: Iterator[dict[str, Any]]
 ) -> None:
     """Writes one file per time, then the collection that lists them."""
-    import meshio
-
     entries, digits = [], len(str(len(times) - 1))
     for number, (time, at, data) in enumerate(zip(times, points, fields, strict=True)):
         name = f"{path.stem}/{path.stem}_{number:0{digits}d}.vtu"
-        with atomic_path(path.parent / name) as partial:
-            meshio.write(partial, meshio.Mesh(at, [cells], point_data=data), file_format="vtu")
+        write_vtu(path.parent / name, at, [cells], data)
         entries.append(f'    <DataSet timestep="{time:.9g}" file={quoteattr(name)}/>')
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <Collection>", *entries]
     write_text(path, "\n".join([*lines, "  </Collection>", "</VTKFile>", ""]))

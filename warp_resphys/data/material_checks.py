@@ -98,11 +98,11 @@ def in_time(read: MeasuredTable, shown: str, path: Path) -> MeasuredTable:
         columns = {name: values for name, values in read.columns.items() if name != "time"}
         return replace(read, columns=columns, notes=(*read.notes, note))
     if anew:
-        seconds = seconds.copy()
+        joined = seconds.copy()
         for row in anew:
-            seconds[row:] += seconds[row - 1] + (after[row] if seconds[row] == 0.0 else 0.0)
+            joined[row:] += seconds[row - 1] + (after[row] if seconds[row] == 0.0 else 0.0)
         note = f"The time begins anew in {lines_of(read.lines[anew])}: it was taken to go on from the line before."
-        read = replace(read, columns={**read.columns, "time": seconds}, notes=(*read.notes, note))
+        read = replace(read, columns={**read.columns, "time": joined}, notes=(*read.notes, note))
     return read.without(repeated, "which repeat the time before them")
 
 

@@ -123,7 +123,7 @@ def _numbers(
 ) -> MeasuredTable:
     """Returns the columns of the lines with numbers."""
     header = rows[first - 1] if first else []
-    width = max(len(header), len(rows[first]) if len(rows) > first else 0)
+    width = len(header) if any(header) else max(map(len, rows[first : first + 1]), default=0)
     values, lines, lost = list[list[float]](), list[int](), list[int]()
     for line, row in enumerate(rows[first:], start=first + 1):
         if not any(row):
@@ -135,8 +135,8 @@ def _numbers(
             )
         if any(row[width:]):
             raise DataFileError(
-                f"{path}, line {line} has {len(row)} cells where the lines before have {width}: leave out marks "
-                "between thousands, and put text with commas in quotation marks."
+                f"{path}, line {line} has {len(row)} cells where its header has {width}: leave out marks between "
+                "thousands, put text with commas in quotation marks, and name each column."
             )
         cells = [row[column] if column < len(row) else "" for column in names]
         given = [number(cell) for cell in cells]

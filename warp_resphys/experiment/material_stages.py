@@ -69,8 +69,9 @@ def table_files(data: MaterialTestData) -> dict[str, list[Path]]:
             matches = []
         files = [path for path in matches if path.is_file() and path.resolve() not in named]
         if name not in single and not files:
-            what = "is a folder, not a file" if (folder / pattern).is_dir() else "is no file"
-            raise DataFileError(f"{folder / pattern} {what}: set data.folder and data.tests.{name}.file.")
+            place = folder / pattern
+            what = f"{place} is a folder, not a file" if place.is_dir() else f"there is no file {place}"
+            raise DataFileError(f"{what}: set data.folder and data.tests.{name}.file.")
         found[name] = files or [single[name]]
     return found
 

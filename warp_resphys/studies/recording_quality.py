@@ -137,6 +137,12 @@ def inspect_recording(settings: RecordingInspection, folder: Path) -> str:
     configured = settings.recording.arguments()
     recordings = [str(settings.recording.path), *settings.compare_with]
     recording, *others = [read_recording(**{**configured, "path": path}) for path in recordings]
+    if not recording.labels:
+        known = listed([*recording.loads])
+        raise DataFileError(
+            f"{recording.source} has no markers, whose quality is examined, but force sensors alone ({known}): read it "
+            "in Python, or convert it."
+        )
     release = release_of(recording, settings.moving, longest_gap) if settings.moving else None
     result = quality(recording, still, release, longest_gap=longest_gap, least_jump=settings.least_jump)
     trials = [recording, *others]
@@ -236,9 +242,11 @@ def convert(settings: Conversion, folder: Path) -> None:
         write_recording(place, recording)
         frames, channels = len(recording.positions), recording.actuation
         inputs = "" if channels is None else f", inputs {channels.shape[1]}"
+        sensors = f", force sensors {listed([*recording.loads])}" if recording.loads else ""
+        seen = f", seen {recording.seen.mean():.1%}" if recording.labels else ""
         print(
-            f"{path} -> {place}: {frames} frames at {recording.rate:g} Hz, markers {listed(recording.labels)}{inputs}, "
-            f"seen {recording.seen.mean():.1%}"
+            f"{path} -> {place}: {frames} frames at {recording.rate:g} Hz, markers {listed(recording.labels)}{inputs}"
+            f"{sensors}{seen}"
         )
 
 

@@ -1,14 +1,15 @@
 """Recordings in ROS 1 and 2 bags, also as single MCAP files, read without ROS by the package rosbags.
 
 Every topic has messages at its own times: those of its headers or, without headers, those at which it was recorded, on
-the clock of the headers. Markers and inputs are brought to common frames: markers by linear interpolation, rotations by
-the shortest turn, and inputs keep their last value.
+the clock of the headers, which must be one for all topics, and run. Markers and inputs are brought to common frames:
+markers by linear interpolation, rotations by the shortest turn, and inputs keep their last value.
 
 A source is a topic, with a member after # where a message has several: the child frame of a transform (``/tf#tip``),
 the number of a point, a pose or a number in an array, from 1 (``/cloud#3``), or the quantity of a joint
 (``/joint_states#finger.effort``). Those of inputs have their unit in brackets (``/pressure#1 [mbar]``).
 """
 
+import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,7 +26,11 @@ from ...settings.data_kinds import BagSettings
 from ..base_motion import since_first
 from .recording import SI_PER_ACTUATION_UNIT, Recording
 
+log = logging.getLogger(__name__)
+
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
+_SAME_CLOCK = 1.0  # s: topics whose delays differ by more have other clocks
+_FROZEN = 5  # messages with one time, of a clock that stands still
 _GAP = 2.5  # frames: a marker without messages for longer is not seen
 _SOURCE = re.compile(r"(?P<topic>[^#\s]+)(?:#(?P<member>\S+))?(?:\s*\[(?P<unit>[^\]]+)\])?")
 _CLOUD_TYPES = {7: "f4", 8: "f8"}  # of the fields of a PointCloud2
@@ -78,8 +83,7 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
         if not source.values:
             named = "" if source.member is None else f" of {source.member}"
             raise DataFileError(f"{path}: {source.topic} has no message{named}; check what was recorded.")
-    clocks = np.concatenate([np.subtract(source.received, source.stamps) for source in sources])
-    late = float(np.nanmedian(clocks)) if np.isfinite(clocks).any() else 0.0
+    late = _late(path, sources)
     times, rate = _frames(path, [source.series(late)[0] for source in markers], bag.rate)
     moved = np.stack([_at_frames(*source.series(late), times, rate) for source in markers], 1)
     columns = []
@@ -98,6 +102,35 @@ def read_bag(path: Path, bag: BagSettings) -> Recording:
         turns=moved[..., 3:] if np.isfinite(moved[..., 3:]).any() else None,
         loads=loads,
     )
+
+
+def _late(path: Path, sources: "Sequence[_Source]") -> float:
+    """Returns the clock of the bag less that of the headers [s].
+
+    Raises:
+        DataFileError: topics have headers of different clocks.
+    """
+    by_topic = {source.text: source.ahead() for source in sources}
+    ahead = {topic: late for topic, late in by_topic.items() if len(late)}
+    if not ahead:
+        return 0.0
+    first, *others = ahead
+    for topic in others:
+        apart = ahead[topic] - ahead[first]
+        if np.abs(apart).max() > _SAME_CLOCK:
+            raise DataFileError(
+                f"{path}: the headers of {topic} are of another clock than those of {first}: they differ by "
+                f"{apart[0]:.3g} s at the start and {apart[1]:.3g} s at the end; record both with one clock."
+            )
+    drift = float(np.ptp(next(iter(ahead.values()))))
+    bare = [source.topic for source in sources if not np.isfinite(source.stamps).any()]
+    if bare and drift > _SAME_CLOCK:
+        raise DataFileError(
+            f"{path}: {bare[0]} has no headers, and the clock of those of {first} drifts from that of the bag by "
+            f"{drift:.3g} s: record both with one clock."
+        )
+    clocks = np.concatenate([np.subtract(source.received, source.stamps) for source in sources])
+    return float(np.nanmedian(clocks))
 
 
 @contextmanager
@@ -155,6 +188,36 @@ class _Source:
         stamps, received = np.array(self.stamps), np.array(self.received)
         times, first = np.unique(np.where(np.isfinite(stamps), stamps, received - late), return_index=True)
         return times, np.array(self.values, dtype=np.float64)[first]
+
+    def ahead(self) -> FloatArray:
+        """Clock of the bag less that of the headers (2,) [s], in the first and last tenth; empty without two headers.
+
+        Raises:
+            DataFileError: stamps stand still or fall back.
+        """
+        stamps, received = np.array(self.stamps), np.array(self.received)
+        known = np.isfinite(stamps)
+        stamps, received = stamps[known], received[known]
+        if len(stamps) < 2:  # such as one that was sent before the recording
+            return stamps[:0]
+        _, counts = np.unique(stamps, return_counts=True)
+        repeated = len(stamps) - len(counts)
+        fallen = np.flatnonzero(np.diff(stamps) < -_SAME_CLOCK)
+        if len(fallen) or 2 * repeated > len(stamps) or counts.max() >= _FROZEN:
+            what = f"{repeated} of {len(stamps)} messages repeat the time of another"
+            if len(fallen):
+                what = f"the time falls by {stamps[fallen[0]] - stamps[fallen[0] + 1]:.3g} s at message {fallen[0] + 2}"
+            raise DataFileError(
+                f"{self.path}: in the headers of {self.topic}, {what}: record it with a clock that runs, or without "
+                "headers."
+            )
+        if repeated:
+            log.warning(
+                "%s: %d of %d messages of %s left out, which repeat the time of another.",
+                *(self.path.name, repeated, len(stamps), self.topic),
+            )
+        late, tenth = received - stamps, max(len(stamps) // 10, 1)
+        return np.array([np.median(late[:tenth]), np.median(late[-tenth:])])
 
     @property
     def number(self) -> int:

@@ -4,7 +4,6 @@ A cell that is empty or NaN is an occlusion.
 """
 
 import logging
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +15,11 @@ from ...io.arrays import FloatArray, IntArray
 from ...io.errors import DataFileError
 from ...io.text import Rows, number
 from ..force_sensors import AXES as FORCES
-from ..force_sensors import UNITS
-from .recording import SI_PER_LOAD_UNIT, Recording
+from .column_names import AXES
+from .recording import Recording
 
 log = logging.getLogger(__name__)
 
-AXES = ("x", "y", "z")
 _OCCLUDED = {"", "nan", "null", "none", "na", "n/a", "#n/a", "-", "--"}
 _UNEVEN = 0.25  # of a frame: largest error of a time stamp
 _NEXT = 1.5  # of the median interval: the longest one without a missing frame
@@ -30,8 +28,6 @@ _LARGEST_STAMP = 1e12  # [s or 1] largest valid time or frame number
 _LEAST_FRAMES = 2  # of a recording
 _LONGEST_GAP = 3.0  # median intervals between lines, through which coordinates of uneven times are interpolated
 _LEAST_RECORDED = 0.1  # of the frames between the first and the last
-
-_LOAD = re.compile(r"(?P<name>.+)\.(?P<axis>[ft][xyz])", re.IGNORECASE)  # of a force sensor
 
 Place = tuple[str, str, int]  # label, axis and column of a coordinate
 # Names of the k columns with the rotation of a rigid body, and a function of their numbers (T, k) that returns
@@ -111,7 +107,7 @@ class Layout:
             grid = np.arange(frames[-1] + 1)
             actuation = np.stack([np.interp(grid, frames, channel) for channel in driven.T], axis=1)
         positions = np.full((frames[-1] + 1, len(markers), 3), np.nan)  # NaN in frames that were not recorded
-        positions[frames] = values[:, chosen].reshape(len(values), -1, 3)
+        positions[frames] = values[:, chosen].reshape(len(values), len(markers), 3)
         loads, given = dict[str, FloatArray](), set[tuple[str, int]]()
         for column, (name, axis, factor) in self.loads.items():
             if (name, axis) in given:
@@ -183,12 +179,15 @@ class Layout:
         wanted += [(label, axis) for label in bodies for axis in (*AXES, *self.turn[0])]
         for label, axis in wanted:
             if (label, axis) not in columns:
-                what, lacks = ("marker", "")
+                what, cure = "marker", "export it again with all"
                 if label in bodies:
-                    what, lacks = "rigid body", f" ({', '.join((*AXES, *self.turn[0]))})"
-                raise DataFileError(
-                    f"{path}: {what} {label} has no column '{label}.{axis}'; export it again with all{lacks}."
-                )
+                    what, cure = "rigid body", f"export it again with all ({', '.join((*AXES, *self.turn[0]))})"
+                elif len([name for name, _ in columns if name == label]) == 1:
+                    cure = (
+                        "its single axis is a distance, as of a laser, and a marker needs two or three: give the "
+                        "others, 0 where it cannot move, or leave the column out in data.table"
+                    )
+                raise DataFileError(f"{path}: {what} {label} has no column '{label}.{axis}'; {cure}.")
         chosen = [columns.get((label, axis), -1) for label in labels for axis in AXES]
         return labels, chosen, {labels.index(body): [columns[body, axis] for axis in self.turn[0]] for body in bodies}
 
@@ -219,26 +218,6 @@ class Layout:
         if len(values) < _LEAST_FRAMES:
             raise DataFileError(f"{path} holds {len(values)} frames: a recording needs two or more.")
         return np.array(values, dtype=np.float64), lines
-
-
-def load_of(head: str, unit: str | None, path: Path) -> tuple[str, int, float] | None:
-    """Returns the sensor, index in `force_sensors.AXES` and factor to SI units of a column; None for another column.
-
-    Raises:
-        DataFileError: a force has the unit of a moment, or a moment that of a force, or neither has one.
-    """
-    if (match := _LOAD.fullmatch(head)) is None or (unit is not None and unit not in SI_PER_LOAD_UNIT):
-        return None
-    name, axis = match["name"], match["axis"].lower()
-    kind, factor = SI_PER_LOAD_UNIT.get(unit or "", ("", 0.0))
-    if kind != axis[0]:
-        given = "no unit" if unit is None else f"the unit '{unit}'"
-        known = ", ".join(word for word, (of, _) in SI_PER_LOAD_UNIT.items() if of == axis[0])
-        raise DataFileError(
-            f"{path}: the column {head} of a force sensor has {given}: give one of {known} in brackets, as in "
-            f"'{head} [{UNITS[axis]}]'."
-        )
-    return name, FORCES.index(axis), factor
 
 
 def _switched_on(driven: FloatArray, lines: Sequence[int], path: Path) -> FloatArray:
@@ -277,14 +256,22 @@ def is_data(row: Sequence[str]) -> bool:
     return len(row) >= 3 and begins and 2 * sum(number(cell) is not None for cell in filled) > len(filled)
 
 
+def has_numbers(row: Sequence[str]) -> bool:
+    """Whether half of the cells of a line or more, and two at least, are numbers, after words such as a state."""
+    filled = [cell for cell in row if cell]
+    return max(2, 0.5 * len(filled)) <= sum(number(cell) is not None for cell in filled)
+
+
 def _check_rise(stamps: FloatArray, lines: Sequence[int], path: Path) -> None:
     """Refuses times or frame numbers that do not rise."""
     known = np.abs(stamps) <= _LARGEST_STAMP
     wrong = np.append(~known[0], ~(np.diff(np.where(known, stamps, np.nan)) > 0.0))
     if wrong.any():
+        row = int(np.argmax(wrong))
         raise DataFileError(
-            f"{path}, line {lines[int(np.argmax(wrong))]}: the time or frame does not rise, or is no number below "
-            "1e12; sort the lines and fill it in."
+            f"{path}, line {lines[row]}: the time or frame does not rise (from {stamps[max(row - 1, 0)]:g} to "
+            f"{stamps[row]:g}), or is no number below 1e12; sort the lines and fill it in, or write what follows into "
+            "a file of its own if the clock begins anew there."
         )
 
 

@@ -25,9 +25,14 @@ _SPELLED = {
 _UNLABELLED = re.compile(
     r"(?:.*:)?\*|unlabell?ed|uname|[\d ]*$", re.IGNORECASE
 )  # as Vicon and OptiTrack name trajectories
-# Kind and factor to SI units of forces and moments.
-SI_PER_LOAD_UNIT = {"N": ("f", 1.0), "mN": ("f", 1e-3), "kN": ("f", 1e3), "N m": ("t", 1.0), "Nm": ("t", 1.0)}
-SI_PER_LOAD_UNIT |= dict.fromkeys(("N mm", "Nmm", "mN m", "mNm"), ("t", 1e-3))
+# Kind and factor to SI units of forces and moments; other spellings of products, as N*m, become these.
+SI_PER_LOAD_UNIT = {
+    **{"N": ("f", 1.0), "mN": ("f", 1e-3), "kN": ("f", 1e3)},
+    **{"gf": ("f", 9.80665e-3), "kgf": ("f", 9.80665), "lbf": ("f", 4.4482216)},
+    **{"N m": ("t", 1.0), "Nm": ("t", 1.0), "N cm": ("t", 1e-2), "Ncm": ("t", 1e-2)},
+    **dict.fromkeys(("N mm", "Nmm", "mN m", "mNm"), ("t", 1e-3)),
+    **{"lbf in": ("t", 0.11298483), "lbf ft": ("t", 1.3558179), "kgf cm": ("t", 9.80665e-2)},
+}
 # Factors to SI units; 1 for an actuation without a unit.
 SI_PER_ACTUATION_UNIT = {"Pa": 1.0, "kPa": 1e3, "mbar": 1e2, "bar": 1e5, "N": 1.0, "m": 1.0, "mm": 1e-3, "1": 1.0}
 LARGEST_SPAN = 100.0  # [m]
@@ -149,6 +154,7 @@ def in_metres(
         raise InputError(f"rate is {rate!r}: set it to the frames a second of {path}.")
     _check_shapes(recording)
     unit, rate = length_unit(recording.unit if units is None else units), recording.rate if rate is None else rate
+    unit = unit if recording.positions.size else "m"  # of forces alone
     lacks, cures = list[str](), list[str]()
     if unit not in METRES_PER_UNIT:
         lacks.append(f"gives positions in '{unit}'" if unit else "does not say in which unit its positions are")
@@ -176,7 +182,8 @@ def in_metres(
 def _check_shapes(recording: Recording) -> None:
     """Refuses arrays that do not belong to each other, and inputs or times that are not finite."""
     path, shape, driven = recording.source, recording.positions.shape, recording.actuation
-    if len(shape) != 3 or shape[2] != 3 or 0 in shape:
+    forces_alone = shape[1:2] == (0,) and recording.loads
+    if len(shape) != 3 or shape[2] != 3 or (0 in shape and not (forces_alone and shape[0])):
         raise DataFileError(
             f"{path} holds no marker trajectories: positions must be (frames, markers, 3), not {shape}."
         )
@@ -200,6 +207,8 @@ def _check_shapes(recording: Recording) -> None:
 def _check_span(recording: Recording) -> None:
     """Refuses positions in a wrong unit, or none."""
     seen = recording.positions[recording.seen]
+    if not recording.positions.size:
+        return
     if not len(seen):
         raise DataFileError(f"{recording.source}: no marker is seen in any frame; check how it was exported.")
     with np.errstate(over="ignore"):

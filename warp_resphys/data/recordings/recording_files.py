@@ -151,7 +151,9 @@ def _assembled(arrays: Arrays, path: Path) -> Recording:
             f"{path}: loads has the shape {loads.shape}, and sensors names {listed(sensors) or 'none'}: loads are "
             "(frames, sensors, 6), forces and moments of each sensor [N, N m], NaN where they were not measured."
         )
-    positions, base = numbers(arrays, "positions", path), found.get("base")
+    alone = "loads" in found and "positions" not in arrays
+    positions = np.zeros((len(loads), 0, 3)) if alone else numbers(arrays, "positions", path)
+    base = found.get("base")
     if base is not None and base.shape != (len(positions), 7):
         raise DataFileError(
             f"{path}: base has the shape {base.shape}; it needs a place and a quaternion (w, x, y, z) for each of the "

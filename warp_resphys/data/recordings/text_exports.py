@@ -6,8 +6,7 @@ docs/recordings.md describes the layouts. Each function here finds the columns o
 
 import logging
 import re
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
@@ -21,31 +20,15 @@ from ...io.arrays import FloatArray
 from ...io.errors import DataFileError, did_you_mean, listed
 from ...io.text import Rows, number, read_rows
 from ...settings.data_kinds import TableSettings
-from .columns import AXES, QUATERNION, Layout, Place, Turn, is_data, load_of, quaternions
-from .recording import METRES_PER_UNIT, SI_PER_ACTUATION_UNIT, Recording, hide_zeros, length_unit, without_subject
+from .column_names import SECONDS, UNIT_NAMES, Columns, coordinates_of, is_channel, load_of, name_and_unit, unit_of
+from .columns import AXES, QUATERNION, Layout, Place, Turn, has_numbers, is_data, quaternions
+from .recording import SI_PER_ACTUATION_UNIT, Recording, hide_zeros, without_subject
 
 log = logging.getLogger(__name__)
 
-Columns = Mapping[int, tuple[str, str | None]]  # names and units by number
-
-_CHANNEL_UNITS = [unit for unit in SI_PER_ACTUATION_UNIT if unit not in METRES_PER_UNIT]  # not of misspelt markers
 _TIMES = ("time", "t", "timestamp", "zeit", "temps", "tiempo", "tempo")
 _FRAMES = ("frame", "frame#", "frames", "frame number", "frame_number", "index", "sample")
-_SECONDS = {
-    **{"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "milliseconds": 1e-3},
-    **{"us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9},  # two letters, which look alike
-}
-_SPELLED = {unit.lower(): unit for unit in ("px", "iso", *SI_PER_ACTUATION_UNIT, *_SECONDS, *METRES_PER_UNIT)}
-_NAMED_UNITS = {*_SPELLED.values()} - {"1", "N"}  # of columns without square brackets
 _OF_DAY = re.compile(r"^(\d{1,2})(:.*)")
-_AXIS = r"(?P<axis>q?[xyz]|qw)"
-_DOTTED = re.compile(rf"(?P<label>.+)\.{_AXIS}", re.IGNORECASE)
-_FORMS = (  # of names of coordinates; all but the first need a second axis beside them
-    _DOTTED,
-    re.compile(rf"(?P<label>.+)[ _/]{_AXIS}", re.IGNORECASE),  # tip_x
-    re.compile(r"(?P<axis>[xyz])[ _]?(?P<label>.+)", re.IGNORECASE),  # x1
-    re.compile(r"(?P<label>.*)(?P<axis>[xyz])", re.IGNORECASE),  # tipX, x
-)
 _QUALISYS_KEYS = ("FILE_VERSION", "NO_OF_FRAMES", "NO_OF_MARKERS", "NO_OF_BODIES", "FREQUENCY", "MARKER_NAMES")
 _ANGLES, _MATRIX = ("roll", "pitch", "yaw"), tuple(f"rot[{entry}]" for entry in range(9))
 _VICON = ("Trajectories", "Objects", "Devices", "Joints", "Model Outputs", "Segments")  # sections
@@ -71,27 +54,27 @@ def read_text_export(path: Path, table: TableSettings | None = None) -> Recordin
 
 def _read_named(rows: Rows, path: Path) -> Recording:
     """Reads a table with a header; names of markers above their axes, and units below, may have lines of their own."""
-    first = next((line for line, row in enumerate(rows) if is_data(row)), len(rows))
+    first = next((line for form in (is_data, has_numbers) for line, row in enumerate(rows) if form(row)), len(rows))
     head = [[cell.lstrip("# ") for cell in row] for row in rows[:first] if any(row)] or [[""]]
     units: list[str] = []
-    if len(head) > 1 and all(_unit(cell.strip("[]()")) in {"", *_SPELLED.values()} for cell in head[-1]):
+    if len(head) > 1 and all(unit_of(cell.strip("[]()")) in {"", *UNIT_NAMES} for cell in head[-1]):
         units = [cell.strip("[]()") for cell in head.pop()]
-    named = {column: _name_and_unit(cell) for column, cell in enumerate(head[-1]) if cell}
+    named = {column: name_and_unit(cell) for column, cell in enumerate(head[-1]) if cell}
     labels = _filled(head[-2], len(head[-1])) if len(head) > 1 else [""] * len(head[-1])
     columns = dict[int, tuple[str, str | None]]()
     for column, (name, unit) in named.items():
         of_marker = f"{labels[column]}.{name}" if labels[column] and name.lower() in AXES else name
-        columns[column] = of_marker, unit or (_unit(units[column]) if column < len(units) else "") or None
+        columns[column] = of_marker, unit or (unit_of(units[column]) if column < len(units) else "") or None
     clocks = [column for words in (_TIMES, _FRAMES) for column in columns if columns[column][0].lower() in words]
     for column in clocks[1:]:  # A frame number beside the time says nothing new.
         del columns[column]
-    if first == len(rows) or not _coordinates(columns):
+    if first == len(rows) or not (coordinates_of(columns) or any(load_of(*one, path) for one in columns.values())):
         raise DataFileError(
             f"{path} has no header that is known: write 'time [s]' or 'frame', then '<marker>.x', '<marker>.y' and "
             "'<marker>.z' for each marker above its numbers, or name all columns in data.table, for inspect and "
             'convert as in \'recording.table={columns: ["time [s]", null, "tip.x [mm]", "tip.y [mm]"]}\'.'
         )
-    return _read_table(rows, first, columns, _CHANNEL_UNITS, max(*columns, *clocks) + 1, path)
+    return _read_table(rows, first, columns, is_channel, max(*columns, *clocks) + 1, path)
 
 
 def _filled(row: Sequence[str], width: int) -> list[str]:
@@ -115,7 +98,7 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
                     f"{path}, line {first + 1}: data.table.names has {name!r}, which {header.count(name)} columns are "
                     f"named{known} data.table.header_lines is the number of lines before the header."
                 )
-        columns = {header.index(name): _name_and_unit(cell) for name, cell in table.names.items()}
+        columns = {header.index(name): name_and_unit(cell) for name, cell in table.names.items()}
         first, width = first + 1, max(column for column, cell in enumerate(header) if cell) + 1
     else:
         if len(header) < width or any(header[width:]):
@@ -123,15 +106,21 @@ def _read_described(rows: Rows, table: TableSettings, path: Path) -> Recording:
                 f"{path}, line {first + 1}: {len(header)} cells, but data.table.columns names {width}: name each "
                 "column of the file, null for one that is not read."
             )
-        columns = {column: _name_and_unit(cell) for column, cell in enumerate(table.columns) if cell}
+        columns = {column: name_and_unit(cell) for column, cell in enumerate(table.columns) if cell}
     clocks = [column for column, (name, _) in columns.items() if name.lower() in (*_TIMES, *_FRAMES)]
     if len(clocks) > 1:
         raise DataFileError(f"{path}: columns {clocks[0] + 1} and {clocks[1] + 1} both tell the time: read one only.")
-    return _read_table(rows, first, columns, list(SI_PER_ACTUATION_UNIT), width, path, table.rate)
+    return _read_table(rows, first, columns, lambda _, unit: unit in SI_PER_ACTUATION_UNIT, width, path, table.rate)
 
 
 def _read_table(
-    rows: Rows, first: int, columns: Columns, accepted: Sequence[str], width: int, path: Path, rate: float | None = None
+    rows: Rows,
+    first: int,
+    columns: Columns,
+    accepts: Callable[[str, str | None], bool],
+    width: int,
+    path: Path,
+    rate: float | None = None,
 ) -> Recording:
     """Reads columns `time [s]` or `frame`, `<marker>.x` to `.z`, of rigid bodies `.qw`, forces `.fx`, and channels.
 
@@ -139,7 +128,7 @@ def _read_table(
         rows: all lines.
         first: number of the first line of numbers.
         columns: names and units by number, at most one of them a time or frame.
-        accepted: units in brackets of the columns that are channels.
+        accepts: whether a column with a name and a unit is a channel.
         width: number of cells of a line.
         path: of the file.
         rate: at which uneven times are sampled again [Hz]; None: they are even.
@@ -157,31 +146,37 @@ def _read_table(
                 f"{path} does not say in which unit its time is, which rises by more than 1 a line: write 'time [ms]' "
                 "or 'time [s]' above it."
             )
-        if (seconds := _SECONDS.get((unit or "s").lower())) is None:
+        if (seconds := SECONDS.get((unit or "s").lower())) is None:
             raise DataFileError(
                 f"{path} gives its time in '{unit}': it must be in s, ms, us, ns or iso, as in 'time [s]'."
             )
-    places, units, channels, coordinates = list[Place](), set[str](), dict[int, float](), _coordinates(columns)
-    loads = dict[int, tuple[str, int, float]]()
+    places, units, channels, coordinates = list[Place](), set[str](), dict[int, float](), coordinates_of(columns)
+    readings = {column: load_of(*one, path) for column, one in columns.items()}
+    loads = {column: load for column, load in readings.items() if load is not None}
+    words = list[str]()
     for column, (name, unit) in columns.items():
-        if (load := load_of(name, unit, path)) is not None:
-            loads[column] = load
-        elif column in coordinates:
+        cells = [row[column] for row in rows[first:] if len(row) > column and row[column]]
+        if column in coordinates and column not in loads:
             label, axis = coordinates[column]
             places.append((label, axis, column))
             units |= {unit} if unit and axis in AXES else set()
-        elif unit is not None and unit in accepted:
+        elif unit is not None and column not in loads and accepts(name, unit):
             channels[column] = SI_PER_ACTUATION_UNIT[unit]
-        elif column != clock and any(number(row[column]) is not None for row in rows[first:] if len(row) > column):
-            kept = {*coordinates, clock, *(other for other, (_, u) in columns.items() if u in accepted)}
+        elif column != clock and column not in loads and any(number(cell) is not None for cell in cells):
+            kept = {*coordinates, *loads, clock, *(other for other, one in columns.items() if accepts(*one))}
             heads = {other: head if unit is None else f"{head} [{unit}]" for other, (head, unit) in columns.items()}
             read = [f'"{heads[other]}"' if other in kept else "null" for other in range(width)]
             raise DataFileError(
-                f"{path}: column {column + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z' nor a "
-                f"channel with a unit in brackets ({', '.join(accepted)}); rename it, or leave it out by naming "
-                f"the others: 'recording.table={{columns: [{', '.join(read)}], header_lines: {first}}}' for inspect "
-                "and convert, data.table in a configuration."
+                f"{path}: column {column + 1} is named '{name}', which is neither '<marker>.x', '.y' or '.z', nor "
+                "'<sensor>.fx [N]' to '.tz [N m]', nor a channel with a unit in brackets "
+                f"({', '.join(SI_PER_ACTUATION_UNIT)}; of lengths, as in 'tendon [mm]'); rename it, or leave it out by "
+                f"naming the others: 'recording.table={{columns: [{', '.join(read)}], header_lines: {first}}}' for "
+                "inspect and convert, data.table in a configuration."
             )
+        elif column != clock and column not in loads and cells:
+            words.append(name)
+    if words:
+        log.warning("%s: columns of text are not read: %s.", path.name, listed(words))
     if len(units) > 1:
         raise DataFileError(f"{path} gives positions in {listed(sorted(units))}: give all of them in one unit.")
     layout = Layout(first, width, places, next(iter(units), None), clock, seconds, rate, channels, loads, planar=True)
@@ -204,41 +199,6 @@ def _since_first(rows: Rows, first: int, column: int, path: Path) -> Rows:
                 "write them as 2026-01-31T12:00:00.010, all with or all without a time zone, or numbers of seconds."
             ) from None
         result[line] = [*row[:column], repr(seconds), *row[column + 1 :]]
-    return result
-
-
-def _unit(text: str) -> str:
-    """Returns the usual spelling of a unit in any case; others stay."""
-    unit = length_unit(text)
-    return _SPELLED.get(unit.lower(), unit)
-
-
-def _name_and_unit(cell: str) -> tuple[str, str | None]:
-    """Splits `name [unit]`, and `name (unit)` or `name_unit` with a known unit; None where there is no unit."""
-    for opening, closing in (("[", "]"), ("(", ")"), ("_", ""), (" ", "")):
-        name, bracket, unit = cell.removesuffix(closing).rpartition(opening)
-        if bracket and cell.endswith(closing) and (opening == "[" or _unit(unit) in _NAMED_UNITS):
-            return name.rstrip(), _unit(unit)
-    return cell, None
-
-
-def _coordinates(columns: Columns) -> dict[int, tuple[str, str]]:
-    """Returns label and axis by the number of those columns that are coordinates: tip.x, or tip_x, tip X, x1, tipX, x.
-
-    Names that are not as in tip.x must have another axis beside them, and a length as their unit if they have one.
-    """
-    found, beside = defaultdict[int, list[tuple[int, str, str]]](list), defaultdict[tuple[int, str], set[str]](set)
-    for column, (name, unit) in columns.items():
-        for form, pattern in enumerate(_FORMS):
-            if (match := pattern.fullmatch(name)) and (pattern is _DOTTED or unit in (None, "px", *METRES_PER_UNIT)):
-                found[column].append((form, match["label"], match["axis"].lower()))
-                beside[form, match["label"]].add(match["axis"].lower())
-    result = dict[int, tuple[str, str]]()
-    for column, options in found.items():
-        for form, label, axis in options:
-            if form == 0 or len(beside[form, label] & {*AXES}) > 1:
-                result[column] = label, axis
-                break
     return result
 
 

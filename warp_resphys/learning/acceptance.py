@@ -67,9 +67,10 @@ class Acceptance:
         yield from self._in_poses(run, learned, _resting(trials), "at rest", before)
         if trials.inputs.actuation and trials.inputs.fixed_positions is None:
             where = "under constant inputs of the training"
-            last, unknown = _at_the_end(trials), torch.full_like(before, torch.nan)
-            yield from self._in_poses(run, learned, trials.inputs.at(run.steps - 1), where, last)
-            yield from self._in_poses(run, learned, _largest(trials.inputs), where, unknown)
+            last, largest = trials.inputs.at(run.steps - 1), _largest(trials.inputs)
+            yield from self._in_poses(run, learned, last, where, _at_the_end(trials))
+            if any(not torch.equal(x, last.actuation[name]) for name, x in largest.actuation.items()):
+                yield from self._in_poses(run, learned, largest, where, torch.full_like(before, torch.nan))
 
     def _in_poses(
         self, run: TrialRollout, learned: Learned, inputs: Inputs, where: str, observed: torch.Tensor

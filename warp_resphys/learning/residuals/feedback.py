@@ -18,11 +18,13 @@ from ...stepping.state import State
 from .correction import acts_of
 
 _ITERATIONS = 50
-_TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-8}  # m
-_PATIENCE = 20  # iterations without progress, after which the search ends
+_AIMS = {torch.float64: 1e-11, torch.float32: 1e-8}  # change of positions at which the iteration ends [m]
+_TOLERANCE = 1e-8  # change of positions that is enough where they come no closer [m]
+_PATIENCE = 20  # iterations without progress, after which the search ends; of positions that rest, a few
 _MEMORY = 6  # iterations that are combined
 _RIDGE = 1e-12
-_MOST_STEPS = 500  # of a motion after which a body must rest
+_MOST_STEPS = 300  # of a motion after which a body must nearly rest
+_RESTS = 1e-6  # motion in a step of a body that nearly rests [m]
 _SETTLED = 1e-9  # relative residual of a gradient
 
 
@@ -32,9 +34,9 @@ def equilibrium_under_feedback(
     """Returns the state of rest under constant inputs and a force (B, N, 3) [N] that depends on the state.
 
     It is the fixed point of equilibria under constant forces. Each iteration evaluates the force, solves the
-    equilibrium under it and accelerates the sequence of positions. It ends when no position moves by more than 1e-9 m,
-    in single precision 1e-8 m, or at once where the force does not depend on the positions. Where the iteration stalls,
-    the body first moves until it rests. For a loss with the gradient w by the fixed point x = S(x), that by what S
+    equilibrium under it and accelerates the sequence of positions. It ends when no position moves by more than
+    1e-11 m, in single precision 1e-8 m, or at once where the force does not depend on the positions. Where the
+    iteration stalls, the body first moves until it rests. For a loss with the gradient w by the fixed point x = S(x), that by what S
     depends on besides x is that of S for g = w + (dS/dx)^T g.
 
     Args:
@@ -81,7 +83,7 @@ class _Feedback:
     ) -> None:
         self._simulator, self._inputs, self._constants = simulator, inputs, constants
         self._predict, self._acts = predict, acts_of(predict)
-        self._tolerance = _TOLERANCES[simulator.dtype]
+        self._aim = _AIMS[simulator.dtype]
 
     def solve(self, state: State) -> State:
         """Returns the equilibrium under the force in a state."""
@@ -107,11 +109,13 @@ class _Feedback:
             size = change.abs().amax((1, 2))
             closer = size < smallest
             best, smallest = solution.where(closer, best), torch.minimum(size, smallest)
-            stalled = 0 if bool((closer & (size >= self._tolerance)).any()) else stalled + 1
-            if bool((smallest < self._tolerance).all()) or stalled == _PATIENCE:
+            stalled = 0 if bool((closer & (size >= self._aim)).any()) else stalled + 1
+            rests = smallest < _TOLERANCE
+            patience = _PATIENCE // 5 if bool(rests.all()) else _PATIENCE
+            if bool((smallest < self._aim).all()) or stalled >= patience:
                 break
             state = State(acceleration.next(state.q, change), state.v)
-        return best, smallest < self._tolerance
+        return best, smallest < _TOLERANCE
 
     def relaxed(self, state: State) -> State:
         """Returns the state in which the body rests after moving under the force, or the last one."""
@@ -120,7 +124,7 @@ class _Feedback:
         for number in range(_MOST_STEPS):
             before, force = state.q, self._predict(state, 0)
             state = moving.step(state, self._inputs.plus(force, self._acts), self._constants)
-            still = float((state.q - before).abs().max()) < self._tolerance
+            still = float((state.q - before).abs().max()) < _RESTS
             if number and still:
                 break
         return State(state.q, torch.zeros_like(state.q))

@@ -202,6 +202,33 @@ def test_the_force_and_the_weight_are_in_balance(stiffnesses):
         torch.testing.assert_close(state.q[:1], free, rtol=0.0, atol=1e-9)
 
 
+class Within:
+    """A force within the body at its free end, which depends on the state."""
+
+    acts = "internal"
+
+    def __call__(self, state, number=0):
+        force = torch.zeros_like(state.q)
+        force[:, TIP] = 0.02 + state.q[:, TIP]
+        return force
+
+
+def test_a_clamp_carries_the_weight_alone_under_a_force_within_the_body():
+    """At rest and in the steps of a corrected simulator, in every environment."""
+    s, *_ = at_rest(0.0)
+    constants = s.prepare()
+    load = (constants.load_mass[..., None] * constants.gravity[:, None]).sum(1)
+    rests = equilibrium_under_feedback(s, Inputs(), constants, s.rest_state(2), Within())
+    torch.testing.assert_close(rests.reaction.force, -load.expand(2, -1), rtol=0.0, atol=1e-10)
+    corrected, state = correction.CorrectedSimulator(s, Within()), s.rest_state(2)
+    for number in range(3):
+        before, state = state, corrected.step(state, number)
+        rate = constants.mass[..., None] * (
+            (state.v - before.v) / s.time_step + constants.mass_damping[..., None] * state.v
+        )
+        torch.testing.assert_close(state.reaction.force, rate.sum(1) - load, rtol=0.0, atol=1e-8)
+
+
 def test_an_equilibrium_is_found_where_its_iteration_would_grow_and_has_gradients():
     """A spring at the tip, 40 times as stiff as the beam: each equilibrium overshoots the one before."""
     s, *_ = at_rest(0.0)

@@ -36,8 +36,10 @@ def equilibrium_under_feedback(
     It is the fixed point of equilibria under constant forces. Each iteration evaluates the force, solves the
     equilibrium under it and accelerates the sequence of positions. It ends when no position moves by more than
     1e-11 m, in single precision 1e-8 m, or at once where the force does not depend on the positions. Where the
-    iteration stalls, the body first moves until it rests. For a loss with the gradient w by the fixed point x = S(x), that by what S
-    depends on besides x is that of S for g = w + (dS/dx)^T g.
+    iteration stalls, the body first moves until it nearly rests.
+
+    For a loss with the gradient w by the fixed point x = S(x), that by what S depends on besides x is that of S for
+    g = w + (dS/dx)^T g.
 
     Args:
         simulator: of the body.

@@ -1,5 +1,6 @@
 import contextlib
 import functools
+import gc
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
@@ -32,6 +33,8 @@ from warp_resphys.report import figures, render
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 torch.set_num_threads(1)
+gc.freeze()  # A collection passes over what is imported, and comes less often.
+gc.set_threshold(10_000, 10, 10)
 
 NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
 STRUCTURAL = {"test_arguments", "test_modules", "test_threads"}  # of these folders, without numbers of libraries

@@ -133,9 +133,9 @@ def kept_renderers():
 
 
 @contextlib.contextmanager
-def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
-    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
-    frames, start, close = render.Renderer.frames, render.Renderer._start, render.Renderer.close
+def renderers_used_again(kept_renderers: list[Any]) -> Iterator[None]:
+    """Drawing processes that draw for the next renderer, as each takes seconds to start."""
+    start, close = render.Renderer._start, render.Renderer.close
 
     def started(self: render.Renderer) -> None:
         if kept_renderers:
@@ -152,17 +152,32 @@ def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
         else:
             close(self)
 
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render.Renderer, "_start", started)
+        patch.setattr(render.Renderer, "close", closed)
+        yield
+
+
+@contextlib.contextmanager
+def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
+    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
+    frames = render.Renderer.frames
+
     def coarse(self: render.Renderer, scene: render.RenderScene) -> Iterator[render.Pixels]:
         return frames(self, replace(scene, size=[side // 8 * 2 for side in scene.size]))
 
-    with pytest.MonkeyPatch.context() as patch:
+    with renderers_used_again(kept_renderers), pytest.MonkeyPatch.context() as patch:
         patch.setattr(render.Renderer, "frames", coarse)
-        patch.setattr(render.Renderer, "_start", started)
-        patch.setattr(render.Renderer, "close", closed)
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
         patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
         patch.setattr(figures, "themed_svg", lambda figure, name: b"<svg/>")
         yield
+
+
+@pytest.fixture(scope="session")
+def used_again(kept_renderers):
+    """A context in which drawing processes are used again, for tests that look at pictures."""
+    return functools.partial(renderers_used_again, kept_renderers)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,6 +1,7 @@
 """The book: `sphinx-build --fail-on-warning docs outputs/book`, in an environment with the extra `book`.
 
 Building it runs the tutorials; those that have not changed since the last build are taken from the cache in `outputs/`.
+`WARP_RESPHYS_TUTORIALS=short` in the environment runs their short form (`extensions/short_form.py`).
 """
 
 import re
@@ -33,7 +34,7 @@ extensions = [
 ]
 source_suffix = {".md": "myst-nb", ".py": "myst-nb"}
 exclude_patterns = ["conf.py", "examples", "extensions"]
-nb_custom_formats = {".py": ["jupytext.reads", {"fmt": "py:percent"}]}
+nb_custom_formats = {".py": "notebooks.read"}
 
 html_theme = "furo"
 html_static_path = ["films", "style"]

@@ -1,5 +1,6 @@
 import contextlib
 import functools
+import gc
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as the command does
@@ -32,9 +33,12 @@ from warp_resphys.report import figures, render
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 torch.set_num_threads(1)
+gc.freeze()  # A collection passes over what is imported, and comes less often.
+gc.set_threshold(10_000, 10, 10)
 
-NUMERICAL = {"dynamics", "energies", "fem", "kernels", "learning", "linalg", "pictures"}  # folders of tests
-STRUCTURAL = {"test_arguments", "test_modules", "test_threads"}  # of these folders, without numbers of libraries
+# Folders of tests; Warp compiles kernels for the processor that there is.
+NUMERICAL = {"dynamics", "energies", "fem", "learning", "linalg", "pictures"}
+STRUCTURAL = {"test_threads"}  # of these folders, without numbers of libraries
 # modules of tests
 LOOK_AT_PICTURES = {
     *("test_bodies", "test_figures", "test_render", "test_report", "test_environments", "test_film"),
@@ -130,9 +134,9 @@ def kept_renderers():
 
 
 @contextlib.contextmanager
-def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
-    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
-    frames, start, close = render.Renderer.frames, render.Renderer._start, render.Renderer.close
+def renderers_used_again(kept_renderers: list[Any]) -> Iterator[None]:
+    """Drawing processes that draw for the next renderer, as each takes seconds to start."""
+    start, close = render.Renderer._start, render.Renderer.close
 
     def started(self: render.Renderer) -> None:
         if kept_renderers:
@@ -149,17 +153,32 @@ def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
         else:
             close(self)
 
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render.Renderer, "_start", started)
+        patch.setattr(render.Renderer, "close", closed)
+        yield
+
+
+@contextlib.contextmanager
+def coarse_pictures(kept_renderers: list[Any]) -> Iterator[None]:
+    """Small pictures by processes that are used again, and figures without a layout that are drawn once."""
+    frames = render.Renderer.frames
+
     def coarse(self: render.Renderer, scene: render.RenderScene) -> Iterator[render.Pixels]:
         return frames(self, replace(scene, size=[side // 8 * 2 for side in scene.size]))
 
-    with pytest.MonkeyPatch.context() as patch:
+    with renderers_used_again(kept_renderers), pytest.MonkeyPatch.context() as patch:
         patch.setattr(render.Renderer, "frames", coarse)
-        patch.setattr(render.Renderer, "_start", started)
-        patch.setattr(render.Renderer, "close", closed)
         patch.setattr(figures, "settle", lambda figure: figure.set_layout_engine("none"))
         patch.setattr(figures, "save_png", lambda figure, path: figure.savefig(path, format="png", dpi=20))
         patch.setattr(figures, "themed_svg", lambda figure, name: b"<svg/>")
         yield
+
+
+@pytest.fixture(scope="session")
+def used_again(kept_renderers):
+    """A context in which drawing processes are used again, for tests that look at pictures."""
+    return functools.partial(renderers_used_again, kept_renderers)
 
 
 @pytest.fixture(scope="module", autouse=True)

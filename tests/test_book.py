@@ -60,6 +60,19 @@ def test_every_tutorial_is_in_the_contents_and_says_when_it_is_wrong():
             assert text.startswith("# ---\n# jupyter:")
 
 
+def test_tutorials_have_a_short_form():
+    in_form = runpy.run_path(str(DOCS / "extensions" / "short_form.py"))["in_form"]
+    assert in_form("for _ in range(14):  # short: for _ in range(2):\n    x", False) == "for _ in range(14):\n    x"
+    assert in_form("    y = 6  # short: y = 3\n    x = y", True) == "    y = 3\n    x = y"
+    for page in (DOCS / "tutorials").glob("*.py"):
+        text = page.read_text(encoding="utf-8")
+        for short in (False, True):
+            written = in_form(text, short)
+            compile(written, page.name, "exec")
+            assert "# short:" not in written
+            assert "\nassert " in written
+
+
 def test_what_the_theory_and_the_pages_name_is_in_the_code():
     theory = (DOCS / "theory.md").read_text(encoding="utf-8")
     modules = {*re.findall(r"`((?:control|data|dynamics|energies|fem|learning|linalg)\.[\w.]+)`", theory)}

@@ -1,10 +1,21 @@
-"""Tutorials as notebooks: next to the page of each tutorial its notebook, with a link below the title."""
+"""Tutorials as notebooks: next to the page of each tutorial its notebook, with a link below the title.
 
+They are short in a book that is built with the environment variable `WARP_RESPHYS_TUTORIALS=short`.
+"""
+
+import os
 from pathlib import Path
 from typing import Any
 
 import jupytext
+from short_form import in_form
 from sphinx.application import Sphinx
+
+
+def read(text: str) -> Any:
+    """Returns a tutorial as a notebook, in full length but where the environment says short."""
+    short = os.environ.get("WARP_RESPHYS_TUTORIALS") == "short"
+    return jupytext.reads(in_form(text, short), fmt="py:percent")
 
 
 def tutorials(app: Sphinx) -> list[Path]:
@@ -18,7 +29,7 @@ def write_notebooks(app: Sphinx, error: Exception | None) -> None:
         for path in tutorials(app):
             target = Path(app.outdir, "tutorials", path.stem).with_suffix(".ipynb")
             target.parent.mkdir(exist_ok=True)
-            jupytext.write(jupytext.read(path, fmt="py:percent"), target)
+            jupytext.write(read(path.read_text(encoding="utf-8")), target)
 
 
 def link_notebook(app: Sphinx, page: str, _template: str, context: dict[str, Any], _doctree: Any) -> None:

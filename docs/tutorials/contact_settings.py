@@ -83,9 +83,9 @@ figure.tight_layout()
 cube = box_hexahedra((0.02, 0.02, 0.02), (2, 2, 2))
 block = Corotated(2e6, 0.4, density=1070.0, stiffness_damping=2e-3)
 D = 1e-3  # m
-loads = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # times its weight
+loads = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # short: loads = np.array([1.0, 100.0])
 figure, ax = plt.subplots(figsize=(5.5, 3.4))
-for stiffness in (1e4, 1e5, 1e6):
+for stiffness in (1e4, 1e5, 1e6):  # short: for stiffness in (1e4, 1e6):
     gaps = []
     for load in loads:
         floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.9 * D))}, stiffness=stiffness, distance=D)
@@ -110,7 +110,8 @@ figure.tight_layout()
 # speed costs some iterations where bodies begin to slide.
 
 # %%
-a, slip_speeds, creeps = np.radians(15.0), np.array([1e-4, 1e-3, 1e-2, 1e-1]), []
+a, creeps = np.radians(15.0), []
+slip_speeds = np.array([1e-4, 1e-3, 1e-2, 1e-1])  # short: slip_speeds = np.array([1e-2])
 print("slip speed  creep      iterations of a thrown block's step, most")
 for slip_speed in slip_speeds:
     floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -9.5e-4))}, 1e5, 0.4, D, slip_speed)

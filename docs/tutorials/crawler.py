@@ -84,7 +84,8 @@ def waves(phases):
 # 36 waves, all in one batch:
 
 # %%
-phase = 2.0 * math.pi * torch.arange(6, dtype=torch.float64) / 6
+COUNT = 6  # short: COUNT = 3
+phase = 2.0 * math.pi * torch.arange(COUNT, dtype=torch.float64) / COUNT
 grid = torch.cartesian_prod(phase, phase)
 with torch.no_grad():
     ways, motions = crawl(waves(grid))
@@ -110,7 +111,7 @@ direction = torch.sign(first[first.abs().argmax()])
 gait = random[first.abs().argmax()][None].requires_grad_()
 optimiser = torch.optim.Adam([gait], lr=0.4)
 reached = []
-for _ in range(14):
+for _ in range(14):  # short: for _ in range(2):
     optimiser.zero_grad()
     way, motion = crawl(gait)
     (-direction * way.sum()).backward()
@@ -121,7 +122,7 @@ print("mm:", " ".join(f"{way:.1f}" for way in reached))
 # %%
 figure, (left, right) = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
 left.axhline(1e3 * ways[best], color="0.5", linestyle="--", label="best of 36 waves")
-left.plot(8 + 2 * np.arange(1, 15), reached, "o-", label="gradients")
+left.plot(8 + 2 * np.arange(1, 1 + len(reached)), reached, "o-", label="gradients")
 left.set(xlabel="simulations", ylabel="way [mm]", ylim=(0, None))
 left.legend(frameon=False)
 clock = simulator.time_step * np.arange(STEPS + 1)
@@ -181,6 +182,6 @@ plt.show()
 # 0.6 N, so friction can be at most 0.36 N.
 
 # %%
-assert reached[-1] > 1.5e3 * ways[best]
+assert reached[-1] > 1.5e3 * ways[best]  # short: assert reached[-1] > reached[0]
 assert abs(forces[-50:].sum(1).mean()) < 0.05 * 360
 assert np.abs(forces[-50:]).max() < 360

@@ -143,11 +143,11 @@ def lifted(folder, name, rings, factor):
     """A table of a membrane of a law with twice the moduli of Ecoflex 00-30, under two weights."""
     law = {"c10": factor * warp_resphys.silicone("Ecoflex 00-30").values["c10"]}
     head = "thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm"
-    rows = [f"# {head} = [2.0, 15.0, {rings}, nan, nan]", "height_mm,pressure_Pa,lifted_force_N", "2,5000,4"]
+    rows = [f"# {head} = [4.0, 15.0, {rings}, nan, nan]", "height_mm,pressure_Pa,lifted_force_N", "2,5000,4"]
     for force in (3.0, 4.0):
         ring = () if "nan" in rings else (tuple(1e-3 * float(size) for size in rings.split(",")),)
         heights = np.linspace(10.0, 20.0, 11)
-        pressures = Membrane(0.04, 0.002, 0.015, force, ring).response(heights / 40.0, law)[0]
+        pressures = Membrane(0.04, 0.004, 0.015, force, ring).response(heights / 40.0, law)[0]
         rows += [f"{height:.1f},{p:.2f},{force:g}" for height, p in zip(heights, pressures, strict=True)]
     (folder / name).write_text("\n".join(rows), encoding="utf-8")
 

@@ -39,6 +39,7 @@ TINY = [
     "correct_uncorrected=false",
     "simfree.trainer.epochs=4",
     "simfree.trainer.rollout_every=4",
+    "parallel.processes=1",  # in this process, where no report is drawn and no torch imported again
 ]
 SYNTHETIC = [
     *TINY,
@@ -58,7 +59,6 @@ FOLDS = [
     "identify.max_evaluations=3",
     "identify.elastic=null",
     "in_the_loop.epochs=1",
-    "parallel.processes=1",  # in this process, where no report is drawn
 ]
 STAGES = ["identify", "reconstruct_resphys", "train_resphys", "train_simfree", "evaluate", "mesh_check", "report"]
 

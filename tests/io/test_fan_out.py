@@ -70,7 +70,7 @@ def fails(task):
 @pytest.mark.parametrize(
     ("task", "error", "message"),
     [
-        ("bad input", WorkerError, "^this is refused.$"),
+        pytest.param("bad input", WorkerError, "^this is refused.$", marks=pytest.mark.slow),
         pytest.param("fault", WorkerFaultError, "ZeroDivisionError", marks=pytest.mark.slow),
     ],
 )

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from warp_resphys.data.driving import phases, time_since_change
 from warp_resphys.io.errors import InputError
@@ -153,8 +154,8 @@ def trials(count, seed, noise, frames=60):
             2.0 * time + draw.uniform(0.0, 6.0)
         )
         shocks = draw.normal(size=x.shape)
-        for k in range(1, frames):
-            shocks[k] = 0.8 * shocks[k - 1] + 0.6 * shocks[k]
+        shocks[1:] *= 0.6
+        shocks = lfilter([1.0], [1.0, -0.8], shocks, axis=0)
         moved = np.linalg.norm(x - REST, axis=-1, keepdims=True)
         made[str(number)] = Predicted(x, x + noise(moved, time) * shocks, time[:, 0, 0])
     return made

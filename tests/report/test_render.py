@@ -1,6 +1,7 @@
 """Pictures of bodies: what is drawn where, in which colours, and what is said where nothing can be drawn."""
 
 import sys
+from types import SimpleNamespace
 
 import matplotlib.colors
 import numpy as np
@@ -90,10 +91,11 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
         render.draw(scene)
     assert reason in str(caught.value)
     assert "libegl1" in str(caught.value)
-    with pytest.raises(render.DrawingError) as caught:
-        render.write_film(tmp_path / "motion.mp4", scene)
-    assert reason in str(caught.value)
-    assert not [*tmp_path.glob("*.mp4*")]
+    if "time" in script:  # which needs no process to start
+        with pytest.raises(render.DrawingError) as caught:
+            render.write_film(tmp_path / "motion.mp4", scene)
+        assert reason in str(caught.value)
+        assert not [*tmp_path.glob("*.mp4*")]
 
 
 @pytest.mark.usefixtures("can_draw")
@@ -114,11 +116,10 @@ def test_one_process_draws_scene_after_scene():
     assert both.shape[1] == 2 * first.shape[1]
 
 
-@pytest.mark.usefixtures("can_draw")
 def test_a_film_that_cannot_be_encoded_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    mesh = box_hexahedra(divisions=(1, 1, 1))
-    scene = body_scene(mesh)
+    scene = body_scene(box_hexahedra(divisions=(1, 1, 1)))
+    drawn = SimpleNamespace(frames=lambda scene: iter([np.zeros((*scene.size[::-1], 3), np.uint8)]))
     with pytest.raises(render.DrawingError, match="imageio-ffmpeg"):
-        render.write_film(tmp_path / "motion.mp4", scene)
+        render.write_film(tmp_path / "motion.mp4", scene, drawn)
     assert not [*tmp_path.iterdir()]

@@ -162,8 +162,9 @@ def test_a_body_in_two_pieces_with_an_open_chamber(tmp_path, arm):
     assert "fixed" not in rows
 
 
-def test_an_arm_is_written_as_it_is_described(tmp_path, capsys):
-    inspect(settings_of(Inspection, "inspect", "mesh=arm_generated", "mesh.layers=0.03", "save=own.msh"), tmp_path)
+def test_an_arm_is_written_as_it_is_described(tmp_path, capsys, used_again):
+    with used_again():
+        inspect(settings_of(Inspection, "inspect", "mesh=arm_generated", "mesh.layers=0.03", "save=own.msh"), tmp_path)
     rows = rows_of(capsys.readouterr().out.partition("Written: ")[0])
     mesh = read_mesh(tmp_path / "own.msh")
     assert rows["vertices"] == f"{len(mesh.vertices)} = {3 * len(mesh.vertices):,} degrees of freedom"

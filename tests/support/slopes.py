@@ -3,8 +3,10 @@
 import numpy as np
 import torch
 
+_POINTS = (-2.0, -1.0, 1.0, 2.0)  # of a difference, in changes
 
-def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6):
+
+def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6, together=False):
     """Compares gradients of a loss with differences of five points along a random direction of every value.
 
     Args:
@@ -13,17 +15,27 @@ def check_slopes(loss, values, sizes, seed=3, tolerance=1e-6):
         sizes: of the changes by name, so small that no point begins or ends to touch or slide.
         seed: of the directions.
         tolerance: of a difference, relative to its size.
+        together: whether the loss takes all points of all differences at once, as so many times the environments.
     """
     random = torch.Generator().manual_seed(seed)
     leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
     result = loss(leaves)
     result.sum().backward()
-    for name, value in values.items():
-        change = sizes[name] * torch.randn(value.shape, generator=random, dtype=torch.float64).to(value.device)
-        slopes = leaves[name].grad * change
+    changes = {
+        name: sizes[name] * torch.randn(value.shape, generator=random, dtype=torch.float64).to(value.device)
+        for name, value in values.items()
+    }
+    points = {name: [value + factor * changes[name] for factor in _POINTS] for name, value in values.items()}
+    with torch.no_grad():
+        if together:
+            every = [{**values, name: point} for name in values for point in points[name]]
+            stacked = {name: torch.cat([each[name] for each in every]) for name in values}
+            found = loss(stacked).reshape(len(values), len(_POINTS), *result.shape)
+        else:
+            found = [[loss({**values, name: point}) for point in points[name]] for name in values]
+    for name, near in zip(values, found, strict=True):
+        slopes = leaves[name].grad * changes[name]
         slopes = slopes.reshape(len(slopes), -1).sum(1) if result.ndim else slopes.sum()
-        with torch.no_grad():
-            near = [loss({**values, name: value + factor * change}) for factor in (-2.0, -1.0, 1.0, 2.0)]
         difference = (8.0 * (near[2] - near[1]) - (near[3] - near[0])) / 12.0
         error = float((slopes - difference).norm() / difference.norm())
         assert error < tolerance, f"{name}: {error:.1e}"

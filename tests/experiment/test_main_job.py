@@ -44,7 +44,7 @@ class TestCompleteRun:
         results = metrics(finished[0])
         keys = {"errors_mm", "errors_vs_reconstruction_mm", "per_trajectory", "range", "networks", "parameters"}
         keys |= {"reconstruction", "seconds_per_test_trajectory", "seconds", "peak_memory_gib", "versions", "device"}
-        assert set(results) == keys | {"first_guesses", "baselines"}
+        assert set(results) == keys | {"first_guesses", "at_bounds", "baselines", "beyond", "recommended"}
         assert set(results["seconds_per_test_trajectory"]) == {"simulation", "target", "resphys", "inference"}
         assert set(results["errors_mm"]) == {*BASELINES, "simulation", "reconstruction", "resphys", "simfree"}
         assert set(results["errors_vs_reconstruction_mm"]) == set(results["errors_mm"]) - {"reconstruction"}

@@ -190,7 +190,7 @@ class TestSentences:
         far = {"range": {"resphys": {"first_s": dict.fromkeys(names, 0.0)}}}
         assert sentences(errors, run, **far) == [
             "Beyond the training loads, ResPhys has 80 % less error than anything without physics (on 5 of 5 trials); "
-            "a body that does not move has 0.500 mm, the uncorrected simulator 6.00 mm.",
+            "a body that does not move has 3.00 and 0.500 mm, the uncorrected simulator 3.00 and 6.00 mm.",
             "Within them, regression is enough.",
             "Recommended, under the conditions below: ResPhys.",
         ]

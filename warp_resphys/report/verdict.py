@@ -30,7 +30,7 @@ from .ranking import (
     simplest,
     unused,
 )
-from .wording import mm_text, model_words, number_text, share_text, unbroken
+from .wording import in_a_row, mm_text, model_words, number_text, share_text, unbroken
 
 _ROWS: Final[Mapping[str, str]] = {  # Below that of the best model without physics.
     "simfree": "network in place of the simulator (SimFree)",
@@ -118,11 +118,12 @@ def verdict(metrics: Metrics, settings: RunSettings) -> list[str]:
     groups, idle = [*grouped_errors(metrics, settings).values()], unused(metrics)
     if not groups or not {*RANKED} & groups[-1].keys():
         return []
-    known = known_errors(groups[-1], idle)
+    every = [known_errors(errors, idle) for errors in groups]
+    known = every[-1]
     played = f"on a simulated {' and '.join(settings.targets)}, " if settings.targets else ""
     beyond = "beyond the training loads, " if len(groups) > 1 else ""
-    texts = [f"{played}{beyond}{_best_text(known)}{_at_rest(known)}" if known else "all models diverged"]
-    inside = known_errors(groups[0], idle) if len(groups) > 1 else {}
+    texts = [f"{played}{beyond}{_best_text(known)}{_at_rest(every)}" if known else "all models diverged"]
+    inside = every[0] if len(groups) > 1 else {}
     if (best := best_of(inside, RANKED)) and len(inside[best]) >= LEAST_EVIDENCE:
         texts.append(f"within them, {model_words(best)} is {'enough' if best in BASELINES else 'best'}")
     texts += _use(known, bool(conditions(metrics, settings)))
@@ -152,12 +153,13 @@ def _best_text(known: Known) -> str:
     return f"{less_error(best, second, gain.share)} ({on})"
 
 
-def _at_rest(known: Known) -> str:
-    """Returns what a body at rest has, where the uncorrected simulator is no better."""
-    if not {"rest", "simulation"} <= known.keys() or fmean(known["rest"]) > fmean(known["simulation"]):
+def _at_rest(groups: Sequence[Known]) -> str:
+    """Returns what a body at rest has in each group of trials, where the uncorrected simulator is no better."""
+    both = [known for known in groups if {"rest", "simulation"} <= known.keys()]
+    if not any(fmean(known["rest"]) < fmean(known["simulation"]) for known in both):
         return ""
-    rest, plain = (mm_text(fmean(known[model])) for model in ("rest", "simulation"))
-    return f"; {model_words('rest')} has {rest}, {model_words('simulation')} {plain}"
+    rest, plain = (in_a_row([number_text(fmean(x[m])) for x in both]) for m in ("rest", "simulation"))
+    return f"; {model_words('rest')} has {rest} mm, {model_words('simulation')} {plain} mm"
 
 
 def counted(lower: int, count: int, noun: str) -> str:

@@ -50,7 +50,7 @@ class ViewSettings(Settings):
     """The configuration ``view``, which explains its keys."""
 
     run: Word
-    model: Word
+    model: Word | None
     trial: Word | None
     device: Word
     host: Word

@@ -77,6 +77,10 @@ class InputError(ResphysError, ValueError):
     """An invalid argument or configuration value."""
 
 
+class MissingPackageError(InputError, ImportError):
+    """A package of an extra is not installed."""
+
+
 class MeshError(InputError):
     """A mesh that cannot be read or is not valid for finite elements."""
 
@@ -145,6 +149,19 @@ def naming(group: str) -> Iterator[None]:
         yield
     except InputError as error:
         raise type(error)(f"{group}{error}") from error
+
+
+@contextmanager
+def needs_extra(extra: str, what: str) -> Iterator[None]:
+    """Raises one sentence where an import fails, with the extra to install; ``what`` as in "the viewer needs"."""
+    try:
+        yield
+    except ImportError as error:
+        if isinstance(error, MissingPackageError):
+            raise
+        raise MissingPackageError(
+            f"{what} a package that is not installed: pip install 'warp-resphys[{extra}]'."
+        ) from error
 
 
 def checks_types(function: Callable[P, R]) -> Callable[P, R]:

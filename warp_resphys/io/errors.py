@@ -211,6 +211,8 @@ def _fields_of(kind: Any) -> dict[str, Any]:
 
 def check_type(name: str, value: object, hint: Any) -> None:
     """Raises InputError for a value that a type hint excludes, also in lists and mappings of a class."""
+    if type(value) is hint:
+        return
     parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     kinds: list[Any] = [Mapping if is_typeddict(part) else get_origin(part) or part for part in parts]
     if object in kinds or Any in kinds or not all(map(_decides, kinds)):

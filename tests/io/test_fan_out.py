@@ -112,7 +112,9 @@ def test_nothing_to_do(tmp_path):
 
 def test_dask_that_is_not_installed(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"parallel\.address is tcp://head:8786, but Dask is not installed"):
+    with pytest.raises(
+        InputError, match=r"parallel\.address=tcp://head:8786 needs a package.*'warp-resphys\[cluster\]'"
+    ):
         done(work, [1], Workers(2, "tcp://head:8786"), tmp_path)
 
 

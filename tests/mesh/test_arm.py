@@ -190,7 +190,12 @@ def test_rotated_segments_take_tetrahedra():
 
 def test_without_gmsh_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "gmsh", None)
-    refuses(MeshError, r"need gmsh, which cannot be imported .*pip install gmsh", mesh_arm, ArmMesh(cells="tetrahedra"))
+    refuses(
+        MeshError,
+        r"need gmsh, which cannot be imported .*pip install 'warp-resphys.mesh.'",
+        mesh_arm,
+        ArmMesh(cells="tetrahedra"),
+    )
     mesh_arm(ArmMesh())
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.errors import InputError, needs_extra
 from ..robot.robot import Robot
 from ..settings.control import LimitsOfInputs
 from .linear_model import LinearModel
@@ -154,12 +154,8 @@ def solve_program(
     Raises:
         InputError: the solver's package is not installed, or the constraints cannot be satisfied.
     """
-    try:
+    with needs_extra("control", "control needs"):
         import piqp
-    except ImportError:
-        raise InputError(
-            "control needs a package that is not installed: pip install 'warp-resphys[control]'."
-        ) from None
     solver = piqp.DenseSolver()
     solver.settings.eps_abs, solver.settings.eps_rel = _TOLERANCE, _TOLERANCE
     solver.setup(hessian, gradient, None, None, rows, least, most, low, high)

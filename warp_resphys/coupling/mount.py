@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..io.arrays import BoolArray, Brief, FloatArray
-from ..io.errors import InputError, listed
+from ..io.errors import InputError, checks_types, listed
 from ..robot.actuation import BASE
 from ..robot.robot import Robot
 from ..robot.robot_scene import RobotScene
@@ -97,6 +97,7 @@ class Mount:
             or an error of `MountingBody`.
     """
 
+    @checks_types
     def __init__(
         self, robot: Robot | RobotScene, model: Any, body: str, pose: ArrayLike = HERE, iterations: int = 2
     ) -> None:

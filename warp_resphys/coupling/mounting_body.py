@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..io.arrays import FloatArray
-from ..io.errors import ConvergenceError, InputError, did_you_mean, listed
+from ..io.errors import ConvergenceError, InputError, did_you_mean, listed, needs_extra
 from ..robot.robot_scene import pose_of
 
 _WHOLE: Final = 1e-6  # deviation of the ratio of the time steps from a whole number
@@ -28,10 +28,8 @@ HERE: Final = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # the pose (6,) of the frame itsel
 
 def mujoco_package() -> Any:
     """Returns the package `mujoco`, or raises InputError where it is not installed."""
-    try:
+    with needs_extra("mujoco", "a mount needs"):
         import mujoco
-    except ImportError as error:
-        raise InputError(f"a mount needs MuJoCo ({error}): pip install 'warp-resphys[mujoco]'.") from None
     return mujoco
 
 

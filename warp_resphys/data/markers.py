@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.arrays import BoolArray, Brief, FloatArray, IntArray
-from ..io.errors import InputError
+from ..io.errors import InputError, checks_types
 from ..mesh.surface import closest_points
 from ..mesh.volume_mesh import Mesh
 from ..stepping.rotations import closest_rotation
@@ -278,6 +278,7 @@ def tangent_frames(corners: torch.Tensor, unstretch: torch.Tensor) -> torch.Tens
     return torch.stack([along, torch.linalg.cross(normal, along), normal], dim=-1)
 
 
+@checks_types
 def bind_markers(
     mesh: Mesh,
     positions: ArrayLike,

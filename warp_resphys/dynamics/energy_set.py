@@ -27,7 +27,7 @@ from ..energies.term import Term, Values
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
 from ..fem.internal_forces import InternalForces
-from ..io.errors import InputError
+from ..io.errors import InputError, check_type
 from ..stepping.inputs import Inputs
 from ..stepping.integrators import Integrator
 from ..stepping.quantity import Quantity
@@ -328,6 +328,7 @@ def place_energies(whole: Body, material: Material | Materials) -> list[PlacedEn
     Raises:
         InputError: a body or a cell without material.
     """
+    check_type("the material", material, Material | Mapping)
     placed: list[PlacedEnergy] = []
     for name, body, first in whole.members:
         prefix = f"{name}_" if name else ""

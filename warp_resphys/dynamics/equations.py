@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from threading import get_ident
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from ..energies.launcher import lasting
 from ..energies.materials import Material
 from ..fem.bodies import Body
 from ..fem.coordinates import DeviceCoordinates
-from ..io.errors import InputError
+from ..io.errors import InputError, check_type, in_short
 from ..linalg.threads import is_shared, shards_of
 from ..settings.body import SolverSettings
 from ..stepping.adjoints import refuse_transforms
@@ -67,6 +67,9 @@ class EquationsOfMotion:
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
+        check_type("the body", body, Body)
+        if not isinstance(time_step, SupportsFloat) or isinstance(time_step, str):
+            raise InputError(f"time_step is {in_short(time_step)}: it must be a number, in seconds.")
         if not (np.isfinite(time_step) and time_step > 0.0):
             raise InputError(f"time_step is {time_step:g}: it must be positive, in seconds.")
         if dtype not in (torch.float64, torch.float32):
@@ -111,7 +114,12 @@ class EquationsOfMotion:
     def tensor(self, values: object) -> torch.Tensor:
         """Returns values with the device and dtype of states."""
         refuse_transforms(values)
-        return torch.as_tensor(values, device=self.rest_positions.device, dtype=self.rest_positions.dtype)
+        try:
+            return torch.as_tensor(values, device=self.rest_positions.device, dtype=self.rest_positions.dtype)
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            if isinstance(error, RuntimeError) and hasattr(values, "shape"):
+                raise  # of a device
+            raise InputError(f"values are {in_short(values)}: give numbers, or an array or a tensor.") from error
 
     def rest_state(self, batch: int) -> State:
         """Returns the undeformed body at rest, for a batch of one or more environments."""
@@ -133,6 +141,7 @@ class EquationsOfMotion:
         """Computes stiffness, mass and weight from values that replace the defaults of parameters, by name."""
         if isinstance(parameters, Constants):
             return parameters
+        check_type("parameters", parameters, Mapping | None)
         parameters = parameters or {}
         for name, value in parameters.items():
             if name not in self.parameters:
@@ -162,6 +171,7 @@ class EquationsOfMotion:
         self, state: State, inputs: Inputs | None, parameters: Mapping[str, Any] | Constants | None
     ) -> tuple[Inputs, Constants]:
         """Returns inputs and constants, or raises InputError if these or the state do not fit."""
+        check_type("the state", state, State)
         inputs, constants = self.fitted(inputs, state.batch), self.prepare(parameters)
         state.check(self.body.n_vertices, self.rest_positions)
         self.check_inputs(inputs, state.batch)

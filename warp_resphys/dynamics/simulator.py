@@ -11,7 +11,7 @@ from ..energies.contact.barrier import ContactForces
 from ..energies.materials import Corotated, Material
 from ..fem.bodies import Body
 from ..fem.coordinates import SymmetryPlane
-from ..io.errors import InputError
+from ..io.errors import InputError, checks_methods
 from ..io.machine import find_device
 from ..io.settings import parse
 from ..settings.body import SolverSettings
@@ -34,6 +34,7 @@ GRAVITY = (0.0, 0.0, -9.80709)
 Parameters = Mapping[str, Any]
 
 
+@checks_methods("rollout", "reaction", "static_equilibrium", "is_held")
 @dataclass
 class Simulator:
     """Simulates a body over time.
@@ -99,9 +100,8 @@ class Simulator:
     def _build(self) -> None:
         self.device = find_device(self.device)
         chosen = {"name": self.solver} if isinstance(self.solver, str) else self.solver
-        settings = parse(SolverSettings, chosen, "solver")
-        tolerance = self.relative_tolerance
-        self.settings = settings if tolerance is None else settings.changed(relative_tolerance=tolerance)
+        own = {} if self.relative_tolerance is None else {"relative_tolerance": self.relative_tolerance}
+        self.settings = parse(SolverSettings, chosen, "solver").changed(**own)
         where = (self.gravity, self.time_step, self.integrator, self.settings, self.device, self.dtype)
         self._equations = equations = EquationsOfMotion(self.body, self.material, *where)
         self.method, self.rest_positions, self.fixed = equations.method, equations.rest_positions, equations.fixed

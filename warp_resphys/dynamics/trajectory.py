@@ -13,7 +13,7 @@ from ..energies.contact.obstacle_poses import Pose
 from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
-from ..io.errors import InputError, number_of
+from ..io.errors import InputError, checks_methods, number_of
 from ..io.safe_files import atomic_hdf5, create
 from ..mesh.motion_files import input_columns, write_csv, write_usd, write_vtk
 from ..stepping.inputs import shapes
@@ -23,6 +23,7 @@ from ..stepping.state import Reaction, SolveReport, State
 _LOADS = tuple(f"load.{kind}{axis} [{unit}]" for kind, unit in (("f", "N"), ("t", "N m")) for axis in "xyz")
 
 
+@checks_methods("write_csv", "write_vtk", "write_usd", "save", "plot")
 @dataclass(frozen=True, repr=False)
 class Motion:
     """T steps of B environments, differentiable.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..fem.integration_points import LODE, principal_stretches, share_outside
 from ..io.classes import imported
-from ..io.errors import DataFileError, InputError, listed
+from ..io.errors import DataFileError, InputError, checks_types, listed
 from ..io.safe_files import read_json
 from ..mesh.volume_mesh import Mesh
 from ..settings.silicones import silicone_files, silicone_name
@@ -193,6 +193,7 @@ def modes_of(law: LawContent) -> list[str]:
     return law.get("modes", [*LODE])
 
 
+@checks_types
 def read_material(name: str) -> Material:
     """The material of a law: the law.json of a run, or a silicone whose law comes with the package.
 
@@ -210,6 +211,7 @@ def read_material(name: str) -> Material:
     return make_material(law["model"], **{key: x for key, x in law["parameters"].items() if key != MASS_DAMPING})
 
 
+@checks_types
 def silicone(product: str) -> Material:
     """Returns the material of a silicone, by its law that comes with the package (docs/results/silicones.md).
 

@@ -22,7 +22,7 @@ from typing_extensions import override
 
 from ..fem.bodies import Body
 from ..io.arrays import FloatArray
-from ..io.errors import InputError, MeshError
+from ..io.errors import InputError, MeshError, check_fields
 from ..kernels.follower_pressure import PRESSURE as PRESSURE_LAW
 from ..mesh.chambers import Chamber, check_chambers, check_open_faces, face_rule
 from ..mesh.volume_mesh import Mesh
@@ -53,6 +53,7 @@ class Pressure(Energy):
 
     def __post_init__(self) -> None:
         """Checks that there is a chamber."""
+        check_fields(self)
         if not self.chambers:
             raise InputError("pressure acts in chambers, but there are none: find them with find_chambers.")
 

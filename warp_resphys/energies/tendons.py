@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
 from ..io.arrays import BoolArray, FloatArray
-from ..io.errors import InputError
+from ..io.errors import InputError, check_type
 from ..io.settings import parse
 from ..kernels import tendon_segments as kernels
 from ..mesh.surface import locate
@@ -80,6 +80,7 @@ class Tendons(Energy):
 
     def __post_init__(self) -> None:
         """Checks the values."""
+        check_type("Tendons: routes", self.routes, Mapping | Sequence)
         if not len(self.routes):
             raise InputError("there is no tendon: give the guides of each, or leave the tendons out.")
         for name, value in (("toe", self.toe), ("reach", self.reach)):

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from ..robot.robot import Robot
 from .arm_world import JOINT_SPEED, ArmWorld
 from .grippers import RISE, SPEED, GraspWorld
 from .tasks import FollowTask, PlaceTask, Reach, ReachTask, RobotTask, SwingTask
-from .vector import ActionMapping, RobotVectorEnv
+from .vector import ActionMapping, RobotVectorEnv, gym
 
 TASKS: Final = ("reach", "follow", "swing_up", "grasp", "pick_and_place")
 WORLDS: Final = ("simulator", "reduced", "laboratory")

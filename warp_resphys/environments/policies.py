@@ -5,18 +5,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from ..control.polynomials import Polynomial, around
 from ..coupling.mounting_body import base_pose, mujoco_package
 from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.errors import InputError, needs_extra
 from ..linalg.threads import threads_for
 from .arm_world import FLANGE, PALM, ArmWorld
 from .tasks import LIFT, GoalTask, Reach
-from .vector import Observation, RobotVectorEnv
+from .vector import AutoresetMode, Observation, RobotVectorEnv
 
 Policy = Callable[[Observation], NDArray[np.float32]]
 
@@ -191,13 +190,11 @@ def learn(
     Raises:
         InputError: Stable-Baselines3 is not installed, or another reset mode.
     """
-    try:
+    with needs_extra("policies", "learning a policy needs"):
         from stable_baselines3 import PPO
         from stable_baselines3.common.callbacks import BaseCallback
 
         from .stable_baselines import Robots
-    except ImportError as error:
-        raise _missing(error) from None
     if environment.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
         raise InputError("learning needs an environment with autoreset_mode='SameStep'.")
 
@@ -233,15 +230,9 @@ def load_model(path: Path) -> Any:
     Raises:
         InputError: Stable-Baselines3 is not installed.
     """
-    try:
+    with needs_extra("policies", "a policy needs"):
         from stable_baselines3 import PPO
-    except ImportError as error:
-        raise _missing(error) from None
     return PPO.load(path, device="cpu")
-
-
-def _missing(error: ImportError) -> InputError:
-    return InputError(f"learning a policy needs Stable-Baselines3 ({error}): pip install 'warp-resphys[policies]'.")
 
 
 def acting(model: Any) -> Policy:

@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import override
 
+from ..io.errors import needs_extra
 from .vector import RobotVectorEnv
+
+with needs_extra("policies", "policies need"):
+    from stable_baselines3.common.vec_env import VecEnv
 
 
 class Robots(VecEnv):

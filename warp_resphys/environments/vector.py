@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
@@ -14,11 +12,16 @@ from ..control.worlds import World
 from ..data.camera import frame_of, side_axes
 from ..energies.contact.obstacle_surface import ObstacleSurface
 from ..io.arrays import BoolArray, FloatArray, IntArray
-from ..io.errors import InputError
+from ..io.errors import InputError, needs_extra
 from ..report.layers import INK, Layer, RenderScene, View, body_layers, chain, obstacle_layers
 from ..report.render import Pixels, Renderer
 from ..stepping.rollout import states
 from .tasks import RobotTask
+
+with needs_extra("environments", "environments need"):
+    import gymnasium as gym
+    from gymnasium.vector import AutoresetMode as AutoresetMode
+    from gymnasium.vector import VectorEnv
 
 Observation = NDArray[np.float32]
 

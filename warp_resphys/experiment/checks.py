@@ -4,7 +4,7 @@ The values of settings and their relations are checked when settings are made, s
 """
 
 from collections.abc import Mapping, Sequence
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -15,7 +15,7 @@ from ..dynamics.simulator import Simulator
 from ..energies.catalogue import read_material
 from ..energies.convex_material import ConvexMaterial
 from ..fem.bodies import Body
-from ..io.errors import InputError, naming, number_of
+from ..io.errors import InputError, naming, needs_extra, number_of
 from ..learning.parameters import MASS_FACTOR, check_names, check_ranges, command_of, identifiable_parameters
 from ..learning.residuals.networks import core_factory
 from ..learning.residuals.reconstruction import make_reconstructor
@@ -64,8 +64,8 @@ def check_run(run: RunSettings) -> None:
     if run.actuator is not None and drive is None:
         raise InputError("a learned actuator needs a robot with pressures, tendons or muscles: set actuator=null.")
     if run.control is not None:
-        if find_spec("piqp") is None:
-            raise InputError("control needs a package that is not installed: pip install 'warp-resphys[control]'.")
+        with needs_extra("control", "control needs"):
+            import_module("piqp")
         if drive is None:
             raise InputError("control needs a robot with pressures, tendons or muscles: set control=none.")
         for name in () if run.identify is None else run.identify.parameters:

@@ -4,20 +4,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.sparse
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from ..io.errors import InputError
+from ..io.errors import InputError, check_fields, checks_methods
 from ..mesh.motion_files import write_vtu
 from ..mesh.plotting import plot_parts
 from ..mesh.surface import locate
 from ..mesh.volume_mesh import Mesh
 from ..settings.body import Rigid
-from .coordinates import Coordinates, SymmetryPlane, dependence, plane_shares, rigid_weights
+from .coordinates import Coordinates, SymmetryPlane, dependence, plane_shares, rigid_weights, vertex_indices
 from .integration_points import Discretisation, Points, discretise
 
 MASS_MODES = ("row_sum", "per_vertex")
@@ -32,6 +32,7 @@ class Glue:
     tolerance: float = 1e-3  # largest distance from the region [m]; gaps are kept
 
 
+@runtime_checkable
 class BodyEnergy(Protocol):
     """The part of `energies.base.Energy` that a body uses."""
 
@@ -50,16 +51,6 @@ class BodyEnergy(Protocol):
         """The energy of the body in another place."""
 
 
-def _vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> NDArray[np.int64]:
-    """Returns vertex indices (n,), or raises InputError for a mask, non-integers or indices out of range."""
-    indices = np.asarray(values).ravel()
-    if indices.size and indices.dtype.kind not in "iu":
-        raise InputError(f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero.")
-    if indices.size and (indices.min() < 0 or indices.max() >= n_vertices):
-        raise InputError(f"{what} must lie between 0 and {n_vertices - 1}.")
-    return indices.astype(np.int64)
-
-
 @dataclass(frozen=True)
 class PointMass:
     """A weight attached to the body, with inertia and gravity."""
@@ -74,7 +65,7 @@ class PointMass:
         Raises:
             InputError: a negative mass, a vertex that the mesh does not have, or weights that do not sum to one.
         """
-        vertices = _vertex_indices(self.vertices, n_vertices, "a point mass's vertices")
+        vertices = vertex_indices(self.vertices, n_vertices, "a point mass's vertices")
         n = len(vertices)
         weights = np.full(n, 1.0 / max(n, 1)) if self.weights is None else np.asarray(self.weights, dtype=float)
         if not np.isfinite(self.mass) or self.mass < 0.0:
@@ -88,6 +79,7 @@ class PointMass:
         return mass
 
 
+@checks_methods("plot", "write_vtk")
 @dataclass(frozen=True)
 class Body:
     """A mesh with its boundary conditions, masses and integration rule."""
@@ -116,9 +108,10 @@ class Body:
                 parameter or an input of the same name.
             MeshError: a mesh that an energy cannot use, such as one with an open chamber.
         """
+        check_fields(self)
         if self.mass not in MASS_MODES:
             raise InputError(f"mass is {self.mass!r}: choose one of {', '.join(MASS_MODES)}.")
-        fixed = np.unique(_vertex_indices(self.fixed, self.n_vertices, "fixed vertices"))
+        fixed = np.unique(vertex_indices(self.fixed, self.n_vertices, "fixed vertices"))
         object.__setattr__(self, "fixed", fixed)
         names = [quantity.name for energy in self.energies for quantity in (*energy.parameters, *energy.inputs)]
         duplicates = [name for name in names if names.count(name) > 1]
@@ -358,7 +351,7 @@ class Body:
 
     def _glued_weights(self, glue: Glue, rigid: Mapping[int, str]) -> scipy.sparse.csr_array:
         """Returns weights (N, N) of control vertices in glued ones, from shape functions of the containing cells."""
-        vertices = np.unique(_vertex_indices(glue.vertices, self.n_vertices, "glued vertices"))
+        vertices = np.unique(vertex_indices(glue.vertices, self.n_vertices, "glued vertices"))
         cells = self.mesh.cells[self.mesh.region(glue.to)]
         for what, others in (("fixed", self.fixed_vertices), ("part of a rigid part", np.array(list(rigid)))):
             if np.isin(vertices, others).any():

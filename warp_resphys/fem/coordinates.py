@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 import scipy.sparse
 import torch
+from numpy.typing import ArrayLike
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
 from ..io.errors import InputError
@@ -350,3 +351,13 @@ def dependence(n_vertices: int, vertices: IntArray, controls: IntArray, weights:
     """Returns the weights (S, K) of control vertices (S, K) in vertices (S,) as a matrix (N, N)."""
     pairs = np.repeat(vertices, controls.shape[1]), controls.ravel()
     return scipy.sparse.csr_array((weights.ravel(), pairs), (n_vertices, n_vertices))
+
+
+def vertex_indices(values: ArrayLike, n_vertices: int, what: str) -> IntArray:
+    """Returns vertex indices (n,), or raises InputError for a mask, non-integers or indices out of range."""
+    indices = np.asarray(values).ravel()
+    if indices.size and indices.dtype.kind not in "iu":
+        raise InputError(f"{what} must be vertex numbers: turn a mask into them with np.flatnonzero.")
+    if indices.size and (indices.min() < 0 or indices.max() >= n_vertices):
+        raise InputError(f"{what} must lie between 0 and {n_vertices - 1}.")
+    return indices.astype(np.int64)

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from typing_extensions import override
 
-from ..io.errors import InputError
+from ..io.errors import InputError, checks_types
 from ..mesh.volume_mesh import Mesh, join
 from ..stepping.inputs import Inputs
 from .bodies import Body, BodyEnergy
@@ -30,6 +30,7 @@ class Scene(Body):
         InputError: no body.
     """
 
+    @checks_types
     def __init__(self, bodies: Mapping[str, Body], contact: BodyEnergy | None = None) -> None:
         if not bodies:
             raise InputError("a scene needs one or more bodies: give them by name.")

@@ -21,7 +21,7 @@ import torch
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
-from .errors import InputError, ResphysError, ResphysWarning
+from .errors import InputError, ResphysError, ResphysWarning, needs_extra
 from .kernel_cache import start_quietly
 from .process import ends_as_after_ctrl_c
 from .progress import be_quiet
@@ -183,12 +183,8 @@ def _local(workers: Workers) -> Iterator[None]:
 @contextmanager
 def _dask(address: str) -> Iterator[None]:
     """Connects to a Dask cluster, which resubmits lost work itself, up to three times."""
-    try:
+    with needs_extra("cluster", f"parallel.address={address} needs"):
         from distributed import Client
-    except ModuleNotFoundError:
-        raise InputError(
-            f"parallel.address is {address}, but Dask is not installed: run pip install 'warp-resphys[cluster]'."
-        ) from None
     try:
         client = Client(address, timeout=_ANSWER_SECONDS)
     except (OSError, ValueError) as error:

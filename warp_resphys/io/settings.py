@@ -47,12 +47,17 @@ class Settings(BaseModel):
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_default=True, protected_namespaces=()
     )
 
-    def __init__(self, /, **values: Any) -> None:
+    def __init__(self, /, *places: Any, **values: Any) -> None:
         """Checks the keys; NumPy's numbers and arrays of one or two axes are taken as numbers and lists.
 
         Raises:
-            InputError: as `parse`; the message names the class.
+            InputError: as `parse`; the message names the class. Or values without keys.
         """
+        if places:
+            kind, first = type(self).__name__, next(iter(type(self).model_fields), "key")
+            raise InputError(
+                f"{kind} is given {places[0]!r} without a name: name it, as in {kind}({first}={places[0]!r})."
+            )
         values = {name: value.tolist() if getattr(value, "ndim", 3) < 3 else value for name, value in values.items()}
         with _in_words(type(self), values, type(self).__name__):
             self.__pydantic_validator__.validate_python(values, self_instance=self)

@@ -20,7 +20,7 @@ from ..data.trials import GIVEN, RELEASED, RESTING, STATIC, UNDER_INPUTS, Trials
 from ..dynamics.frames import BaseFrame, base_movement
 from ..dynamics.simulator import Simulator
 from ..io.arrays import Brief
-from ..io.errors import ConvergenceError, InputError, in_short, listed
+from ..io.errors import ConvergenceError, InputError, checks_types, in_short, listed
 from ..settings.learning import ActuationSettings, ReleaseSettings
 from ..settings.mesh import Place
 from ..stepping.inputs import Inputs
@@ -107,6 +107,7 @@ class ObservedMotions(Brief):
             )
 
     @classmethod
+    @checks_types
     def of(
         cls,
         simulator: Simulator,

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
-from ..io.errors import InputError
+from ..io.errors import InputError, needs_extra
 from ..io.safe_files import write_text
 from .volume_mesh import Mesh, boundary_triangles, surface_vertices
 
@@ -128,10 +128,8 @@ def write_usd(
     """
     if path.suffix not in _USD:
         raise InputError(f"{path} does not end in {', '.join(_USD)}: give such a name.")
-    try:
+    with needs_extra("usd", "USD files need"):
         from pxr import Tf, Usd, UsdGeom, Vt
-    except ImportError:
-        raise InputError("USD files need a package that is not installed: pip install 'warp-resphys[usd]'.") from None
     surface = surface_vertices(mesh)
     triangles = np.searchsorted(surface, boundary_triangles(mesh))
     stage = Usd.Stage.CreateInMemory()

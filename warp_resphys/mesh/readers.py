@@ -13,7 +13,7 @@ import numpy as np
 from ..io.arrays import FloatArray, IntArray
 from ..io.atomic import atomic_path
 from ..io.decoding import MESH_READERS, Arrays, decode, mesh_arrays
-from ..io.errors import DecodingError, MeshError, warn
+from ..io.errors import DecodingError, MeshError, checks_types, warn
 from .elements import ELEMENTS
 from .volume_mesh import Mesh, boundary_faces, check_mesh, is_mirrored, quadratic
 
@@ -26,6 +26,7 @@ _CELL_TYPES = tuple(element.file_type for element in ELEMENTS.values())  # meshi
 _PHYSICAL, _GEOMETRICAL = "gmsh:physical", "gmsh:geometrical"  # meshio's names of gmsh's group numbers
 
 
+@checks_types
 def read_mesh(path: str | os.PathLike[str], units: str = "m", order: int = 1, drop_unreferenced: bool = False) -> Mesh:
     """Reads and checks a tetrahedral or hexahedral mesh of gmsh, Abaqus or any other format of meshio.
 

@@ -47,7 +47,7 @@ def tetrahedra_by_gmsh(describe: Callable[[Any], None], size: float, what: str) 
         import gmsh
     except (ImportError, OSError) as error:  # OSError: a system library that gmsh needs is missing
         raise _NoGmshError(
-            f"tetrahedra of {what} need gmsh, which cannot be imported ({error}): install it with pip install gmsh."
+            f"tetrahedra of {what} need gmsh, which cannot be imported ({error}): pip install 'warp-resphys[mesh]'."
         ) from error
     if gmsh.isInitialized():
         raise _NoGmshError(f"gmsh is in use in this process: call gmsh.finalize() before {what} is meshed.")

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from ..io.arrays import BoolArray, FloatArray, IntArray
-from ..io.errors import MeshError
+from ..io.errors import MeshError, checks_types
 from .elements import BY_NODES, ELEMENTS, FACES, Element
 from .plotting import plot_parts
 
@@ -110,6 +110,7 @@ class Mesh:
         return f"Mesh({len(self.vertices)} vertices, {len(self.cells)} cells: {self.kind}{regions})"
 
 
+@checks_types
 def quadratic(mesh: Mesh, kind: str = "") -> Mesh:
     """Returns a mesh of quadratic elements from one of linear cells; the new nodes are numbered after the old ones.
 

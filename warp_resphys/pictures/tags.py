@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..data.camera import Lens
 from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.errors import InputError, needs_extra
 from ..settings.pictures import TagSettings
 
 # Corners of a tag in the order of OpenCV, over half its edge.
@@ -24,10 +24,8 @@ def tag_poses(tag: TagSettings, image: NDArray[np.uint8], lens: Lens) -> list[Fl
     Raises:
         InputError: OpenCV is not installed, or has no such dictionary; or the edges are not perpendicular.
     """
-    try:
+    with needs_extra("tags", "data.tag needs"):
         import cv2
-    except ModuleNotFoundError:
-        raise InputError("data.tag needs a package that is not installed: pip install 'warp-resphys[tags]'.") from None
     constant = getattr(cv2.aruco, f"DICT_{tag.dictionary.upper()}", None)
     if constant is None:
         raise InputError(f"OpenCV has no tags {tag.dictionary!r}: choose one such as 6x6_250 or apriltag_36h11.")

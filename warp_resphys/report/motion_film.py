@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..data.camera import frame_of, height_of, motion_axes
 from ..dynamics.trajectory import Motion
-from ..io.errors import InputError
+from ..io.errors import InputError, checks_types
 from ..mesh.volume_mesh import boundary_triangles
 from .layers import MEASURED, Layer, RenderScene, View, body_layers, face_edges, obstacle_layers, pace, sharp_edges
 from .render import DrawingError, write_film
@@ -18,6 +18,7 @@ _DOT: Final = 0.024  # diameter of a marker, over half the height of the view
 _BEFORE: Final = 5.0  # shift of the markers to the viewer, over the same
 
 
+@checks_types
 def film(
     motion: Motion, path: str | Path, environment: int = 0, slower: float = 1.0, gravity: ArrayLike = (0.0, 0.0, -1.0)
 ) -> Path:

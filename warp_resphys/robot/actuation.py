@@ -170,7 +170,7 @@ class InputReader:
     def _tensor(self, value: Any, name: str) -> torch.Tensor:
         try:
             return self._simulator.tensor(value)
-        except (TypeError, ValueError, RuntimeError, OverflowError):
+        except InputError:
             raise InputError(f"{name} is {value!r}: give numbers, or an array or a tensor of numbers.") from None
 
 

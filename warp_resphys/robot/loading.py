@@ -15,7 +15,7 @@ from ..data.trials import PAYLOAD, STATIC
 from ..dynamics.trajectory import Motion
 from ..experiment.build import choose_device
 from ..experiment.experiment import Experiment
-from ..io.errors import DataFileError, InputError, listed
+from ..io.errors import DataFileError, InputError, checks_types, listed
 from ..learning.parameters import split_name
 from ..stepping.state import State
 from .actuation import BASE
@@ -23,6 +23,7 @@ from .description import SUFFIX, Description, describe, finished_experiment
 from .robot import Robot
 
 
+@checks_types
 def load(path: str | Path, model: str | None = None, device: str = "cpu", on_failure: str = "raise") -> Robot:
     """Loads the robot of a finished run, or of a file that `Robot.save` wrote.
 

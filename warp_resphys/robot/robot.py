@@ -13,7 +13,7 @@ from ..data.markers import Observation
 from ..dynamics.frames import BaseFrame, VertexFrames
 from ..dynamics.simulator import Simulator
 from ..dynamics.trajectory import Motion
-from ..io.errors import ConvergenceError, InputError
+from ..io.errors import ConvergenceError, InputError, checks_methods, checks_types
 from ..learning.evaluation import POSE_STEPS
 from ..learning.observed_motions import Identified
 from ..learning.parameters import TILTS, check_names, constants_of, identifiable_parameters, replaced
@@ -41,6 +41,7 @@ from .description import Description
 from .of_simulator import description_of
 
 
+@checks_methods("__init__", "rollout", "begin", "settle", "step", "observe", "save")
 class Robot:
     """The simulator of an experiment with identified parameters and learned force; `loading.load` makes one.
 
@@ -88,6 +89,7 @@ class Robot:
         self._set_parameters(parameters or {})
 
     @classmethod
+    @checks_types
     def of(
         cls,
         simulator: Simulator,
@@ -143,9 +145,8 @@ class Robot:
 
     def in_gravity(self, gravity: ArrayLike) -> "Robot":
         """Returns the robot under another gravity (3,) in axes of the world [m/s^2], without an identified tilt."""
-        pull = np.asarray(gravity, dtype=np.float64).tolist()
         known = {name: value for name, value in self.parameters.items() if name not in TILTS}
-        simulator = replace(self.simulator, gravity=pull)
+        simulator = replace(self.simulator, gravity=np.asarray(gravity).tolist())
         description = self.description.stepped_by(simulator, without=TILTS)
         return self._changed(known, simulator=simulator, description=description)
 

@@ -18,7 +18,7 @@ from ..energies.materials import Material
 from ..fem.bodies import Body
 from ..fem.scene import Scene
 from ..io.arrays import FloatArray
-from ..io.errors import InputError
+from ..io.errors import InputError, checks_types
 from ..learning.parameters import constants_of
 from ..stepping.inputs import Inputs
 from ..stepping.state import State
@@ -52,6 +52,7 @@ class RobotScene:
         constants: of the simulator, with the robots' identified parameters.
     """
 
+    @checks_types
     def __init__(
         self,
         robots: Mapping[str, tuple[Robot, ArrayLike]],

@@ -29,6 +29,10 @@ class Quantity:
     shown_unit: str = ""  # unit of displayed values
     shown_factor: float = 1.0  # number of `shown_unit` in one `unit`
 
+    def __float__(self) -> float:
+        """Raises InputError, as a quantity is no number."""
+        raise InputError(f"{self.name} is declared here, with its unit and range: its value is in `defaults`, by name.")
+
     def shown(self, value: float) -> str:
         """Returns a value as text, in the displayed unit."""
         return f"{self.shown_factor * value:.4g} {self.shown_unit}"

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..io.arrays import BoolArray, Brief
-from ..io.errors import InputError
+from ..io.errors import InputError, check_type
 from .inputs import check_tensor, shapes
 
 ROBOT = "robot"  # owner of the memory variables of a robot and of its roll-out
@@ -83,6 +83,7 @@ class Reaction(Brief):
         if isinstance(vertices, slice):
             chosen = sorted(place.keys() & {*range(*vertices.indices(1 + max(place, default=0)))})
         else:
+            check_type("vertices", vertices, ArrayLike)
             numbers = torch.as_tensor(vertices).reshape(-1)
             if numbers.is_floating_point() or numbers.dtype == torch.bool or not place.keys() >= {*numbers.tolist()}:
                 raise InputError("there is no reaction at some of these vertices: give numbers of those of `vertices`.")

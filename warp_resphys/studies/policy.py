@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import AfterValidator
 
-from ..io.errors import InputError
+from ..io.errors import needs_extra
 from ..io.progress import Progress, show
 from ..io.resuming import finished_record
 from ..io.safe_files import read_json, write_json
@@ -55,11 +55,9 @@ def train_policy(settings: Policies, folder: Path) -> None:
         DataFileError: there is no finished run.
     """
     del folder
-    try:
+    with needs_extra("policies", "policies need"):
         from ..environments.making import make_vector
         from ..environments.tasks import GoalTask
-    except ImportError as error:
-        raise InputError(f"policies need Gymnasium ({error}): pip install 'warp-resphys[policies]'.") from None
     wp.config.log_level = wp.LOG_WARNING
     run, task, models = Path(settings.run).expanduser(), settings.skill, settings.models
     reaches, learned_on = {}, settings.learned_on

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ..energies.contact.obstacle_surface import ObstacleSurface
-from ..io.errors import InputError, ResphysError
+from ..io.errors import InputError, ResphysError, needs_extra
 from ..io.progress import show
 from ..io.settings import Count, Positive, Settings, Word, setting
 from ..mesh.volume_mesh import boundary_triangles, surface_vertices
@@ -69,12 +69,8 @@ def view(settings: ViewSettings, folder: Path) -> None:
     """
     del folder
     port = _free_port(settings.host, settings.port)
-    try:
+    with needs_extra("view", "the viewer needs"):
         import viser
-    except ImportError:
-        raise InputError(
-            "the viewer needs a package that is not installed: pip install 'warp-resphys[view]'."
-        ) from None
     wp.config.log_level = wp.LOG_WARNING
     robot = load(Path(settings.run).expanduser(), settings.model, device=settings.device)
     live: LiveRobot | LiveTwin

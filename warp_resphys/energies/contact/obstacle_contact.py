@@ -34,7 +34,7 @@ import torch
 from typing_extensions import override
 
 from ...fem.integration_points import Points
-from ...io.errors import InputError, in_short, listed
+from ...io.errors import InputError, check_type, in_short, listed
 from ...mesh.volume_mesh import Mesh
 from ...settings.contact import Obstacle, SurfaceFile
 from ...stepping.quantity import Parameter, Quantity
@@ -87,6 +87,7 @@ class Contact(Energy):
 
     def __post_init__(self) -> None:
         """Checks the values."""
+        check_type("Contact: obstacles", self.obstacles, Mapping)
         if not self.obstacles:
             raise InputError("contact needs an obstacle or more: give them by name.")
         for name, obstacle in self.obstacles.items():

@@ -162,6 +162,12 @@ def test_a_stretch_is_no_strain(tmp_path, kind):
     np.testing.assert_allclose(read_test(path)["strain"], strain, rtol=1e-4)
 
 
+def test_a_break_near_a_strain_of_one_is_no_stretch(tmp_path):
+    strain = np.append(STRAINS, [1.01, 1.02])
+    path = table(tmp_path / "a.csv", "strain,stress [kPa]", strain, np.append(curve(), [0.12, 0.1]))
+    assert len(read_test(path)["strain"]) == 52
+
+
 def membrane(path, *forces):
     head = "thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm"
     rows = [f"{10 + k % 6},5000,{force:.6g}" for k, force in enumerate(forces)]

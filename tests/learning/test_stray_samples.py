@@ -77,7 +77,9 @@ def test_cycles_and_coarse_load_cells_lose_nothing(count, noise, kind):
         loads = np.diff(strain, prepend=-1.0) > 0.0
         for law in (LAW, {"c10": 10e3, "ogden_3": 25e3}):
             exact = stress(kind, strain, law)
-            noisy = exact * np.where(loads, 1.0, 0.4 + 0.6 * strain / most) * (1.0 + noise * random.standard_normal(count))
+            noisy = (
+                exact * np.where(loads, 1.0, 0.4 + 0.6 * strain / most) * (1.0 + noise * random.standard_normal(count))
+            )
             size = np.abs(noisy).max() or 1.0
             for curve in (noisy, np.round(noisy / size * 20.0) * size / 20.0, np.maximum(noisy - 0.3 * size, 0.0)):
                 assert found(strain, curve) == {}

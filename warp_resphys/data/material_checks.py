@@ -128,7 +128,10 @@ def check_no_stretch(read: MeasuredTable, path: Path) -> None:
     strain, load = read.columns["strain"], np.abs(read.columns["stress" if "stress" in read.columns else "force"])
     if len(strain) < LEAST or not 0.9 <= (unloaded := float(strain[np.argmin(load)])) <= 1.1:
         return
-    if (strain.min() >= 0.9 or strain.max() <= 1.1) and load.min() < 0.2 * load.max():
+    away = np.abs(strain - 1.0)
+    near = away <= np.median(away)
+    grows = np.median(load[near]) < 0.8 * np.median(load[~near]) if not near.all() else False
+    if (strain.min() >= 0.9 or strain.max() <= 1.1) and load.min() < 0.2 * load.max() and grows:
         raise DataFileError(
             f"{path}: the strain is {unloaded:.3g} in line {read.lines[np.argmin(load)]}, where the load is least, as "
             "a stretch is: name its column 'stretch', or subtract 1."

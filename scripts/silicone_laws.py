@@ -26,7 +26,7 @@ from warp_resphys.settings.data_kinds import TableSettings
 
 ROOT: Final = Path(__file__).parents[1]
 PAGE: Final = ROOT / "docs" / "results" / "silicones.md"
-TABLE: Final = TableSettings(columns=("time [s]", None, None, "strain", "stress [MPa]"), header_lines=18)
+TABLE: Final = TableSettings(columns=(None, None, None, "strain", "stress [MPa]"), header_lines=18)
 SOURCE: Final = (
     "Uniaxial tension, ASTM D412 die C, 450 mm/min, strain from the crosshead; Soft Robotics Materials Database, doi "
     "10.1089/soro.2019.0115, Open Database License 1.0"

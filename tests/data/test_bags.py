@@ -9,6 +9,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from support.command_line import outcome
+from support.refusals import refuses
 from warp_resphys import DataFileError, InputError, read_recording
 from warp_resphys.data.base_motion import since_first
 from warp_resphys.settings.data_kinds import BagSettings
@@ -83,8 +84,8 @@ def of_tip(source, *inputs):
     return BagSettings(markers={"tip": source}, inputs=inputs)
 
 
-def written(path, kind="sqlite3", left_out=(), late=0.0):
-    """A bag with two markers, a rigid body, two inputs and an image topic."""
+def written(path, kind="sqlite3", left_out=(), late=0.0, clock=None):
+    """A bag with two markers, a rigid body, two inputs and an image topic; ``clock`` changes times of /joint_states."""
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
     if kind == "bag":  # not among the types of ROS 1 that rosbags brings
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
@@ -110,7 +111,8 @@ def written(path, kind="sqlite3", left_out=(), late=0.0):
             write("/wrench", make.wrench(other, (other, 0.0, 2.0 * other)), other)
             if number % 10 == 0:
                 write("/pressure", make.numbers([0.0, number]), time)
-                write("/joint_states", make.joints(time, arm=9.0, winch=0.5 * number), time)
+                stamp = time if clock is None else clock(number, time)
+                write("/joint_states", make.joints(stamp, arm=9.0, winch=0.5 * number), time)
     return path
 
 
@@ -154,6 +156,33 @@ def test_wrenches_are_readings_of_force_sensors(tmp_path):
     assert np.isnan(readings[0]).all()  # before its first message
     expected = np.stack([TIMES, 0.0 * TIMES, 2.0 * TIMES, 0.0 * TIMES, TIMES, 0.0 * TIMES], 1)
     np.testing.assert_allclose(readings[1:], expected[1:], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("clock", "said"),
+    [
+        (lambda number, time: 1.0, "in the headers of /joint_states, 4 of 5 messages repeat the time of another"),
+        (
+            lambda number, time: time - 50.0 * (number > 15),
+            "the time falls by 49.8 s at message 3: record it with a clock",
+        ),
+        (
+            lambda number, time: time + 40.0,
+            "/joint_states#winch.* are of another clock than those of /mocap/tip: they differ by -40 s at the start",
+        ),
+        (lambda number, time: 5.0 * time, "another clock .* at the start and -3.2 s at the end"),
+    ],
+)
+def test_clocks_that_stand_still_fall_or_differ(tmp_path, clock, said):
+    bag = of_tip("/mocap/tip", "/joint_states#winch.position [mm]")
+    refuses(DataFileError, said, read_recording, written(tmp_path / "trial", clock=clock), bag=bag)
+
+
+def test_a_message_that_comes_twice_is_left_out_and_counted(tmp_path, caplog):
+    path = written(tmp_path / "trial", clock=lambda number, time: time - 0.2 * (number == 20))
+    read = read_recording(path, bag=of_tip("/mocap/tip", "/joint_states#winch.position [mm]"))
+    np.testing.assert_allclose(read.actuation[:, 0], 0.5e-3 * np.repeat([0, 10, 10, 30, 40], [10, 10, 10, 10, 1]))
+    assert "trial: 1 of 5 messages of /joint_states left out, which repeat the time of another" in caplog.text
 
 
 def test_a_gap_is_not_bridged(tmp_path):

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from support.command_line import refusal
 from support.refusals import refuses
 from warp_resphys import DataFileError, read_recording
 from warp_resphys.data.recordings.processing import Release, resample, trim_to_release
 from warp_resphys.data.recordings.recording_files import write_recording
+from warp_resphys.settings.data_kinds import TableSettings
 
 TIMES = np.arange(21) / 50.0
 FORCE = 0.3 + TIMES
@@ -53,6 +55,110 @@ def test_a_column_in_another_unit_is_a_channel_and_two_of_one_name_are_refused(t
 )
 def test_wrong_units_are_refused(tmp_path, header, said):
     refuses(DataFileError, said, read_recording, table(tmp_path / "a.csv", header))
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "axis", "factor"),
+    [
+        ("load_fz [N]", "load", 2, 1.0),
+        ("load fz [N]", "load", 2, 1.0),
+        ("load_Fz_N", "load", 2, 1.0),
+        ("load.fz (N)", "load", 2, 1.0),
+        ("load.fz (in mN)", "load", 2, 1e-3),
+        ("Fz [N]", "load", 2, 1.0),
+        ("Fz_N", "load", 2, 1.0),
+        ("Force Y (N)", "load", 1, 1.0),
+        ("ati/fx [N]", "ati", 0, 1.0),
+        ("wrench.force.z [N]", "wrench", 2, 1.0),
+        ("ft/wrench/torque/x [Nm]", "ft/wrench", 3, 1.0),
+        ("load.fz [gf]", "load", 2, 9.80665e-3),
+        ("load.fz [lbf]", "load", 2, 4.4482216),
+        ("load.mx [Nm]", "load", 3, 1.0),
+        ("Mz [N mm]", "load", 5, 1e-3),
+        ("load.tx [N\u00b7m]", "load", 3, 1.0),
+        ("load.tx [N*m]", "load", 3, 1.0),
+        ("load.tx [N.m]", "load", 3, 1.0),
+        ("load.tx [N-m]", "load", 3, 1.0),
+        ("load.tx [in-lbf]", "load", 3, 0.11298483),
+    ],
+)
+def test_names_and_units_of_loggers(tmp_path, header, name, axis, factor):
+    recording = read_recording(table(tmp_path / "a.csv", header))
+    assert recording.labels == ("tip",)
+    assert recording.actuation.shape == (21, 1)
+    assert [*recording.loads] == [name]
+    np.testing.assert_allclose(recording.loads[name][:, axis], factor * FORCE)
+    assert np.isfinite(recording.loads[name]).sum() == 21
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("Fx", r"column Fx of a force sensor has no unit: .* 'load.fx \[N\]', or 'F.x \[mm\]' for a marker"),
+        ("Mx", r"column Mx of a force sensor has no unit: .* 'load.tx \[N m\]'"),
+        ("load.fz [V]", r"has the unit 'V': give one of N, mN, kN, gf, kgf, lbf"),
+        ("load.fz [g]", r"has the unit 'g': give one of N"),
+        ("Force [N]", r"may be a reading of a force sensor or an input: write 'load.fz \[N\]'"),
+        ("Force (in N)", r"may be a reading of a force sensor or an input"),
+        ("Load cell 1 (N)", r"may be a reading of a force sensor or an input"),
+        ("laser [mm]", r"is named 'laser', which is neither .* nor '<sensor>.fx \[N\]' .* 'tendon \[mm\]'"),
+        ("tip_u [mm]", r"is named 'tip_u', which is neither"),
+    ],
+)
+def test_what_may_be_a_force_or_an_input_is_asked_about(tmp_path, header, said):
+    refuses(DataFileError, said, read_recording, table(tmp_path / "a.csv", header))
+
+
+def test_lengths_of_tendons_are_inputs(tmp_path):
+    recording = read_recording(table(tmp_path / "a.csv", "tendon_1 [mm]", "winch (m)", "left cable_mm"))
+    assert recording.labels == ("tip",)
+    np.testing.assert_allclose(recording.actuation[:, 1:], np.outer(FORCE, [1e-3, 2.0, 3e-3]))
+
+
+def test_forces_without_markers_are_a_recording(tmp_path):
+    path = tmp_path / "blocked.csv"
+    rows = [f"{t:.2f},{10.0 * t},{0.3 + t}" for t in TIMES]
+    path.write_text("\n".join(["time [s],pressure [kPa],load.fz [N]", *rows]), encoding="utf-8")
+    columns = TableSettings(columns=("time [s]", "pressure [kPa]", "load.fz [N]"), header_lines=1)
+    for table in (None, columns):
+        recording = read_recording(path, table=table)
+        assert recording.positions.shape == (21, 0, 3)
+        assert recording.rate == 50.0
+        np.testing.assert_allclose(recording.actuation[:, 0], 1e4 * TIMES)
+        np.testing.assert_allclose(recording.loads["load"][:, 2], FORCE)
+    write_recording(tmp_path / "a.h5", recording)
+    loads = recording.loads["load"][:, None]
+    np.savez(tmp_path / "a.npz", rate_hz=50.0, loads=loads, sensors=["load"])
+    for name in ("a.h5", "a.npz"):
+        np.testing.assert_allclose(read_recording(tmp_path / name).loads["load"], recording.loads["load"])
+    pressure = tmp_path / "pressure.csv"
+    pressure.write_text("time [s],pressure [kPa]\n0,1\n1,2\n2,3\n", encoding="utf-8")
+    refuses(DataFileError, "no header that is known", read_recording, pressure)
+    assert "has no markers, whose quality is examined, but force sensors alone ('load')" in refusal(
+        "inspect", str(path)
+    )
+
+
+def test_a_distance_along_one_axis_is_no_marker(tmp_path):
+    path = tmp_path / "laser.csv"
+    path.write_text("time [s],rod.x [mm],valve [kPa]\n" + "".join(f"{t},{t},1\n" for t in TIMES), encoding="utf-8")
+    said = "marker rod has no column 'rod.y'; its single axis is a distance, as of a laser, .* give the others"
+    refuses(DataFileError, said, read_recording, path)
+
+
+def test_words_beside_numbers_are_skipped_and_named(tmp_path, caplog):
+    path = tmp_path / "a.csv"
+    rows = "".join(f"run,{t},{10.0 * t},1,2\n" for t in TIMES)
+    path.write_text("state,time [s],tip.x [mm],tip.y [mm],tip.z [mm]\n" + rows, encoding="utf-8")
+    np.testing.assert_allclose(read_recording(path).positions[:, 0, 0], 1e-2 * TIMES)
+    assert "columns of text are not read: 'state'" in caplog.text
+
+
+def test_thousands_of_positions(tmp_path):
+    path = tmp_path / "a.txt"
+    rows = "".join(f"{t:.2f}\t{980.0 + 50.0 * t:,.0f}\t1\t2\n" for t in TIMES)
+    path.write_text("time [s]\ttip.x [mm]\ttip.y [mm]\ttip.z [mm]\n" + rows, encoding="utf-8")
+    np.testing.assert_allclose(read_recording(path).positions[:, 0, 0], 1e-3 * np.round(980.0 + 50.0 * TIMES))
 
 
 def test_readings_follow_frames_and_rates(tmp_path):

@@ -108,6 +108,10 @@ def test_two_specimens_in_a_table_are_refused(tmp_path, head):
     refuses(
         DataFileError, "line 52: the strain falls from 1 to 0.02 at once, as where another specimen", read_test, path
     )
+    for first, second in ((50, 15), (20, 50)):  # that do not reach the same strain
+        some = [np.concatenate([one[:first], one[50 : 50 + second]]) for one in columns]
+        shorter = table(tmp_path / "b.csv", head, *some)
+        refuses(DataFileError, f"line {first + 2}: the strain falls from .* at once", read_test, shorter)
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text("\n".join([*lines[:51], lines[0], *lines[51:]]), encoding="utf-8")
     refuses(DataFileError, "2 tables, whose numbers begin in lines 2, 53: write each specimen", read_test, path)
@@ -130,7 +134,7 @@ def test_steps_and_cycles_are_one_test(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("most", "c10"), [(3.5, 30e3), (18.0, 30e3), (18.0, 300e3), (6.0, 500e3), (1.5, 30e3), (12.0, 5e3)]
+    ("most", "c10"), [(0.8, 20e3), (3.5, 30e3), (18.0, 30e3), (18.0, 300e3), (6.0, 500e3), (1.5, 30e3), (12.0, 5e3)]
 )
 def test_per_cent_without_a_unit_is_asked_about(tmp_path, most, c10):
     percent = np.linspace(most / 60, most, 60)
@@ -160,6 +164,12 @@ def test_a_stretch_is_no_strain(tmp_path, kind):
     )
     path = table(tmp_path / "a.csv", "stretch,stress [kPa]", stretch, load)
     np.testing.assert_allclose(read_test(path)["strain"], strain, rtol=1e-4)
+
+
+def test_a_break_near_a_strain_of_one_is_no_stretch(tmp_path):
+    strain = np.append(STRAINS, [1.01, 1.02])
+    path = table(tmp_path / "a.csv", "strain,stress [kPa]", strain, np.append(curve(), [0.12, 0.1]))
+    assert len(read_test(path)["strain"]) == 52
 
 
 def membrane(path, *forces):

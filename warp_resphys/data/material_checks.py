@@ -24,6 +24,8 @@ _STRAIGHT: Final = (1.25, 2.0)  # ratio of slopes of a straight curve; of one th
 _PARTS: Final = 5  # of the strains, with a slope each
 _BEGINS: Final = 2.0  # steps of a clock from zero, up to which it begins
 _AT_ONCE: Final = 10.0  # ratio of a step to the usual one
+_PART: Final = 0.15  # of the range of a deformation, of such a step
+_LEFT: Final = 0.3  # of a deformation, at most, that another specimen begins with
 
 
 @dataclass(frozen=True)
@@ -111,14 +113,14 @@ def _restarts(length: FloatArray) -> list[int]:
     steps = np.diff(length)
     if len(steps) < 2 * LEAST:
         return []
-    large = (np.abs(steps) > 0.5 * np.ptp(length)) & (np.abs(steps) > _AT_ONCE * np.median(np.abs(steps)))
-    back = large & (np.abs(length[1:]) < np.abs(length[:-1]))
-    if (large & ~back).any():
+    at_once = np.abs(steps) > max(_AT_ONCE * float(np.median(np.abs(steps))), _PART * float(np.ptp(length)))
+    back = at_once & (np.abs(length[1:]) < _LEFT * np.abs(length[:-1]))
+    if (at_once & (np.abs(length[1:]) > np.abs(length[:-1]))).any():
         return []  # steps to and fro
     found = list[int]()
     for row in np.flatnonzero(back) + 1:
         before, after = abs(length[row - 1]), np.abs(length[row:])
-        if row >= LEAST and len(after) >= LEAST and after[:LEAST].max() < 0.5 * before < after.max():
+        if row >= LEAST and len(after) >= LEAST and after[:LEAST].max() < 0.5 * before < 5.0 * (after.max() - after[0]):
             found.append(int(row))
     return found
 
@@ -128,7 +130,10 @@ def check_no_stretch(read: MeasuredTable, path: Path) -> None:
     strain, load = read.columns["strain"], np.abs(read.columns["stress" if "stress" in read.columns else "force"])
     if len(strain) < LEAST or not 0.9 <= (unloaded := float(strain[np.argmin(load)])) <= 1.1:
         return
-    if (strain.min() >= 0.9 or strain.max() <= 1.1) and load.min() < 0.2 * load.max():
+    away = np.abs(strain - 1.0)
+    near = away <= np.median(away)
+    grows = np.median(load[near]) < 0.8 * np.median(load[~near]) if not near.all() else False
+    if (strain.min() >= 0.9 or strain.max() <= 1.1) and load.min() < 0.2 * load.max() and grows:
         raise DataFileError(
             f"{path}: the strain is {unloaded:.3g} in line {read.lines[np.argmin(load)]}, where the load is least, as "
             "a stretch is: name its column 'stretch', or subtract 1."
@@ -145,11 +150,11 @@ def check_unit(read: MeasuredTable, strain: FloatArray, stress: FloatArray, path
         path: of the table.
 
     Raises:
-        DataFileError: as the strain would be more than 100 %, of a material that is softer than silicones, or whose
-            curve is straight where none of an elastomer is.
+        DataFileError: as the strain would be of a material that is softer than silicones, or whose curve is straight
+            where none of an elastomer is.
     """
     most = float(np.abs(strain).max()) if len(strain) else 0.0
-    if read.bare is None or most <= 1.0:
+    if read.bare is None or not most:
         return
     modulus = float(np.median(np.abs(stress[strain != 0.0] / strain[strain != 0.0]))) / 3.0
     limit = _STRAIGHT[modulus < _SOFT or most > _LONG]

@@ -25,15 +25,22 @@ _UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "min": 60.0, "ms": 1e-3},
     "strain": {"1": 1.0, "%": 0.01},
     "stretch": {"1": 1.0},
-    "displacement": {**METRES_PER_UNIT, "in": 0.0254},
+    "displacement": {**METRES_PER_UNIT, "um": 1e-6, "in": 0.0254},
     "stress": _PRESSURES,
     "force": {"N": 1.0, "kN": 1e3, "mN": 1e-3, "lbf": 4.448222, "kgf": 9.80665, "gf": 9.80665e-3},
 }
 _BARE: Final = ("strain", "stretch")  # that may have no unit
 _SYNONYMS: Final = {"extension": "displacement", "load": "force"}  # where no column has the word itself
-_SPELLED: Final = {"sec": "s", "S": "s", "seconds": "s", "N/mm²": "MPa", "N/mm2": "MPa", "inch": "in"} | dict.fromkeys(
-    ("mm/mm", "m/m", "in/in", "-", "\u2013"), "1"
-)
+_SPELLED: Final = {
+    "sec": "s",
+    "S": "s",
+    "seconds": "s",
+    "N/mm²": "MPa",
+    "N/mm2": "MPa",
+    "inch": "in",
+    "\u00b5m": "um",
+    "\u03bcm": "um",
+} | dict.fromkeys(("mm/mm", "m/m", "in/in", "-", "\u2013"), "1")
 _CELL: Final = re.compile(r"(.*?)[\s_]*(?:[\[(](?:in )?(.*)[\])])?")
 _SUFFIX: Final = re.compile(r"(\w+?)(?:_|\s*/\s*)([^\s_/]+)")  # Force_N, Kraft / N
 _ALL_UNITS: Final = {*_SPELLED, *(unit for units in _UNITS.values() for unit in units)}

@@ -1,6 +1,7 @@
 """The law of a material from tests of specimens: stages and results."""
 
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from ..energies.catalogue import LawContent, law_path, read_law
 from ..energies.isochoric import bulk_of, shear_modulus
 from ..io.arrays import BoolArray, FloatArray
 from ..io.atomic import digest
-from ..io.errors import ConvergenceError, DataFileError, InputError, naming
+from ..io.errors import ConvergenceError, DataFileError, InputError, ResphysWarning, naming
 from ..io.progress import show
 from ..io.resuming import Stage, StageContext, package_versions, resources_used
 from ..io.safe_files import read_json, write_json
@@ -76,7 +77,7 @@ def table_files(data: MaterialTestData) -> dict[str, list[Path]]:
     return found
 
 
-def test_names(data: MaterialTestData, tables: Mapping[str, Sequence[Path]]) -> dict[tuple[str, Path], str]:
+def names_of(data: MaterialTestData, tables: Mapping[str, Sequence[Path]]) -> dict[tuple[str, Path], str]:
     """Returns a name of its own for each table: that of its test, or where a pattern finds several that of the file.
 
     Files of one name are named with their folders, and files that differ by their extension with it.
@@ -112,7 +113,7 @@ def tests_of(
         ConvergenceError: a simulated specimen has no equilibrium.
     """
     fitted, held, tables = dict[str, MaterialTest](), dict[str, MaterialTest](), table_files(data)
-    names, notes = test_names(data, tables), list[str]()
+    names, notes = names_of(data, tables), list[str]()
     for number, (name, wanted) in enumerate(data.tests.items()):
         found = held if wanted.held_out else fitted
         for path in tables.get(name, [None]):
@@ -228,18 +229,20 @@ def identify_material(context: StageContext) -> None:
     tests, held, notes = tests_of(data, ratio, settings.seed)
     known = None if wanted.file is None else read_law(wanted.file)
     unscaled, factor = None, None
-    if data.scaled:
-        assert known is not None
-        law = scale_to_tests(tests, known, density=density, poissons_ratio=ratio)
-        simple: LawContent = {**known, "parameters": {"c10": 0.5 * shear_modulus(known["parameters"])}}
-        simplest = law if not law.groups else scale_to_tests(tests, simple, density=density, poissons_ratio=ratio)
-        factor = shear_modulus(law.parameters) / shear_modulus(known["parameters"])
-        unscaled = replace(law, columns={name: value / factor for name, value in law.columns.items()})
-    else:
-        times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
-        options = {"density": density, "poissons_ratio": ratio, "times": times, "known": known}
-        law = identify_from_tests(tests, terms=wanted.terms, **options)
-        simplest = law if not law.groups else identify_from_tests(tests, terms=(), **options)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".* left out", ResphysWarning)  # which report and terminal name
+        if data.scaled:
+            assert known is not None
+            law = scale_to_tests(tests, known, density=density, poissons_ratio=ratio)
+            simple: LawContent = {**known, "parameters": {"c10": 0.5 * shear_modulus(known["parameters"])}}
+            simplest = law if not law.groups else scale_to_tests(tests, simple, density=density, poissons_ratio=ratio)
+            factor = shear_modulus(law.parameters) / shear_modulus(known["parameters"])
+            unscaled = replace(law, columns={name: value / factor for name, value in law.columns.items()})
+        else:
+            times = np.geomspace(*wanted.relaxation_times, wanted.branches).tolist()
+            options = {"density": density, "poissons_ratio": ratio, "times": times, "known": known}
+            law = identify_from_tests(tests, terms=wanted.terms, **options)
+            simplest = law if not law.groups else identify_from_tests(tests, terms=(), **options)
     models = {"law": law, "neo_hookean": simplest} | ({} if unscaled is None else {"unscaled": unscaled})
     results = {name: _result(name, test, models, name in held) for name, test in (tests | held).items()}
     content = law.content()

@@ -27,7 +27,7 @@ SHIFT = 1e-6  # m, along every axis, against which friction acts that is to hold
 _HELD_BY = 3  # vertices with friction, against all displacements and turns
 _MOST_LENGTHS = 100.0  # largest displacement, in lengths of the body
 _REMEDY = "the equilibrium does not settle: lower the friction, the tension or the internal forces"
-_EXACT = 1e-12  # relative tolerance of an equilibrium, whose reactions balance its loads as exactly
+_EXACT = 1e-10  # relative tolerance of an equilibrium, whose reactions balance its loads as exactly
 _LEAST_SHARE = 1.0 / 64.0  # smallest load increment, as a fraction of the loads
 
 Solve = Callable[[float, torch.Tensor], tuple[torch.Tensor, SolveReport]]

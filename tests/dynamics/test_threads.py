@@ -86,6 +86,7 @@ with ThreadPoolExecutor(4) as pool:
 """
 
 
+@pytest.mark.slow
 def test_the_first_use_may_be_in_several_threads(pytestconfig):
     """Warp loads modules and captures graphs for the whole process: of one simulator and of several."""
     folder = pytestconfig.rootpath / "tests"

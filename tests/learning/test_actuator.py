@@ -245,9 +245,10 @@ def test_poses_at_rest_teach_what_acts_in_the_end(simulator):
 
 def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, motions):
     fitting, kept = ActuatorFitting(simulator, motions, MANY[:2], ("motion 3",)), []
-    whole, training = fitting.fit(QUICK, save=kept.append)
+    two = QUICK.changed(epochs=2)
+    whole, training = fitting.fit(two, save=kept.append)
     fitting.fit(QUICK.changed(epochs=1), save=kept.append)
-    again, resumed = fitting.fit(QUICK, resumed=kept[-1])
+    again, resumed = fitting.fit(two, resumed=kept[-1])
     assert resumed["epochs"] == training["epochs"]
     torch.testing.assert_close(again.actuator["tendon_tension"].weights, whole.actuator["tendon_tension"].weights)
 

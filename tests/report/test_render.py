@@ -99,18 +99,18 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_one_process_draws_scene_after_scene():
+def test_one_process_draws_scene_after_scene(renderer):
     mesh = box_hexahedra(divisions=(1, 1, 1))
     small = body_scene(mesh)
     wide = body_scene(mesh, views=2)
-    with render.Renderer() as renderer:
-        first, both = (render.draw(scene, renderer)[0] for scene in (small, wide))
-        process = renderer._process
-        (again,) = render.draw(small, renderer)
-        assert renderer._process is process
-        renderer.close()
-        (restarted,) = render.draw(small, renderer)
+    first, both = (render.draw(scene, renderer)[0] for scene in (small, wide))
+    process = renderer._process
+    (again,) = render.draw(small, renderer)
+    assert renderer._process is process
+    renderer.close()
+    (restarted,) = render.draw(small, renderer)
     assert process.poll() is not None
+    assert renderer._process is not process
     np.testing.assert_array_equal(first, again)
     np.testing.assert_array_equal(first, restarted)
     assert both.shape[1] == 2 * first.shape[1]

@@ -305,6 +305,7 @@ def test_its_description(robot, arm):
     assert robot.description.errors_mm == errors
 
 
+@pytest.mark.slow
 def test_the_lines_of_the_readme(tmp_path, monkeypatch):
     """A beam of two silicones, which README.md simulates as one: the corrected robot is right under another pull."""
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")

@@ -9,9 +9,18 @@ import yaml
 
 from warp_resphys.learning.baselines import BASELINES
 from warp_resphys.report.data import Errors
-from warp_resphys.report.ranking import LEAST_TRIALS, best_pair, compared, known_errors
+from warp_resphys.report.ranking import LEAST_EVIDENCE, LEAST_TRIALS, best_pair, compared, known_errors
 from warp_resphys.report.verdict import less_error
-from warp_resphys.report.wording import MINUS, MODELS, NONE, duration_text, error_parts, in_a_row, number_text
+from warp_resphys.report.wording import (
+    MINUS,
+    MODELS,
+    NONE,
+    duration_text,
+    error_parts,
+    in_a_row,
+    model_words,
+    number_text,
+)
 
 ROWS: Final[Mapping[str, Any]] = yaml.safe_load(Path(__file__).with_name("reproduce.yaml").read_text(encoding="utf-8"))
 CORRECTED: Final = ("sysid", "resphys")
@@ -105,6 +114,8 @@ def _robot_section(name: str, row: Mapping[str, Any], pictures: Path) -> list[st
         means = {model: row["errors_mm"][model]["mean"] for model in (pair["corrected"], pair["other"])}
         best, second = sorted(means, key=lambda model: means[model])
         said = less_error(best, second, 1.0 - means[best] / means[second])
+        if count < LEAST_EVIDENCE:
+            said = f"no evidence either way for {model_words(best)} or {model_words(second)}"
         text += f" {said[0].upper()}{said[1:]} ({number_text(means[best])} and {number_text(means[second])} mm)."
     if row["moved_mm"] is not None:
         text += f" A finer mesh moves the markers of the identified simulator by {number_text(row['moved_mm'])} mm."

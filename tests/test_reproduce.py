@@ -55,7 +55,9 @@ def test_the_readme_has_the_figures_of_the_robots():
 
 
 def same(text, exact):
-    """Whether a number is another one, rounded."""
+    """Whether a number is another one, rounded, or is below a bound: "below 0.001"."""
+    if text.startswith("below "):
+        return 0.0 < float(exact) < float(text.removeprefix("below "))
     return abs(float(text) - float(exact)) <= 0.5 * 10.0 ** -len(text.partition(".")[2]) + 1e-9
 
 
@@ -73,6 +75,17 @@ def test_every_row_is_an_experiment():
     assert composed("config", [override for row in every for override in row.get("overrides", ())])
     for name, beam in reproduce.ROWS["beams"].items():
         assert composed("config", [f"experiment={name}", *beam.get("overrides", ())]).get("law") is None
+
+
+def test_less_error_of_a_robot_is_claimed_with_three_trials_or_more():
+    kept = json.loads((DOCS / "robots.json").read_text())
+    page = reproduce.robots_page(kept, {}, DOCS / "robots")
+    tested = {len(row["tested"]) for row in kept.values() if row["beside"]}
+    assert min(tested) < 3 <= max(tested)
+    for text in re.findall(r"^Tested on .*", page, flags=re.MULTILINE):
+        few = int(re.match(r"Tested on (\d+)", text)[1]) < 3
+        assert ("No evidence either way" in text) == few
+        assert ("less error than" in text) == (not few)
 
 
 def test_gains_and_the_best_models_are_those_of_the_trials():

@@ -415,12 +415,19 @@ def test_the_verdict_says_where_an_identification_is_no_better():
         none = dict.fromkeys(distances)
         return PictureResult("a", "", tested, 1, distances, distances, distances, none, none)
 
-    assert picture_verdict([result(0.5, 2.0, True), result(9.0, 1.0, False)]) == [
-        "The identified simulator has 75 % less error than the uncorrected simulator (on 1 pose kept back)."
+    three = [result(0.5, 2.0, True)] * 3
+    assert picture_verdict([*three, result(9.0, 1.0, False)]) == [
+        "The identified simulator has 75 % less error than the uncorrected simulator (on 3 of 3 poses kept back)."
     ]
+    assert picture_verdict([*three[:2], result(9.0, 1.0, False)]) == [
+        "No evidence either way: 2 poses kept back (the identified simulator 0.500 mm and the uncorrected simulator "
+        "2.00 mm)."
+    ]
+    uneven = [result(0.1, 5.0, True), result(1.1, 1.0, True), result(1.1, 1.0, True)]
+    assert picture_verdict(uneven)[0].startswith("No evidence either way: 3 poses kept back")
     assert picture_verdict([result(0.95, 1.0, True)])[1].startswith("Check before use: these poses hardly depend on ")
-    (worse,) = picture_verdict([result(2.0, 1.0, True)])
-    assert worse.startswith("The uncorrected simulator has 50 % less error than the identified simulator (on 1 pose")
+    (worse,) = picture_verdict([result(2.0, 1.0, True)] * 3)
+    assert worse.startswith("The uncorrected simulator has 50 % less error than the identified simulator (on 3 of 3")
     assert picture_verdict([result(0.5, 2.0, False)])[1] == "Check before use: no pose was kept back."
     away = replace(result(0.5, 2.0, True), overlap=dict.fromkeys(("undeformed", "simulation", "sysid"), 0.1))
     assert "'a' hardly overlap: check the camera" in picture_verdict([away])[1]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ...io.arrays import FloatArray
-from ...io.errors import listed
+from ...io.errors import listed, number_of
 from ...io.safe_files import read_array, read_hdf5
 from ...learning.identification.search import Identification
 from ...learning.parameters import TILTS
@@ -20,8 +20,9 @@ from ...pictures.seen import NEUTRAL
 from ...settings.run import RunSettings
 from ..identification_section import parameter_rows
 from ..page import Block, Canvas, Cell, Drawn, PageTable, Part, Row, Text, Usage, write_page
+from ..ranking import LEAST_EVIDENCE
 from ..verdict import counted
-from ..wording import NONE, TONES, number_text, share_text
+from ..wording import NONE, TONES, in_a_row, mm_text, number_text, share_text
 
 _NAMES: Final = {"undeformed": "an undeformed body", "simulation": "the uncorrected simulator"}
 _MODELS: Final = {"undeformed": "Undeformed", "simulation": "Uncorrected", "sysid": "Identified"}
@@ -86,8 +87,10 @@ def picture_verdict(results: Sequence[PictureResult]) -> list[str]:
         share_text(1.0 - errors[best] / errors[second]),
         "kept back" if shown[0].tested else "of the training",
     )
-    on = f"{counted(lower, len(shown), 'pose')} {which}"
-    text = f"{names[best]} has {share} less error than {names[second]} ({on})"
+    text = f"{names[best]} has {share} less error than {names[second]} ({counted(lower, len(shown), 'pose')} {which})"
+    if len(shown) < LEAST_EVIDENCE or 2 * lower <= len(shown):
+        both = in_a_row([f"{names[model]} {mm_text(errors[model])}" for model in (best, second)])
+        text = f"no evidence either way: {number_of(len(shown), 'pose')} {which} ({both})"
     doubts = [] if shown[0].tested else ["no pose was kept back"]
     if abs(errors["sysid"] - errors["simulation"]) < (1.0 - _BETTER) * errors["simulation"]:
         doubts.append("these poses hardly depend on the material, and do not test it")

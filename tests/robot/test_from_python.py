@@ -142,7 +142,7 @@ def test_what_cannot_be_saved_or_is_no_robot_is_refused(robot, tmp_path):
     path, own = tmp_path / "own.safetensors", Robot.of(replace(robot.simulator, body=body))
     refuses(InputError, r"simulator.body.energies\[0\] is of the class .*Mine.*module of its own", own.save, path)
     refuses(InputError, "simulator is of a scene", Robot.of, Simulator(wr.Scene({"a": body}), {"a": wr.Corotated()}))
-    refuses(InputError, "the simulator is of type Body", Robot.of, body)
+    refuses(InputError, "simulator is of type Body", Robot.of, body)
     refuses(InputError, "markers is an array of shape", Robot.of, robot.simulator, np.zeros((2, 3)))
     refuses(InputError, "no input .* 'pressure': it has", Robot.of, robot.simulator, ranges={"pressure": (0, 1)})
     refuses(InputError, "ranges.tendon_tension is", Robot.of, robot.simulator, ranges={"tendon_tension": (1, 1)})

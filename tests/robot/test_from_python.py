@@ -181,6 +181,18 @@ def test_a_lost_robot_rests_on_its_own_base(robot):
     np.testing.assert_allclose(state.q[0], robot.simulator.body.vertices @ turn.T + base[:3], atol=1e-8)
 
 
+def test_a_lost_scene_rests_on_its_bases(robot):
+    hasty = Robot.of(finger(solver=wr.SolverSettings(on_failure="count", max_iterations=2)))
+    poses = {"one": (0.0, 0.2, 0.0, 0.0, 0.0, 0.0), "two": np.zeros(6)}
+    calm, scene = (wr.RobotScene({name: (one, pose) for name, pose in poses.items()}) for one in (robot, hasty))
+    base, pushed = np.array([2.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(robot.simulator.rest_positions.shape)
+    pushed[-1] = 10.0
+    inputs = {name: {"base": base} for name in poses}
+    state = scene.step(calm.begin(inputs=inputs), {**inputs, "two": {"base": base, "external_force": pushed}})
+    assert state.lost.tolist() == [True]
+    np.testing.assert_allclose(state.q[0], scene.simulator.rest_positions + torch.as_tensor(base[:3]), atol=1e-8)
+
+
 def test_a_state_is_written_for_paraview(robot, tmp_path):
     motion, body = moved(robot, tendon_tension=[2.0]), robot.simulator.body
     written, q = meshio.read(body.write_vtk(tmp_path / "finger.vtu", motion.final)), motion.final.q[0].numpy()

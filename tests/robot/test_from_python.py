@@ -19,6 +19,8 @@ from warp_resphys import Body, InputError, Robot, Simulator, select_vertices
 from warp_resphys.control.reduction import fingerprint
 from warp_resphys.energies import ConvexMaterial, FibreFamily, Medium, Muscle
 from warp_resphys.io.errors import DataFileError
+from warp_resphys.learning.identification.search import Identification
+from warp_resphys.learning.identification.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.ResphysWarning")  # few cells
 GUIDES = [[x, 0.0, -0.006] for x in (0.0, 0.03, 0.06)]
@@ -73,6 +75,20 @@ def test_what_was_changed_is_saved(robot, tmp_path):
     assert torch.equal(moved(again).q, moved(changed).q)
     several = robot.with_parameters(youngs_modulus=torch.tensor([1e5, 2e5]).double())
     refuses(InputError, "youngs_modulus has 2 values", several.save, tmp_path / "more.safetensors")
+
+
+def test_what_identify_found_is_kept(tmp_path):
+    """Values, their uncertainty, by which environments differ, and places of markers."""
+    name = "youngs_modulus"
+    uncertainty = Uncertainty({name: 2e4}, [[1.0]], {name: 1.0}, 0.1, {name: 2e5})
+    offsets = {"tip": [0.0, 0.0, 1e-3], "side": [0.0, 0.0, 0.0]}
+    placement = {"offsets": offsets, "shift": [0.0] * 3, "turn": [0.0] * 3, "centre": [0.0] * 3}
+    found = Identification({"youngs_modulus": 3e5}, placement=placement, uncertainty=uncertainty)
+    made = Robot.of(finger(), PLACES, found)
+    again, plain = wr.load(made.save(tmp_path / "finger.safetensors")), Robot.of(finger(), PLACES)
+    assert again.description.uncertainty == uncertainty
+    seen, nominal = (one.observe(one.simulator.rest_state())[0] for one in (again, plain))
+    np.testing.assert_allclose(seen - nominal, [offsets["tip"], offsets["side"]], atol=1e-12)
 
 
 def boxes(**body):

@@ -67,7 +67,8 @@ class CorrectedSimulator:
     def step(self, state: State, number: int) -> State:
         """Returns the state after the step of a number; differentiable."""
         new, failed = self._advance(state, number, state.lost)
-        lost, places, q = state.lost | failed, self._inputs.at(number).fixed_positions, new.q.detach()
+        lost, q = state.lost | failed, new.q.detach()
+        places = self._inputs.at(number).fixed_positions
         if bool((self._rest.is_near(q, places, DIVERGENCE_DISTANCE) & ~lost).all()):
             return new.with_memory({"lost": lost})
         resting = self._rest.carried(state.batch, places)

@@ -19,6 +19,8 @@ from warp_resphys import Body, InputError, Robot, Simulator, select_vertices
 from warp_resphys.control.reduction import fingerprint
 from warp_resphys.energies import ConvexMaterial, FibreFamily, Medium, Muscle
 from warp_resphys.io.errors import DataFileError
+from warp_resphys.learning.identification.search import Identification
+from warp_resphys.learning.identification.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.filterwarnings("ignore::warp_resphys.ResphysWarning")  # few cells
 GUIDES = [[x, 0.0, -0.006] for x in (0.0, 0.03, 0.06)]
@@ -73,6 +75,20 @@ def test_what_was_changed_is_saved(robot, tmp_path):
     assert torch.equal(moved(again).q, moved(changed).q)
     several = robot.with_parameters(youngs_modulus=torch.tensor([1e5, 2e5]).double())
     refuses(InputError, "youngs_modulus has 2 values", several.save, tmp_path / "more.safetensors")
+
+
+def test_what_identify_found_is_kept(tmp_path):
+    """Values, their uncertainty, by which environments differ, and places of markers."""
+    name = "youngs_modulus"
+    uncertainty = Uncertainty({name: 2e4}, [[1.0]], {name: 1.0}, 0.1, {name: 2e5})
+    offsets = {"tip": [0.0, 0.0, 1e-3], "side": [0.0, 0.0, 0.0]}
+    placement = {"offsets": offsets, "shift": [0.0] * 3, "turn": [0.0] * 3, "centre": [0.0] * 3}
+    found = Identification({"youngs_modulus": 3e5}, placement=placement, uncertainty=uncertainty)
+    made = Robot.of(finger(), PLACES, found)
+    again, plain = wr.load(made.save(tmp_path / "finger.safetensors")), Robot.of(finger(), PLACES)
+    assert again.description.uncertainty == uncertainty
+    seen, nominal = (one.observe(one.simulator.rest_state())[0] for one in (again, plain))
+    np.testing.assert_allclose(seen - nominal, [offsets["tip"], offsets["side"]], atol=1e-12)
 
 
 def boxes(**body):
@@ -142,7 +158,7 @@ def test_what_cannot_be_saved_or_is_no_robot_is_refused(robot, tmp_path):
     path, own = tmp_path / "own.safetensors", Robot.of(replace(robot.simulator, body=body))
     refuses(InputError, r"simulator.body.energies\[0\] is of the class .*Mine.*module of its own", own.save, path)
     refuses(InputError, "simulator is of a scene", Robot.of, Simulator(wr.Scene({"a": body}), {"a": wr.Corotated()}))
-    refuses(InputError, "the simulator is of type Body", Robot.of, body)
+    refuses(InputError, "simulator is of type Body", Robot.of, body)
     refuses(InputError, "markers is an array of shape", Robot.of, robot.simulator, np.zeros((2, 3)))
     refuses(InputError, "no input .* 'pressure': it has", Robot.of, robot.simulator, ranges={"pressure": (0, 1)})
     refuses(InputError, "ranges.tendon_tension is", Robot.of, robot.simulator, ranges={"tendon_tension": (1, 1)})
@@ -179,6 +195,18 @@ def test_a_lost_robot_rests_on_its_own_base(robot):
     assert state.lost.tolist() == [True]
     turn = np.array([[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(state.q[0], robot.simulator.body.vertices @ turn.T + base[:3], atol=1e-8)
+
+
+def test_a_lost_scene_rests_on_its_bases(robot):
+    hasty = Robot.of(finger(solver=wr.SolverSettings(on_failure="count", max_iterations=2)))
+    poses = {"one": (0.0, 0.2, 0.0, 0.0, 0.0, 0.0), "two": np.zeros(6)}
+    calm, scene = (wr.RobotScene({name: (one, pose) for name, pose in poses.items()}) for one in (robot, hasty))
+    base, pushed = np.array([2.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.zeros(robot.simulator.rest_positions.shape)
+    pushed[-1] = 10.0
+    inputs = {name: {"base": base} for name in poses}
+    state = scene.step(calm.begin(inputs=inputs), {**inputs, "two": {"base": base, "external_force": pushed}})
+    assert state.lost.tolist() == [True]
+    np.testing.assert_allclose(state.q[0], scene.simulator.rest_positions + torch.as_tensor(base[:3]), atol=1e-8)
 
 
 def test_a_state_is_written_for_paraview(robot, tmp_path):

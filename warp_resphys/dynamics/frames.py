@@ -11,6 +11,7 @@ from ..fem.bodies import Body
 from ..fem.integration_points import mean_gradients
 from ..stepping.rotations import closest_rotation, rotations
 
+_TURNED = 2.0 * 3.0**0.5  # largest displacement by a turn about a point inside, over the longest side of a body's box
 _LEAST_TURN = 1e-9  # weight of the identity in the rotation of a base, over the squared size of the body
 _ITERATIONS = 8  # of the polar decomposition; enough for stretches from 0.1 to 10
 _AT_ONCE = 100  # states processed together
@@ -88,6 +89,41 @@ def carried_rest(body: Body, fixed_positions: torch.Tensor) -> torch.Tensor:
         turn = closest_rotation((now - middle).mT @ (base - centre) + least * torch.eye(3).to(rest))
         carried[:, first : first + member.n_vertices] = (own - centre) @ turn.mT + middle
     return carried.to(fixed_positions)
+
+
+class RestOnBase:
+    """The rest shape of a body where its base is, and displacements from it.
+
+    Those of a body that nothing holds are beside its mean displacement.
+
+    Args:
+        body: a body or a scene.
+        rest_positions: (N, 3) [m].
+    """
+
+    def __init__(self, body: Body, rest_positions: torch.Tensor) -> None:
+        self._body, self._rest = body, rest_positions
+        self._length = float(np.ptp(body.vertices, axis=0).max())
+
+    def carried(self, batch: int, fixed_positions: torch.Tensor | None) -> torch.Tensor:
+        """Returns rest shapes (B, N, 3) where the fixed vertices (1 or B, D, 3) are, by `carried_rest` [m]."""
+        at = self._rest[None] if fixed_positions is None else carried_rest(self._body, fixed_positions.to(self._rest))
+        return at.expand(batch, -1, -1)
+
+    def is_within(self, q: torch.Tensor, resting: torch.Tensor, lengths: float) -> torch.Tensor:
+        """Whether the vertices of bodies (B,) are within some body lengths of rest shapes (1 or B, N, 3)."""
+        moved = q - resting
+        if not len(self._body.fixed_vertices):
+            moved = moved - moved.mean(1, keepdim=True)
+        return moved.abs().flatten(1).amax(1) < lengths * self._length
+
+    def is_near(self, q: torch.Tensor, fixed_positions: torch.Tensor | None, lengths: float) -> torch.Tensor:
+        """Whether bodies (B,) are within, however their bases have turned: quickly, and False for some that are."""
+        if fixed_positions is None:
+            return self.is_within(q, self._rest, lengths)
+        middle = self._rest[torch.as_tensor(self._body.fixed_vertices, device=q.device)].mean(0)
+        shift = fixed_positions.to(q).mean(-2, keepdim=True) - middle
+        return self.is_within(q - shift, self._rest, lengths - _TURNED)
 
 
 class BaseFrame:

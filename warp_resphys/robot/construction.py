@@ -161,4 +161,4 @@ def made(plain: Any, tensors: Mapping[str, torch.Tensor], path: Path) -> Any:
             arguments["dtype"] = {"float64": torch.float64, "float32": torch.float32}[arguments["dtype"]]
         return target(**arguments)
     except (InputError, KeyError, TypeError, ValueError) as error:
-        raise DataFileError(f"{path}: an object in it cannot be made ({error}): save the robot again.") from error
+        raise DataFileError(f"{path}: an object in it cannot be made: {error}") from error

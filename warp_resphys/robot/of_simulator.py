@@ -26,14 +26,13 @@ def description_of(
     Raises:
         InputError: see `Robot.of`.
     """
-    if not isinstance(simulator, Simulator) or isinstance(simulator.body, Scene):
-        what = "of a scene" if isinstance(simulator, Simulator) else in_short(simulator)
-        raise InputError(f"the simulator is {what}: give a Simulator of one body; RobotScene joins several robots.")
+    if isinstance(simulator.body, Scene):
+        raise InputError("the simulator is of a scene: give a Simulator of one body; RobotScene joins several robots.")
     known, mesh = Identified.of(parameters), simulator.body.mesh
     if isinstance(markers, Mapping):
         markers = bind_markers(mesh, np.array([*markers.values()], dtype=np.float64), [*markers])
-    if markers is not None and not (isinstance(markers, Observation) and markers.labels):
-        raise InputError(f"markers is {in_short(markers)}: give places by label, or markers of bind_markers.")
+    if markers is not None and not markers.labels:
+        raise InputError(f"markers is {in_short(markers)} without labels: give places by label, or bind_markers.")
     return Description(
         name=name,
         model="sysid" if known.parameters else "simulation",

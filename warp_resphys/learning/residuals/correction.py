@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 
-from ...dynamics.frames import BaseFrame, VertexFrames, carried_rest
+from ...dynamics.frames import BaseFrame, RestOnBase, VertexFrames
 from ...dynamics.simulator import Constants, Simulator
 from ...io.arrays import Brief
 from ...io.errors import InputError, in_short
@@ -23,7 +22,6 @@ from .networks import NextState, ResidualForce, StateMap, restore
 
 COROTATED: Final = "corotated"
 _KINDS: Final = {ResidualForce: "residual force", NextState: "next state"}  # of checkpoints
-_TURNED = 2.0 * 3.0**0.5  # largest displacement by a turn about a point inside, over the longest side of a body's box
 DIVERGENCE_DISTANCE = 10.0  # body lengths from rest beyond which a roll-out has diverged
 
 # Function of the state and the number of the step: a residual force (B, N, 3) [N] to add, or the next state. Where the
@@ -59,42 +57,20 @@ class CorrectedSimulator:
         self.simulator, self._predict = simulator, predict
         self._inputs = Inputs() if inputs is None else inputs
         self._constants = simulator.prepare() if constants is None else constants
-        self._rest, self._length = simulator.rest_positions, float(np.ptp(simulator.body.vertices, axis=0).max())
+        self._rest = RestOnBase(simulator.body, simulator.rest_positions)
 
     def step(self, state: State, number: int) -> State:
         """Returns the state after the step of a number; differentiable."""
         new, failed = self._advance(state, number, state.lost)
-        lost, places = state.lost | failed, self._inputs.at(number).fixed_positions
-        if bool((self._is_near(new.q.detach(), places) & ~lost).all()):
+        lost, q = state.lost | failed, new.q.detach()
+        places = self._inputs.at(number).fixed_positions
+        if bool((self._rest.is_near(q, places, DIVERGENCE_DISTANCE) & ~lost).all()):
             return new.with_memory({"lost": lost})
-        resting = self._resting(state.batch, places)
-        lost = lost | ~(self._moved(new.q.detach(), resting.q) < DIVERGENCE_DISTANCE * self._length)
+        resting = self._rest.carried(state.batch, places)
+        lost = lost | ~self._rest.is_within(q, resting, DIVERGENCE_DISTANCE)
         if bool(lost.any()):
-            new = resting.where(lost, new)
+            new = replace(self.simulator.rest_state(state.batch), q=resting).where(lost, new)
         return new.with_memory({"lost": lost})
-
-    def _is_near(self, q: torch.Tensor, fixed_positions: torch.Tensor | None) -> torch.Tensor:
-        """Whether bodies (B,) have not diverged, however their bases have turned about the middles of these."""
-        if fixed_positions is None:
-            return self._moved(q, self._rest) < DIVERGENCE_DISTANCE * self._length
-        base = self._rest[self.simulator.fixed].mean(0)
-        shift = self.simulator.tensor(fixed_positions).mean(-2, keepdim=True) - base
-        return self._moved(q - shift, self._rest) < (DIVERGENCE_DISTANCE - _TURNED) * self._length
-
-    def _resting(self, batch: int, fixed_positions: torch.Tensor | None) -> State:
-        """Returns the body at rest where its fixed vertices (1 or B, D, 3) are [m]."""
-        at_rest = self.simulator.rest_state(batch)
-        if fixed_positions is None:
-            return at_rest
-        carried = carried_rest(self.simulator.body, self.simulator.tensor(fixed_positions))
-        return replace(at_rest, q=carried.expand(batch, -1, -1))
-
-    def _moved(self, q: torch.Tensor, resting: torch.Tensor) -> torch.Tensor:
-        """Returns the largest displacement (B,) from rest, beside the mean one of a body that nothing holds [m]."""
-        moved = q - resting
-        if not len(self.simulator.fixed):
-            moved = moved - moved.mean(1, keepdim=True)
-        return moved.abs().flatten(1).amax(1)
 
     def _advance(self, state: State, number: int, lost: torch.Tensor) -> tuple[State, torch.Tensor]:
         """Returns the next state, and which environments (B,) failed."""

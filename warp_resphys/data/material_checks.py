@@ -80,8 +80,8 @@ def in_time(read: MeasuredTable, shown: str, path: Path) -> MeasuredTable:
     steps = np.zeros(0) if seconds is None else np.diff(seconds)
     falls = np.flatnonzero(steps < 0.0) + 1
     length = read.columns[shown]
-    begins = _restarts(length)
-    if begins := [row for row in begins if seconds is None or row in falls]:
+    begins = [row for row in _restarts(length) if seconds is None or row in falls]
+    if begins:
         before, after = length[begins[0] - 1], length[begins[0]]
         raise DataFileError(
             f"{path}, line {read.lines[begins[0]]}: the {shown} falls from {before:.3g} to {after:.3g} at once, as "
@@ -128,7 +128,8 @@ def _restarts(length: FloatArray) -> list[int]:
 def check_no_stretch(read: MeasuredTable, path: Path) -> None:
     """Refuses a strain that is one where the load is least, and grows or falls from there."""
     strain, load = read.columns["strain"], np.abs(read.columns["stress" if "stress" in read.columns else "force"])
-    if len(strain) < LEAST or not 0.9 <= (unloaded := float(strain[np.argmin(load)])) <= 1.1:
+    unloaded = float(strain[np.argmin(load)]) if len(load) else 0.0
+    if len(strain) < LEAST or not 0.9 <= unloaded <= 1.1:
         return
     away = np.abs(strain - 1.0)
     near = away <= np.median(away)

@@ -30,7 +30,8 @@ class SpecimenSettings(Settings):
         if box not in ((True, True), (False, False)) or box[0] == (self.diameter is not None):
             raise ValueError("diameter, or width and thickness: give one of them, in m.")
         for name in ("length", "width", "thickness", "diameter", "indenter"):
-            if (size := getattr(self, name)) is not None and size > _LARGEST:
+            size = getattr(self, name)
+            if size is not None and size > _LARGEST:
                 raise ValueError(f"{name} is {size:g} m: sizes are in m, write {1e-3 * size:g} for {size:g} mm.")
         return self
 

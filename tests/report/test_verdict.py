@@ -67,7 +67,9 @@ def test_what_holds_for_any_errors(seed):
     assert model_words(best).lower() in first.lower()
     assert f"{count} trial" in first
     assert [line.startswith("Trials: ") for line in lines] == [True] * (count < LEAST_TRIALS)
-    assert ("conditions" in use) == (count < LEAST_TRIALS and best not in BASELINES)
+    enough = best in BASELINES and count >= LEAST_EVIDENCE
+    assert ("is enough for trials like these" in use) == enough
+    assert ("conditions" in use) == (count < LEAST_TRIALS and not enough)
     (marked,) = (head for head, (_, mark) in table_of(errors).items() if mark == "best")
     assert (model_words(best) in marked) or best not in BASELINES
     assert not {"helps", "harm", "rest", "simfree", "resphys_uncorrected"} & {*" ".join([first, use, *lines]).split()}

@@ -21,6 +21,7 @@ from .ranking import (
     LEAST_EVIDENCE,
     LEAST_TRIALS,
     RANKED,
+    SIMULATORS,
     Known,
     best_of,
     best_pair,
@@ -168,12 +169,12 @@ def counted(lower: int, count: int, noun: str) -> str:
 
 
 def _use(known: Known, conditional: bool) -> Iterator[str]:
-    """Yields which model to use: the simplest one with physics that is not clearly worse than the best one."""
-    best = best_of(known, RANKED)
-    if best in BASELINES:
+    """Yields that a prediction without physics is enough, or the simulator that `recommended` recommends."""
+    best, chosen = best_of(known, RANKED), simplest(known, SIMULATORS)
+    if best in BASELINES and len(known[best]) >= LEAST_EVIDENCE:
         yield f"{model_words(best)} is enough for trials like these; to judge the simulator, test it on others"
-    elif best:
-        chosen = simplest(known, [model for model in RANKED if model not in BASELINES])
-        simpler = f", which is simpler than {model_words(best)} and not significantly worse"
+    elif chosen:
+        better = best_of(known, SIMULATORS)
+        simpler = f", which is simpler than {model_words(better)} and not significantly worse"
         use = "recommended, under the conditions below:" if conditional else "use"
-        yield f"{use} {model_words(chosen)}{simpler * (chosen != best)}"
+        yield f"{use} {model_words(chosen)}{simpler * (chosen != better)}"

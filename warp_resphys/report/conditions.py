@@ -78,8 +78,10 @@ class Judged:
 
 def conditions(metrics: Metrics, settings: RunSettings) -> list[str]:
     """Returns the conditions that hold, one line each, see `CONDITIONS`."""
-    run = Judged(metrics, settings)
-    return [unbroken(f"{line[0].upper()}{line[1:]}.") for lines in CONDITIONS for line in lines(run)]
+    run, found = Judged(metrics, settings), list[str]()
+    for lines in CONDITIONS:
+        found += lines(run)
+    return [unbroken(f"{line[0].upper()}{line[1:]}.") for line in found]
 
 
 def _coverage(run: Judged) -> Iterator[str]:
@@ -160,7 +162,9 @@ def _beyond(run: Judged) -> Iterator[str]:
             left |= fold["range"][run.model]["first_s"]
     others, facts = [name for name in tests if name in excess or name in other_trials(run.settings)], list[str]()
     if others:
-        largest = {kind: max((of.get(kind, 0.0) for of in excess.values()), default=0.0) for kind in _KINDS}
+        largest = dict.fromkeys(_KINDS, 0.0)
+        for of_trial in excess.values():
+            largest |= {kind: max(share, largest[kind]) for kind, share in of_trial.items()}
         shares = in_a_row([f"{_percent(share)} in {kind}" for kind, share in largest.items() if share > 0.0])
         facts.append(_of_tests(others, tests) + (f", by up to {shares}" if shares else ""))
     if left:

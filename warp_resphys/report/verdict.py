@@ -159,7 +159,8 @@ def _at_rest(groups: Sequence[Known]) -> str:
     both = [known for known in groups if {"rest", "simulation"} <= known.keys()]
     if not any(fmean(known["rest"]) < fmean(known["simulation"]) for known in both):
         return ""
-    rest, plain = (in_a_row([number_text(fmean(x[m])) for x in both]) for m in ("rest", "simulation"))
+    rest = in_a_row([number_text(fmean(known["rest"])) for known in both])
+    plain = in_a_row([number_text(fmean(known["simulation"])) for known in both])
     return f"; {model_words('rest')} has {rest} mm, {model_words('simulation')} {plain} mm"
 
 

@@ -111,7 +111,7 @@ class ObservedMotions(Brief):
     def of(
         cls,
         simulator: Simulator,
-        observed: torch.Tensor | NDArray[np.float64] | None,
+        observed: torch.Tensor | Sequence[Any] | NDArray[np.float64] | None,
         start: State | None = None,
         inputs: Inputs | None = None,
         resting: Inputs | None = None,

@@ -57,6 +57,15 @@ def test_dropouts(noise, width, value):
     assert law.parameters["c10"] == pytest.approx(30e3, rel=0.02)
 
 
+def test_single_dropouts_of_short_tests():
+    """All but the first samples, whose neighbours differ by more than a factor of two."""
+    strain = np.linspace(0.15, 3.0, 20)
+    for place in range(3, 19):
+        curve = stress("tension", strain, LAW)
+        curve[place] = 0.0
+        assert found(strain, curve) == {"out": [place]}
+
+
 def test_a_dropout_and_a_break_in_several_samples():
     curve = np.concatenate([measured(), [150e3, 60e3, 4e3, 3e3, 3e3]])
     curve[[30, 150]] = 0.0
@@ -92,7 +101,8 @@ def test_relaxation_loses_nothing(count, share):
     ramp = np.interp(seconds, [0.0, 1.0, 40.0], [0.0, 1.0, 1.0])
     steps = 0.25 * np.floor(seconds / 10.0 + 1.0) * (seconds > 0.0)
     pulses = 1.0 * (seconds % 10.0 > 5.0)
-    for strain in (ramp, steps, pulses):
+    cycles = 1.0 - np.abs(seconds % 4.0 / 2.0 - 1.0)
+    for strain in (ramp, steps, pulses, cycles):
         for time in (0.1, 1.0, 10.0):
             columns = stress_columns("tension", strain, ("c10", f"prony_{time}"), seconds)
             assert found(strain, 30e3 * (1.0 - share) * columns["c10"] + 60e3 * share * columns[f"prony_{time}"]) == {}

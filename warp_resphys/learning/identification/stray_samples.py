@@ -8,7 +8,7 @@ before, where that was half of the largest or more. The samples from the fall on
 and have more stress where they are unloaded.
 
 A dropout: a run of up to ten samples whose strains lie between those of the samples before and after it, while their
-stresses lie below those by more than half of the largest, or above by more than it. It is by more than 2 % of the
+stresses lie below half of the least of those, if they are positive, or above twice the largest; by more than 2 % of the
 largest stress of the test, 5 % above, and twelve times the usual roughness of the curve there. At a turn of the strain,
 as in cycles, the strain lies outside, too; after a step of the strain, stresses may pass at once, and are no strays.
 """
@@ -27,7 +27,7 @@ _STILL: Final = 0.05  # of the range of strains, by which a strain falls that co
 _LONGEST: Final = 10  # samples of a dropout
 _BESIDE: Final = 2  # samples before and after it that it is compared with
 _NEAR: Final = 10  # samples on each side that show how rough the curve is
-_AWAY: Final = (0.5, 1.0)  # of the largest stress beside a dropout, below and above these
+_AWAY: Final = (0.5, 1.0)  # of the least stress beside a dropout below, and of the largest above
 _STEP: Final = 3.0  # ratio of a step of the strain to the usual one beside it
 _LEAST: Final = (0.02, 0.05)  # of the largest stress of the test, likewise
 _QUANTA: Final = 3.0  # steps of the resolution of the load cell
@@ -80,6 +80,7 @@ def _quantum(stress: FloatArray) -> float:
 
 def _dropout(strain: FloatArray, stress: FloatArray) -> slice | None:
     """Returns the shortest run of samples that is a dropout, None without one."""
+    strain, stress = (np.pad(values, 1, "edge") if len(values) else values for values in (strain, stress))
     count, size, slack = len(strain), float(np.abs(stress).max(initial=0.0)), 0.2 * _STILL * float(np.ptp(strain))
     rough = np.abs(stress[1:-1] - 0.5 * (stress[:-2] + stress[2:]))
     usual = float(np.median(rough)) if len(rough) else 0.0
@@ -91,18 +92,21 @@ def _dropout(strain: FloatArray, stress: FloatArray) -> slice | None:
         strains, stresses = (np.delete(window, np.r_[run], axis=1) for window in windows)
         below = (stresses.min(1)[:, None] - windows[1][:, run]).min(1)
         above = (windows[1][:, run] - stresses.max(1)[:, None]).min(1)
-        largest, steps = np.abs(stresses).max(1), np.abs(np.diff(windows[0], axis=1))
+        largest = np.abs(stresses).max(1)
+        least = np.where(stresses.min(1) > 0.0, stresses.min(1), largest)
+        changes = np.diff(windows[0], axis=1)
+        steps, turns = np.abs(changes), changes[:, 0] * changes[:, -1] < -(slack**2)
         away = np.maximum(below, above)
-        drops = (below > _AWAY[0] * largest) & (below > _LEAST[0] * size)
+        drops = (below > _AWAY[0] * least) & (below > _LEAST[0] * size)
         spikes = (above > _AWAY[1] * largest) & (above > _LEAST[1] * size)
         between = (windows[0][:, run] >= strains.min(1)[:, None] - slack) & (
             windows[0][:, run] <= strains.max(1)[:, None] + slack
         )
         even = steps.max(1) <= np.maximum(_STEP * np.median(steps, 1), 5.0 * slack)
-        for start in np.flatnonzero((drops | spikes) & between.all(1) & even):
+        for start in np.flatnonzero((drops | spikes) & between.all(1) & even & ~turns):
             first = start + _BESIDE
             before, after = rough[max(first - 2 - _NEAR, 0) : max(first - 2, 0)], rough[first + length :][:_NEAR]
             near = float(np.median(np.append(before, after))) if len(before) + len(after) else 0.0
             if away[start] > max(_ROUGH * max(near, 0.5 * usual), _QUANTA * _quantum(stress)):
-                return slice(first, first + length)
+                return slice(first - 1, first - 1 + length)
     return None

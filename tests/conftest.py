@@ -42,9 +42,10 @@ STRUCTURAL = {"test_threads"}  # of these folders, without numbers of libraries
 # modules of tests
 LOOK_AT_PICTURES = {
     *("test_bodies", "test_figures", "test_render", "test_report", "test_environments", "test_film"),
-    *("test_control_run", "test_inspect_mesh"),
+    *("test_control_run", "test_inspect_mesh", "test_motion_film"),
 }
 DECODE_IN_PROCESSES = {"test_damaged_files", "test_foreign_recordings", "test_mesh", "test_recordings"}  # as users do
+COMMAND = render.COMMAND  # which tests without drawing replace
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
@@ -139,14 +140,14 @@ def renderers_used_again(kept_renderers: list[Any]) -> Iterator[None]:
     start, close = render.Renderer._start, render.Renderer.close
 
     def started(self: render.Renderer) -> None:
-        if kept_renderers:
+        if kept_renderers and render.COMMAND is COMMAND:
             self._process, self._messages = own = kept_renderers.pop()
             self._end = weakref.finalize(self, render._end, *own)
         else:
             start(self)
 
     def closed(self: render.Renderer) -> None:
-        if self._end is not None and self._process.poll() is None:
+        if self._end is not None and self._process.poll() is None and render.COMMAND is COMMAND:
             self._end.detach()
             self._end = None
             kept_renderers.append((self._process, self._messages))

@@ -67,7 +67,7 @@ CASES = [
     (r"state.previous must be the pair \(q, v\)", lambda s: s.step(State(*2 * (s.rest_positions[None],), (None,)))),
     *((f"batch {WHOLE}", lambda s, count=count: s.rest_state(count)) for count in (0, 2.5, True, "two")),
     (f"batch {WHOLE}", lambda s: s.static_equilibrium(batch=0)),
-    (f"steps {WHOLE}", lambda s: rolled(s, 2.5)),
+    ("steps is of type float: it must be int", lambda s: rolled(s, 2.5)),
     ("external_force has 3 time steps, but 4 are to be simulated", lambda s: rolled(s, 4, external_force=FORCES)),
     ("fixed_positions has 3 time steps, but 4", lambda s: rolled(s, 4, fixed_positions=FORCES[:, :, s.fixed])),
     (f"has {ELEMENTS + 1} values for {ELEMENTS} elements", lambda s: moved(s, {"density": [1000.0] * (ELEMENTS + 1)})),

@@ -83,6 +83,12 @@ class _Supports:
         arms = (q - centre) / self.length
         return self.twists[:3] + torch.linalg.cross(self.twists[3:].expand(*arms.shape, -1), arms[..., None], dim=-2)
 
+    def wrench(self, force: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        """Returns W (B, K) of the forces of all vertices (B, N, 3) [N] by the basis of twists, at q (B, N, 3) [m]."""
+        acting, arms = force[:, self.vertices], (q[:, self.vertices] - self.centre(q)) / self.length
+        moment = torch.linalg.cross(arms, acting).sum(1)
+        return torch.cat([acting.sum(1), moment], 1) @ self.twists
+
     def centre(self, q: torch.Tensor) -> torch.Tensor:
         """Returns c (B, 1, 3) at positions (B, N, 3) of all vertices [m]."""
         around = q[:, self.fixed] if len(self.fixed) else q[:, self.vertices]
@@ -128,10 +134,11 @@ class InternalForces:
         for one in self._supports:
             acting = force[:, one.vertices]
             if one.loose:
-                _, stiffness = one.at_fixed(q)
-                moves = one.moves(q[:, one.vertices], one.centre(q)) @ one.free(stiffness)[:, None]
+                free = one.free(one.at_fixed(q)[1])
+                moves = one.moves(q[:, one.vertices], one.centre(q)) @ free[:, None]
                 inert = mass[:, one.vertices, None, None] * moves
-                share = torch.linalg.solve(_gram(moves, inert), _wrench(moves, acting))
+                wrench = (one.wrench(force, q)[:, None] @ free)[:, 0]
+                share = torch.linalg.solve(_gram(moves, inert), wrench)
                 acting = acting - (inert @ share[:, None, :, None])[..., 0]
             parts.append(acting)
         return torch.cat(parts, 1)
@@ -149,7 +156,7 @@ class InternalForces:
             if not len(one.fixed):
                 continue
             at_fixed, stiffness = one.at_fixed(q)
-            wrench = _wrench(one.moves(q[:, one.vertices], one.centre(q)), force[:, one.vertices])
+            wrench = one.wrench(force, q)
             if one.loose:
                 free = one.free(stiffness)
                 stiffness = stiffness + free @ free.mT
@@ -185,8 +192,3 @@ def _null_space(matrix: FloatArray) -> FloatArray:
 def _gram(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Returns the sums over vertices of a^T b, (B, K, L), for (B, n, 3, K) and (B, n, 3, L)."""
     return a.flatten(1, 2).mT @ b.flatten(1, 2)
-
-
-def _wrench(moves: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """Returns the sums (B, K) of J^T f over vertices, for J (B, n, 3, K) and f (B, n, 3)."""
-    return (moves.flatten(1, 2).mT @ force.flatten(1)[..., None])[..., 0]

@@ -98,7 +98,7 @@ def can_draw(renderer: render.Renderer) -> None:
     """Skips where bodies cannot be drawn."""
     mesh = box_hexahedra(divisions=(1, 1, 1))
     try:
-        render.draw(body_scene(mesh), renderer)
+        render.draw(body_scene(mesh, longest=100), renderer)
     except render.DrawingError as error:
         pytest.skip(str(error))
 

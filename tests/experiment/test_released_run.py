@@ -30,7 +30,7 @@ TRAINED = ("resphys", "simfree")
 TINY = [
     "experiment=beam_real",
     "mesh.divisions=[4,1,1]",
-    "data.seconds=0.12",
+    "data.seconds=0.08",
     "~identify.parameters.mass_damping",
     "~identify.first_guess.mass_damping",
     "identify.starts=1",
@@ -45,7 +45,7 @@ SYNTHETIC = [
     *TINY,
     "laboratory.mesh.divisions=[6,2,2]",
     "laboratory.time_step=0.005",
-    "laboratory.seconds=0.15",
+    "laboratory.seconds=0.11",
     "laboratory.train=[m0,m80]",
     "laboratory.validation=[m20]",
     "laboratory.test=[m50]",
@@ -85,7 +85,7 @@ class TestCompleteRun:
             np.testing.assert_array_equal(file["film_steps"], np.arange(len(file["film_steps"])))
             fall = file["sysid_film"][2, -1, 2] - file["sysid_film"][0, -1, 2]
         assert fall == pytest.approx(-0.5 * 9.80709 * 0.02**2, rel=0.15)  # freely at first; by half steps
-        assert films == {(12, 20, 3)}  # the whole steps of 0.01 s up to the last frame, which comes before 0.12 s
+        assert films == {(8, 20, 3)}  # the whole steps of 0.01 s up to the last frame, which comes before 0.08 s
 
     def test_identification(self, finished):
         results = read_json(finished / "identification.json")

@@ -50,12 +50,14 @@ def workers(request, monkeypatch):
         yield Workers(2, cluster.scheduler_address)
 
 
-def test_results_come_in_order_from_other_processes_on_one_thread(workers, tmp_path):
+def test_results_come_in_order_from_other_processes_on_one_thread_in_a_shared_folder(workers, tmp_path):
     results, numbers = done(work, [(tmp_path, number) for number in range(1, 6)], workers, tmp_path)
     assert [result for _, _, result in results] == [10, 20, 30, 40, 50]
     assert sorted(numbers) == [0, 1, 2, 3, 4]
     assert len({process for process, _, _ in results} - {os.getpid()}) == 2
     assert {threads for _, threads, _ in results} == {1}
+    with pytest.raises(WorkerError, match="choose a run folder that all workers share"):
+        done(fails, [""], workers, tmp_path / "elsewhere")
 
 
 def fails(task):
@@ -99,11 +101,6 @@ def test_the_task_of_a_killed_worker_is_repeated(workers, tmp_path):
     assert results == [0, 1, 4, 9]
     assert (tmp_path / "died").exists()
     assert sorted(numbers) == [0, 1, 2, 3]
-
-
-def test_workers_without_the_folder(tmp_path):
-    with pytest.raises(WorkerError, match="choose a run folder that all workers share"):
-        done(fails, [""], Workers(2), tmp_path / "elsewhere")
 
 
 def test_nothing_to_do(tmp_path):

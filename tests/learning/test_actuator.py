@@ -28,7 +28,7 @@ BODY = wr.Body(MESH, fixed=wr.select_vertices(MESH, x=0.0), energies=[wr.Tendons
 MARKERS = wr.bind_markers(
     MESH, np.array([[0.1, 0.01, 0.022], [0.06, 0.01, 0.022], [0.1, 0.022, 0.01]]), ["a", "b", "c"]
 )
-STEP, STEPS, TRIALS = 0.02, 32, 8
+STEP, STEPS, TRIALS = 0.02, 22, 8
 QUICK = ActuatorSettings(filters=(0.3,), centres=30, epochs=3)
 
 
@@ -253,17 +253,18 @@ def test_training_that_was_interrupted_goes_on_as_if_it_had_not_been(simulator, 
     torch.testing.assert_close(again.actuator["tendon_tension"].weights, whole.actuator["tendon_tension"].weights)
 
 
+@pytest.fixture(scope="module")
 def linearised_motions(simulator, motions):
-    """Linearised motions of MANY and their replay, without an actuator."""
-    ((replay, start),) = ActuatorFitting(simulator, motions, MANY)._replays(MANY)
+    """Linearised motions of FEW and their replay, without an actuator."""
+    ((replay, start),) = ActuatorFitting(simulator, motions, FEW)._replays(FEW)
     felt = felt_inputs(replay, {}, QUICK.filters)
     (values,) = felt.values()
     model = Actuator({"tendon_tension": InputNetwork.of_training(values.flatten(0, 1), QUICK.filters, QUICK.centres)})
     return Linearised.of(replay, start, {}, model, felt), model, replay, start
 
 
-def test_the_penalty_grows_with_the_noise_and_the_model_stays(simulator, motions):
-    one, model, replay, _ = linearised_motions(simulator, motions)
+def test_the_penalty_grows_with_the_noise_and_the_model_stays(linearised_motions):
+    one, model, replay, _ = linearised_motions
     noise = torch.randn(one.points.shape, generator=torch.Generator().manual_seed(0)).double()
     noisy = replace(replay.trials, observed=replay.trials.observed + 3e-3 * noise)
     both = one, replace(one, replay=replay.changed(trials=noisy))
@@ -272,8 +273,8 @@ def test_the_penalty_grows_with_the_noise_and_the_model_stays(simulator, motions
     assert not model.inputs["tendon_tension"].weights.any()
 
 
-def test_linearised_motions_follow_changes_of_the_inputs_in_time(simulator, motions):
-    one, model, replay, start = linearised_motions(simulator, motions)
+def test_linearised_motions_follow_changes_of_the_inputs_in_time(linearised_motions):
+    one, model, replay, start = linearised_motions
     before = one.errors(one.changes(model))
     model = Actuator({"tendon_tension": network_of(lambda values: 2e-3 * values[:, :2], 1.0, 2, QUICK.filters)})
     exact = replay.errors(replay.changed(actuator=model.inputs)(start))[0] - before

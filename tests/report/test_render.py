@@ -101,8 +101,8 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
 @pytest.mark.usefixtures("can_draw")
 def test_one_process_draws_scene_after_scene(renderer):
     mesh = box_hexahedra(divisions=(1, 1, 1))
-    small = body_scene(mesh)
-    wide = body_scene(mesh, views=2)
+    small = body_scene(mesh, longest=200)
+    wide = body_scene(mesh, views=2, longest=200)
     first, both = (render.draw(scene, renderer)[0] for scene in (small, wide))
     process = renderer._process
     (again,) = render.draw(small, renderer)

@@ -33,7 +33,7 @@ def buckling(share, x):
 
 
 MESSAGES = {
-    "Unknown input presure. This body accepts external_force, fixed_positions, attached_mass.": (
+    "Unknown input presure. This body accepts external_force, internal_force, fixed_positions, attached_mass.": (
         lambda: beam().step(beam().rest_state(), wr.Inputs(presure=torch.zeros(1, 2)))
     ),
     "5 of 20 vertices (11, 12, 13, 14, 15; counted from 0) lie on another one, a crack between cells; merge or glue "

@@ -47,7 +47,7 @@ def markers_at(*rows):
 
 
 OBSERVED = {"whole": WHOLE_STATE, "vertices": markers_at([5, 10]), "pairs": markers_at([5, 8, 11], [9, 6, 4])}
-OBSERVED |= {kind: bind_markers(MESH, STEMS, "abc", kind=kind, vertices=TIP, patch=0.06) for kind in KINDS}
+OBSERVED |= {kind: bind_markers(MESH, STEMS, [*"abc"], kind=kind, vertices=TIP, patch=0.06) for kind in KINDS}
 
 
 def reconstruct(solver, start, observed):
@@ -200,7 +200,7 @@ class TestLevenbergMarquardt:
         """With stems that turn, and with a marker that one of the environments did not see."""
         observed, start = observation(3, (0.1, 0.5), integrator=integrator)
         sim = simulator(integrator=integrator)
-        markers = bind_markers(MESH, STEMS[::2], "ab", kind="rigid", vertices=TIP)
+        markers = bind_markers(MESH, STEMS[::2], ["a", "b"], kind="rigid", vertices=TIP)
         states, first = [start, start], None
         for target in observed[1:]:
             seen = markers(target)

@@ -24,7 +24,7 @@ TINY = [
     *("experiment=tentacle", "mesh.layers=4", "mesh.nodes=20", "parallel.processes=1", "markers.patch=0.05"),
     *("tendons.routes.first.pieces=6", "tendons.routes.second.pieces=6", "data.folder=recordings", "data.folds=null"),
     *("data.train=[weak,strong,second]", "data.validation=[other]", "data.test=[both]", "identify.max_evaluations=6"),
-    *("trainer={epochs:4,rollout_every:2,batch_size:16}", "network={position_modes:1,force_modes:2,width:8}"),
+    *("trainer={epochs:2,rollout_every:2,batch_size:16}", "network={position_modes:1,force_modes:2,width:8}"),
     *("in_the_loop.epochs=1", "simfree.network.position_modes=1", "~identify.parameters.density"),
     *(f"~identify.parameters.tendon_offset_2_{name}" for name in OFFSETS),  # weak poses do not show them
 ]

@@ -165,7 +165,9 @@ def test_bad_routes_are_refused(guides, keys, words):
 def test_friction_that_no_pose_holds_and_memory_of_another_body_are_refused(monkeypatch):
     monkeypatch.setattr(time_step, "_MOST_SETTLINGS", 2)
     s = simulator(STRAIGHT)
-    refuses(ConvergenceError, "lower the friction, the tension or the internal forces", s.static_equilibrium, tension(6.0))
+    refuses(
+        ConvergenceError, "lower the friction, the tension or the internal forces", s.static_equilibrium, tension(6.0)
+    )
     s = simulator(STRAIGHT)
     state = s.rest_state()
     state = State(state.q, state.v, memory={"tendon_segment_tension": torch.zeros(1, 3).double()})

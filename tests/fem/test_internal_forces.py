@@ -120,6 +120,17 @@ def test_a_free_body_keeps_its_momentum():
     assert float((torch.cdist(state.q, state.q) - torch.cdist(rest.q, rest.q)).abs().max()) > 1e-4  # it deforms
 
 
+def test_a_free_body_whose_vertices_have_no_mass_is_balanced():
+    """As of a rigid body, whose mass is a matrix of its own; a force of zero follows no pose."""
+    rest = torch.as_tensor(BEAM.vertices)
+    internal, q = InternalForces(Body(BEAM), rest), rest[None]
+    force = 1.0 + noise(1, len(rest), 3)
+    balanced = internal.balanced(force, q, torch.zeros(1, len(rest), dtype=torch.float64))
+    torch.testing.assert_close(wrench(balanced, q), torch.zeros(1, 6).double(), rtol=0.0, atol=1e-12)
+    assert internal.follow_pose(force)
+    assert not internal.follow_pose(0.0 * force)
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_body_on_pins_swings_under_true_loads_alone(count):
     """One fixed vertex is a ball joint, two are a hinge."""

@@ -52,7 +52,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def robot(arm):
-    return warp_resphys.load(arm)
+    return warp_resphys.load(arm, "resphys")
 
 
 def played(robot, steps):
@@ -296,7 +296,9 @@ class TestBadInput:
 @pytest.mark.slow
 def test_its_description(robot, arm):
     text = repr(robot)
-    for part in ("run, resphys: ", "3 markers", "pressure [Pa]: chamber_1, chamber_2", "pressure_delay: ", "error"):
+    advised = read_json(arm / "metrics.json")["recommended"]
+    assert f"run, {advised} (recommended): " in repr(warp_resphys.load(arm))
+    for part in ("run, resphys (", "3 markers", "pressure [Pa]: chamber_1, chamber_2", "pressure_delay: ", "error"):
         assert part in text
     low, high = robot.inputs["pressure"].low, robot.inputs["pressure"].high
     assert low[0] >= 0.0

@@ -203,7 +203,7 @@ class EnergySet:
     def internal_force(self, step: SimulatorStep, q: torch.Tensor | None = None) -> torch.Tensor | None:
         """Returns the internal force (B, N, 3) of a step, balanced at q (B, N, 3) or without forces, or None [N]."""
         force, mass = step.inputs.internal_force, step.constants.mass
-        if force is None or not self.internal.is_loose:
+        if force is None or not self.depends_on_pose(step):
             return force
         if step.inputs.attached_mass is not None:
             mass = mass + step.inputs.attached_mass
@@ -211,7 +211,7 @@ class EnergySet:
 
     def depends_on_pose(self, step: SimulatorStep) -> bool:
         """Whether the internal force of a step depends on the pose at its end, as of a body that nothing holds."""
-        return self.internal.is_loose and step.inputs.internal_force is not None
+        return self.internal.follow_pose(step.inputs.internal_force)
 
     def _loads(self, step: SimulatorStep, near: torch.Tensor | None) -> torch.Tensor:
         """Returns the dead loads (1 or B, N, 3): gravity, forces of the inputs and those of the energies [N]."""

@@ -30,6 +30,7 @@ from ..io.arrays import FloatArray
 from ..stepping.state import Reaction
 from .bodies import Body
 
+_LEAST = 1e-6  # of the largest mass, as which the mass of a vertex counts at least
 _RANK = 1e-9  # of the largest eigenvalue: smaller ones belong to motions that nothing hinders
 
 
@@ -117,10 +118,9 @@ class InternalForces:
     def __init__(self, body: Body, rest_positions: torch.Tensor) -> None:
         self._supports = [*_supports(body, rest_positions)]
 
-    @property
-    def is_loose(self) -> bool:
-        """Whether nothing hinders some rigid motion of a body, so that its resultants depend on the pose."""
-        return any(one.loose for one in self._supports)
+    def follow_pose(self, force: torch.Tensor | None) -> bool:
+        """Whether balanced forces depend on the pose: some (B, N, 3) act where nothing hinders a rigid motion."""
+        return force is not None and any(one.loose and bool(force[:, one.vertices].any()) for one in self._supports)
 
     def balanced(self, force: torch.Tensor, q: torch.Tensor, mass: torch.Tensor) -> torch.Tensor:
         """Returns forces without resultants along the motions that nothing hinders, differentiable.
@@ -128,15 +128,16 @@ class InternalForces:
         Args:
             force: (B, N, 3) [N].
             q: (B, N, 3) positions [m].
-            mass: (1 or B, N) [kg].
+            mass: (1 or B, N) [kg]; of a body whose vertices have none, such as a rigid one, all count alike.
         """
-        parts = []
+        parts, largest = [], mass.amax(1, keepdim=True)
+        weight = (mass / torch.where(largest > 0.0, largest, 1.0)).clamp_min(_LEAST)
         for one in self._supports:
             acting = force[:, one.vertices]
             if one.loose:
                 free = one.free(one.at_fixed(q)[1])
                 moves = one.moves(q[:, one.vertices], one.centre(q)) @ free[:, None]
-                inert = mass[:, one.vertices, None, None] * moves
+                inert = weight[:, one.vertices, None, None] * moves
                 wrench = (one.wrench(force, q)[:, None] @ free)[:, 0]
                 share = torch.linalg.solve(_gram(moves, inert), wrench)
                 acting = acting - (inert @ share[:, None, :, None])[..., 0]

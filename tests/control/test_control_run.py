@@ -54,7 +54,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def robot(folder):
-    return warp_resphys.load(folder)
+    return warp_resphys.load(folder, "resphys")
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ class TestReducedTwin:
     @pytest.fixture(scope="class")
     @classmethod
     def corrected(cls, folder):
-        return warp_resphys.load(folder)
+        return warp_resphys.load(folder, "resphys")
 
     @pytest.fixture(scope="class")
     @classmethod
@@ -225,7 +225,7 @@ class TestReducedTwin:
         settings = TwinSettings(
             horizon=0.1, patience=0.3, align=False, refine={}, noise=2e-4, planned=True, engine="reduced"
         )
-        twin = settings.twin(warp_resphys.load(folder))
+        twin = settings.twin(warp_resphys.load(folder, "resphys"))
         assert isinstance(twin.estimator, ReducedEstimator)
         assert ", resphys, by its reduced model: steps of 10 ms, predictions 0.1 s ahead, no packet yet" in repr(twin)
         with pytest.raises(InputError, match="no youngs_modulus to refine"):

@@ -253,7 +253,7 @@ def test_steps_need_a_reset_and_actions_their_shape(folder):
 
 @pytest.fixture(scope="module")
 def robot(folder):
-    return warp_resphys.load(folder)
+    return warp_resphys.load(folder, "resphys")
 
 
 @pytest.mark.slow

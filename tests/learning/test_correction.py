@@ -247,6 +247,20 @@ def test_an_equilibrium_is_found_where_its_iteration_would_grow_and_has_gradient
     check_slopes(tip, values, {"stiffness": 3.0, "youngs_modulus": 3e3}, tolerance=1e-4)
 
 
+def test_an_equilibrium_under_a_force_that_is_the_same_everywhere_has_gradients():
+    s, *_ = at_rest(0.0)
+
+    def tip(values):
+        force = torch.zeros_like(s.rest_state().q)
+        force[:, TIP, 2] = values["push"]
+        constants = s.prepare({"youngs_modulus": values["youngs_modulus"]})
+        at = equilibrium_under_feedback(s, Inputs(), constants, s.rest_state(), lambda state, number: force)
+        return 1e3 * at.q[:, TIP, 2].mean()
+
+    values = {"push": torch.tensor(0.01).double(), "youngs_modulus": torch.tensor([[1e5]]).double()}
+    check_slopes(tip, values, {"push": 1e-4, "youngs_modulus": 1e2})
+
+
 def test_a_force_that_turns_round_has_no_equilibrium():
     """It pushes the tip back over the height at which it rests without the force."""
     s, free, _ = at_rest(0.0)

@@ -36,7 +36,7 @@ _RANK = 1e-9  # of the largest eigenvalue: smaller ones belong to motions that n
 
 @dataclass(frozen=True)
 class _Supports:
-    """What holds one body of a simulator.
+    """Supports of one body of a simulator.
 
     Attributes:
         vertices: range of its vertices.

@@ -33,7 +33,7 @@ _LONGEST = 1000
 
 @runtime_checkable
 class _Array(Protocol):
-    """What NumPy takes as an array."""
+    """Object that NumPy takes as an array."""
 
     def __array__(self) -> Any: ...
 

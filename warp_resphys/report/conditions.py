@@ -35,6 +35,7 @@ _CLOSE: Final = 1e-4  # distance from the first guess that counts as none, over 
 _TURNED: Final = 3.0  # degrees by which identification rotates the markers, from which on their registration is wrong
 _NAMED: Final = 4  # trials at most that a line names
 _GROUPS: Final = {"sysid": "parameters", "sysid_elastic": "elastic"}  # keys of the ranges in the group `identify`
+CAUSES: Final = "check names (exchanged ones too), nominal positions, and the unit"
 _KINDS: Final = ("inputs", "loads", "displacements")  # keys of `beyond` in the metrics
 
 
@@ -57,7 +58,7 @@ class Judged:
 
     @cached_property
     def known(self) -> Known:
-        """Those of the models that are used and ran through."""
+        """Errors of the models that are used and did not diverge [mm], by model."""
         return known_errors(self.errors, unused(self.metrics))
 
     @cached_property
@@ -85,7 +86,7 @@ def conditions(metrics: Metrics, settings: RunSettings) -> list[str]:
 
 
 def _coverage(run: Judged) -> Iterator[str]:
-    """Prediction intervals that hold fewer measurements than they should, in all trials or in some."""
+    """Yields prediction intervals that hold fewer measurements than they should, in all trials or in some."""
     found = run.metrics.get("intervals", {}).get("models", {}).get(run.model, {})
     if "coverage" not in found:
         return
@@ -100,7 +101,7 @@ def _coverage(run: Judged) -> Iterator[str]:
 
 
 def _bounds(run: Judged) -> Iterator[str]:
-    """Identified parameters at a bound, and those that stayed at their first guess."""
+    """Yields identified parameters at a bound, and those that stayed at their first guess."""
     bounds, guesses = dict[str, list[int]](), dict[str, list[int]]()
     for number, fold in enumerate(run.folds):
         for text in _at_bounds(fold):
@@ -153,7 +154,7 @@ def _at_first_guess(metrics: Metrics, settings: RunSettings) -> Iterator[str]:
 
 
 def _beyond(run: Judged) -> Iterator[str]:
-    """Test trials whose loads, inputs or displacements lie outside of those of the training, and models there."""
+    """Yields test trials whose loads, inputs or displacements lie beyond those of the training, and models there."""
     tests, excess, left = list[str](), dict[str, Mapping[str, float]](), dict[str, float]()
     for fold in run.folds:
         tests += [row["name"] for row in fold.get("per_trajectory", ())]
@@ -181,7 +182,7 @@ def _of_tests(some: list[str], tests: list[str]) -> str:
 
 
 def _mesh(run: Judged) -> Iterator[str]:
-    """An error of the mesh that is larger than what the model gains, or is not known."""
+    """Yields an error of the mesh that is larger than what the model gains, or is not known."""
     checks = [fold["mesh_check"] for fold in run.folds if "mesh_check" in fold]
     moves = [moved for check in checks if (moved := check.get("moved_mm")) is not None]
     if checks and not moves:
@@ -195,7 +196,7 @@ def _mesh(run: Judged) -> Iterator[str]:
 
 
 def _registration(run: Judged) -> Iterator[str]:
-    """Markers that do not fit their nominal positions."""
+    """Yields markers that do not fit their nominal positions."""
     placed = [fold["placement"] for fold in run.folds if "placement" in fold]
     off = dict[str, float]()
     for placement in placed:
@@ -213,11 +214,8 @@ def _registration(run: Judged) -> Iterator[str]:
         yield f"{text}; {CAUSES}, and whether the body at rest is bent or sags"
 
 
-CAUSES: Final = "check names (exchanged ones too), nominal positions, and the unit"
-
-
 def _few_trials(run: Judged) -> Iterator[str]:
-    """Fewer trials than an interval needs."""
+    """Yields that there are fewer trials than an interval needs."""
     if 0 < run.count < LEAST_TRIALS:
         trials = f"{_NUMBERS[run.count]} trial{'s are' if run.count > 1 else ' is'}"
         few = "no evidence" if run.count < LEAST_EVIDENCE else "too few for an interval"
@@ -225,7 +223,7 @@ def _few_trials(run: Judged) -> Iterator[str]:
 
 
 def _refused(run: Judged) -> Iterator[str]:
-    """What was learned and is not used, and corrections that diverged."""
+    """Yields the learned models that are not used, and corrections that diverged."""
     for model, why in unused(run.metrics).items():
         yield f"not used: {model_words(model)}, as {why}"
     laws = [fold["law"] for fold in run.folds if "law" in fold]

@@ -18,7 +18,7 @@ from ..data.rigid_bodies import corners_of, owners
 from ..dynamics.simulator import Simulator
 from ..energies.materials import MASS_DAMPING
 from ..experiment.build import bound_markers, build_body, build_simulator, marker_view_of
-from ..experiment.experiment import SIMFREE, Experiment, network_of
+from ..experiment.experiment import LEARNED, SIMFREE, Experiment, network_of
 from ..experiment.files import COMPARE, ERRORS, METRICS, fold_folder, read_if_there
 from ..io.arrays import FloatArray
 from ..io.classes import check_packages
@@ -54,7 +54,6 @@ _NEEDED: Final = {
 }
 _NETWORK: Final = "network."
 _REGION: Final = "region."
-FORCES: Final = ("resphys", "resphys_uncorrected")  # models with a learned force
 _PLAIN: Final = (  # fields that are written unchanged
     *("name", "model", "settings", "material", "parameters", "payload_at", "markers", "labels", "sets"),
     *("placement", "filters", "sees_payload", "told_of_base", "seen", "level", "errors_mm", "recommended"),
@@ -336,7 +335,7 @@ def describe(folder: Path, model: str | None = None) -> Description:
     errors: ErrorTables = read_if_there(folder / ERRORS)
     calibrated = errors["intervals"]["models"].get(model, {}) if "intervals" in errors else {}
     learned, actuation = experiment.learned(model), settings.actuation
-    if learned is None and model in FORCES and experiment.has_forces:
+    if learned is None and model in LEARNED and experiment.has_forces:
         log.warning("%s: the force of %s was learned and is not used; its report says why", folder, model)
     base = None if learned is None else experiment.motions.base_movement_mask(simulator)
     moved = trials.contact_at(trials.names, simulator.body, trials.time_step)

@@ -256,7 +256,9 @@ class TrainerSettings(EpochSettings):
         "rollout", "keep the weights of the least validation roll-out error, or loss"
     )
     gate: bool = setting(
-        True, "use the force only if it is clearly closer to held-out trials than the simulator; false: always"
+        True,
+        "use the force only if it is clearly closer to held-out trials than the simulator and the robot rests with it; "
+        "false: always",
     )
 
 

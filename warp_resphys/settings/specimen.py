@@ -8,7 +8,7 @@ from ..io.settings import Natural, NotNegative, Pair, Positive, Settings, Word, 
 from .data_kinds import TableSettings
 from .performed import WithoutMotion, rising
 
-_LARGEST: Final = 1.0  # size of a specimen [m]; larger ones are in mm
+LARGEST_SIZE: Final = 1.0  # of a specimen [m]; larger ones are in mm
 
 
 class SpecimenSettings(Settings):
@@ -31,7 +31,7 @@ class SpecimenSettings(Settings):
             raise ValueError("diameter, or width and thickness: give one of them, in m.")
         for name in ("length", "width", "thickness", "diameter", "indenter"):
             size = getattr(self, name)
-            if size is not None and size > _LARGEST:
+            if size is not None and size > LARGEST_SIZE:
                 raise ValueError(f"{name} is {size:g} m: sizes are in m, write {1e-3 * size:g} for {size:g} mm.")
         return self
 
@@ -49,7 +49,7 @@ class SpecimenSettings(Settings):
 class MembraneSettings(Settings):
     """An inflated membrane; the head of its table has its thickness, cap and rings."""
 
-    radius: Annotated[Positive, Field(le=1.0)] = setting(description="of the disc within its clamp", unit="m")
+    radius: Annotated[Positive, Field(le=LARGEST_SIZE)] = setting(description="of the disc within its clamp", unit="m")
     ring_modulus: Positive = setting(1.0e6, "shear modulus of its stiff rings", "Pa")
 
 

@@ -29,13 +29,13 @@ from ...mesh.rod import rod
 from ...mesh.selection import select_vertices
 from ...mesh.volume_mesh import Mesh
 from ...settings.contact import Sphere
+from ...settings.specimen import LARGEST_SIZE
 from ...stepping.inputs import Inputs
 from .membranes import Membrane
 from .stray_samples import strays
 
 LEAST_SAMPLES: Final = 5  # of a test
 LARGEST_STRAIN: Final = 20.0  # of a silicone; larger ones are in per cent
-LARGEST_SIZE: Final = 1.0  # of a specimen [m]; larger ones are in mm
 SHEAR_MODULI: Final = (100.0, 1e8)  # of elastomers, from brush-like ones to rubber of Shore A 95 [Pa]
 NUISANCES: Final = ("zero", "toe", "compliance")
 _LEAST: Final = 0.02  # of the largest stress, below which errors are not relative to the stress

@@ -3,6 +3,7 @@
 They are fixed points of equilibria under constant forces, which Anderson's acceleration finds.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -16,6 +17,8 @@ from ...io.errors import ConvergenceError
 from ...stepping.inputs import Inputs
 from ...stepping.state import State
 from .correction import acts_of
+
+log = logging.getLogger(__name__)
 
 _ITERATIONS = 50
 _AIMS = {torch.float64: 1e-11, torch.float32: 1e-8}  # change of positions at which the iteration ends [m]
@@ -55,7 +58,10 @@ def equilibrium_under_feedback(
     with torch.no_grad():
         found, rests = problem.iterate(guess)
         if not bool(rests.all()):
-            found, rests = problem.iterate(problem.relaxed(found))
+            try:
+                found, rests = problem.iterate(problem.relaxed(found))
+            except ConvergenceError:
+                log.debug("the body does not come to rest: a step or an equilibrium on the way failed")
     if not bool(rests.all()):
         count = f"{int((~rests).sum())} of {len(rests)} poses"
         raise ConvergenceError(
@@ -65,10 +71,15 @@ def equilibrium_under_feedback(
         )
     if not torch.is_grad_enabled():
         return found
-    near = found.q.clone().requires_grad_()
-    solution, again = problem.solve(found.detach()), problem.solve(State(near, found.v)).q
-    if not solution.q.requires_grad or not again.requires_grad:
+    solution = problem.solve(found.detach())
+    if not solution.q.requires_grad:
         return solution
+    near = found.q.clone().requires_grad_()
+    force = predict(State(near, found.v), 0)
+    depends = force.requires_grad and torch.autograd.grad(force.sum(), near, retain_graph=True, allow_unused=True)[0]
+    if not isinstance(depends, torch.Tensor):  # The force is the same at all positions.
+        return solution
+    again = problem.under(force, found).q
 
     def through(gradient: torch.Tensor) -> torch.Tensor:
         return problem.adjoint(gradient, near, again)
@@ -89,9 +100,10 @@ class _Feedback:
 
     def solve(self, state: State) -> State:
         """Returns the equilibrium under the force in a state."""
-        return self._under(self._predict(state, 0), state)
+        return self.under(self._predict(state, 0), state)
 
-    def _under(self, force: torch.Tensor, state: State) -> State:
+    def under(self, force: torch.Tensor, state: State) -> State:
+        """Returns the equilibrium under a force (B, N, 3) [N], near a state."""
         acting = self._inputs.plus(force, self._acts)
         return self._simulator.static_equilibrium(acting, self._constants, start=state.q.detach())
 
@@ -106,7 +118,7 @@ class _Feedback:
             constant = previous is not None and torch.equal(current, previous)
             if constant and torch.equal(self._predict(solution, 0), current):
                 return solution, torch.ones_like(smallest, dtype=torch.bool)
-            solution = self._under(current, state)
+            solution = self.under(current, state)
             change = solution.q - state.q
             size = change.abs().amax((1, 2))
             closer = size < smallest

@@ -75,11 +75,7 @@ def equilibrium_under_feedback(
     if not solution.q.requires_grad:
         return solution
     near = found.q.clone().requires_grad_()
-    force = predict(State(near, found.v), 0)
-    depends = force.requires_grad and torch.autograd.grad(force.sum(), near, retain_graph=True, allow_unused=True)[0]
-    if not isinstance(depends, torch.Tensor):  # The force is the same at all positions.
-        return solution
-    again = problem.under(force, found).q
+    again = problem.solve(State(near, found.v)).q
 
     def through(gradient: torch.Tensor) -> torch.Tensor:
         return problem.adjoint(gradient, near, again)
@@ -100,9 +96,9 @@ class _Feedback:
 
     def solve(self, state: State) -> State:
         """Returns the equilibrium under the force in a state."""
-        return self.under(self._predict(state, 0), state)
+        return self._under(self._predict(state, 0), state)
 
-    def under(self, force: torch.Tensor, state: State) -> State:
+    def _under(self, force: torch.Tensor, state: State) -> State:
         """Returns the equilibrium under a force (B, N, 3) [N], near a state."""
         acting = self._inputs.plus(force, self._acts)
         return self._simulator.static_equilibrium(acting, self._constants, start=state.q.detach())
@@ -118,7 +114,7 @@ class _Feedback:
             constant = previous is not None and torch.equal(current, previous)
             if constant and torch.equal(self._predict(solution, 0), current):
                 return solution, torch.ones_like(smallest, dtype=torch.bool)
-            solution = self.under(current, state)
+            solution = self._under(current, state)
             change = solution.q - state.q
             size = change.abs().amax((1, 2))
             closer = size < smallest

@@ -165,11 +165,35 @@ class _Problem:
 
     def loss(self, cases: Sequence[_Case], changes: Sequence[torch.Tensor]) -> torch.Tensor:
         """Loss of the roll-out with changes of the start, of inputs and of parameters."""
-        values = {case.name: case.value(change) for case, change in zip(cases, changes, strict=True)}
-        state = State(values.pop("q", self.state.q), values.pop("v", self.state.v))
-        inputs = self.inputs.replace(**{name: values.pop(name) for name in [*values] if name in self.inputs.fields})
-        trajectory = self.simulator.rollout(state, self.steps, inputs, values)
-        return (self.weights[0] * trajectory.q).sum() + (self.weights[1] * trajectory.v).sum()
+        return self.losses(cases, [changes])[0]
+
+    def losses(self, cases: Sequence[_Case], variants: Sequence[Sequence[torch.Tensor]]) -> torch.Tensor:
+        """Losses (R,) of R roll-outs side by side, each with changes of its own."""
+        count = len(variants)
+        values = {
+            case.name: self._side_by_side(case, [case.value(changes[k]) for changes in variants])
+            for k, case in enumerate(cases)
+        }
+        q, v = (values.pop(name, getattr(self.state, name).repeat(count, 1, 1)) for name in ("q", "v"))
+        inputs = {name: self._repeated(name, [value] * count) for name, value in self.inputs.fields.items()}
+        inputs |= {name: values.pop(name) for name in [*values] if name in inputs}
+        trajectory = self.simulator.rollout(State(q, v), self.steps, Inputs(**inputs), values)
+        positions, velocities = (x.unflatten(1, (count, -1)) for x in (trajectory.q, trajectory.v))
+        weighted = self.weights[0][:, None] * positions + self.weights[1][:, None] * velocities
+        return weighted.sum((0, 2, 3, 4))
+
+    def _side_by_side(self, case: _Case, values: Sequence[torch.Tensor]) -> torch.Tensor:
+        """A value of R roll-outs, by environment."""
+        if case.name in self.inputs.fields:
+            return self._repeated(case.name, values)
+        if case.name in ("q", "v", "gravity") or case.kind == "environment":
+            return torch.cat([*values])
+        return torch.cat([value.expand(self.batch, -1) for value in values])
+
+    @staticmethod
+    def _repeated(name: str, values: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Inputs of R roll-outs: environments follow the steps, if there are any."""
+        return torch.cat([*values], dim=0 if name == "attached_mass" else 1)
 
     def cases(self) -> Iterator[_Case]:
         """Yields the start and every input and parameter in its shapes, with random changes of typical size."""
@@ -215,11 +239,11 @@ class _Problem:
             factors = 0.5 + 0.5 * torch.rand(len(group), generator=self.random)
             shares = {k: share * float(factor) for (k, share), factor in zip(shares.items(), factors, strict=True)}
 
-        def loss(step: float) -> float:
-            return float(self.loss(cases, [step * shares.get(k, 0.0) * case.change for k, case in enumerate(cases)]))
-
-        with torch.no_grad():
-            total, uncertainty = central_difference(loss)
+        steps = [sign * 0.5**k for k in range(1 + _HALVINGS) for sign in (1.0, -1.0)]
+        variants = [[step * shares.get(k, 0.0) * case.change for k, case in enumerate(cases)] for step in steps]
+        with torch.no_grad():  # All differences in one batch, as a small body's step takes as long as theirs.
+            losses = dict(zip(steps, self.losses(cases, variants).tolist(), strict=True))
+        total, uncertainty = central_difference(losses.__getitem__)
         error = total - sum(share * adjoints[k] for k, share in shares.items())
         for k, share in shares.items():
             yield GradientRow(cases[k].title, adjoints[k], adjoints[k] + error / share, abs(uncertainty / share))

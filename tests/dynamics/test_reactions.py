@@ -175,8 +175,8 @@ def test_grasping_plates_carry_a_cube():
     state, fixed = simulator.rest_state(), simulator.rest_positions[simulator.fixed]
     inwards = torch.where(fixed[:, :1] < 0.01, 1.0, -1.0) * fixed.new_tensor([1.0, 0.0, 0.0])
     with torch.no_grad():
-        for number in range(40):
-            inputs = Inputs(fixed_positions=(fixed + 5e-4 * min(1.0, number / 10) * inwards)[None])
+        for number in range(24):
+            inputs = Inputs(fixed_positions=(fixed + 5e-4 * min(1.0, number / 5) * inwards)[None])
             before, state = state, simulator.step(state, inputs)
         weight = 1000.0 * 1e-6 * G
         touch = simulator.contacts(before, state, inputs)["surfaces"].reaction().at(scene.vertex_slice("cube"))

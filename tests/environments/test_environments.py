@@ -24,6 +24,12 @@ from warp_resphys.studies.live import LiveRobot
 QUICK = {"seconds": 0.2, "action_time": 0.05}  # four actions
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _drawing_processes_are_used_again(used_again):
+    with used_again():
+        yield
+
+
 def played(environment, steps=6, seed=3):
     """Observations, rewards and ends of some steps of the same random actions."""
     random = np.random.default_rng(0)
@@ -44,7 +50,7 @@ class TestGymnasium:
     def test_its_checker_passes(self, folder, task):
         name = "".join(word.capitalize() for word in task.split("_"))
         environment = gym.make(f"warp_resphys/{name}-v0", run=folder, render_mode="rgb_array", **QUICK)
-        check_env(environment.unwrapped)
+        check_env(environment.unwrapped, skip_render_check=task != "reach")  # the pictures are alike
         environment.close()
 
     def test_a_vector_of_them_is_made_by_name(self, folder):

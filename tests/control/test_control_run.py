@@ -31,7 +31,7 @@ from warp_resphys.twin.reduced_estimator import ReducedEstimator
 pytestmark = pytest.mark.slow
 CONTROL = [
     "experiment=tendon_rod_control",
-    *(*ROD, *DRIVEN, "data.steps=40"),
+    *(*ROD, *DRIVEN, "data.steps=40", "mesh_check=null"),
     *("+simulation.prony_ratio_1=0.0", "+simulation.prony_time_1=0.05"),
     "+identify.parameters.tendon_tension_factor={lower:0.5,upper:1.5}",
     "+identify.parameters.tendon_tension_delay={lower:0.0,upper:0.05}",

@@ -192,7 +192,6 @@ def test_the_force_at_the_base_is_the_weight_at_rest_and_observed_last(folder, w
     begun = np.linalg.norm(more[[0, 5], :, -3:], axis=-1)  # in the first steps of two episodes
     np.testing.assert_allclose(begun, 9.80709 / 9.81, rtol=1e-4)
     assert np.abs(more[1:4, :, -3:] - more[0, :, -3:]).max() > 0.05
-    refuses(InputError, "forces need a simulator", make_vector, "reach", folder, 1, world="reduced", forces=True)
 
 
 class TestPictures:

@@ -157,7 +157,7 @@ def turned(mesh, random, place):
 @pytest.mark.parametrize(("distance", "dtype"), [(1e-3, torch.float64), (1e-4, torch.float32)])
 def test_thrown_blocks_never_cross(distance, dtype, device):
     """Throws of two or three blocks of random sizes, the second of which is rigid in every other throw."""
-    random, hits, throws = np.random.default_rng(0), 0, 6
+    random, hits, throws = np.random.default_rng(0), 0, 4
     for k in range(throws):
         speed, h = 10.0 ** random.uniform(-0.5, 1.0), 10.0 ** random.uniform(-3.3, -2.0)
         way = random.normal(size=3)

@@ -144,9 +144,7 @@ def kicked(ratio, youngs_modulus, steps, robot=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ratio", "youngs_modulus"), [(0.1, 3e4), (0.1, 3e6), (1.0, 3e5), (10.0, 3e4), (10.0, 3e6)]
-)
+@pytest.mark.parametrize(("ratio", "youngs_modulus"), [(0.1, 3e4), (0.1, 3e6), (1.0, 3e5), (10.0, 3e4), (10.0, 3e6)])
 def test_robots_without_damping_are_stable_at_all_ratios_of_mass(ratio, youngs_modulus):
     twists = kicked(ratio, youngs_modulus, 300)
     assert twists[150:].max() < 1.05 * twists[:150].max()

@@ -39,16 +39,15 @@ def done(function, tasks, workers, folder):
     return fan_out(function, tasks, workers, folder, numbers.append), numbers
 
 
-@pytest.fixture(scope="module", params=["local", pytest.param("dask", marks=pytest.mark.slow)])
-def workers(request):
+@pytest.fixture(params=["local", pytest.param("dask", marks=pytest.mark.slow)])
+def workers(request, monkeypatch):
     if request.param == "local":
         yield Workers(2)
         return
     distributed = pytest.importorskip("distributed")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where workers find these functions
-        with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-            yield Workers(2, cluster.scheduler_address)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where workers find these functions
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        yield Workers(2, cluster.scheduler_address)
 
 
 def test_results_come_in_order_from_other_processes_on_one_thread_in_a_shared_folder(workers, tmp_path):

@@ -1,14 +1,17 @@
 """The script of the published tables and of the page of robots: its pages, which rows it keeps, and what it refuses."""
 
+import io
 import json
 import re
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import reproduce
 
+from support.command_line import outcome
 from warp_resphys.io.errors import ResphysError
 from warp_resphys.overrides import composed
 from warp_resphys.report.wording import error_parts, number_text
@@ -34,6 +37,20 @@ def end_of(monkeypatch, *arguments):
     except SystemExit as end:
         return end.code
     return 0
+
+
+class RunHere:
+    """In place of the process of a run, which takes seconds to start; the row of a robot has one of its own."""
+
+    def __init__(self, command, **_):
+        ended = outcome(*command[3:])
+        self.returncode, self.stderr = ended.code, io.StringIO(ended.err)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
 
 
 def test_the_page_of_robots_is_that_of_the_kept_results():
@@ -118,6 +135,7 @@ def test_rows_with_other_settings_and_other_recordings_are_refused(monkeypatch, 
 @pytest.mark.slow
 def test_published_numbers_stand_beside_ours_and_a_failed_run_does_not_stop_the_others(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(reproduce, "subprocess", SimpleNamespace(Popen=RunHere, PIPE=None))
     monkeypatch.setitem(reproduce.ROWS["variants"]["published_physics"], "overrides", ["seed=-1"])
     arguments = ["--results", "out", "--overrides", *SMALL_BEAM]
     assert end_of(monkeypatch, "beam_oscillation/default", "beam_oscillation/published_physics", *arguments) == 2

@@ -109,11 +109,10 @@ def period(positions, time_step):
     ("joint", "start", "about", "substeps", "mass"),
     [
         (SLIDE.format(stiffness=40), 0.02, 0.0, 5, 0.004),
-        pytest.param(SLIDE.format(stiffness=20), 0.02, 0.0, 1, 0.04, marks=pytest.mark.slow),
         pytest.param(HINGE, 0.1, HANGING, 1, 0.04, marks=pytest.mark.slow),
         pytest.param(HINGE, 0.1, HANGING, 5, 0.4, marks=pytest.mark.slow),
     ],
-    ids=["slide, light", "slide", "hinge", "hinge, heavy"],
+    ids=["slide, light", "hinge", "hinge, heavy"],
 )
 def test_a_stiff_robot_swings_like_a_rigid_body(joint, start, about, substeps, mass):
     """Period, and reaction over motion, to 1 % at 5 ms; the error of the motion is proportional to the step.
@@ -144,8 +143,7 @@ def kicked(ratio, youngs_modulus, steps, robot=None):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("youngs_modulus", [3e4, 3e5, 3e6])
-@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize(("ratio", "youngs_modulus"), [(0.1, 3e4), (0.1, 3e6), (1.0, 3e5), (10.0, 3e4), (10.0, 3e6)])
 def test_robots_without_damping_are_stable_at_all_ratios_of_mass(ratio, youngs_modulus):
     twists = kicked(ratio, youngs_modulus, 300)
     assert twists[150:].max() < 1.05 * twists[:150].max()

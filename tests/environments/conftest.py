@@ -6,10 +6,11 @@ from support.main_job import DRIVEN, ROD, run_without_report
 from warp_resphys.control.reduction import fingerprint
 from warp_resphys.environments import making
 
-RUN = ["experiment=tendon_rod", *ROD, *DRIVEN, "data.steps=30"]
+SHORT = [*DRIVEN, "data.steps=30", "mesh_check=null"]
+RUN = ["experiment=tendon_rod", *ROD, *SHORT]
 BOX = "boxes: [[[-0.007, -0.007, -0.08], [0.007, 0.007, 0.0]]]"
 MESHES = ["mesh.size=0.014", f"laboratory.mesh={{kind: boxes, {BOX}, size: 0.01}}", "laboratory.time_step=0.01"]
-FINGER = ["experiment=finger", *MESHES, *DRIVEN, "data.steps=30"]
+FINGER = ["experiment=finger", *MESHES, *SHORT]
 
 
 @pytest.fixture(scope="session")

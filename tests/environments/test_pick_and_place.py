@@ -59,7 +59,7 @@ def test_gymnasiums_checker_passes(fingers):
 
 @pytest.mark.slow
 def test_the_scripted_policy_lifts_the_ball_and_puts_it_down_at_its_goal(fingers):
-    arms = make_vector("pick_and_place", fingers, 2, "sysid")
+    arms = make_vector("pick_and_place", fingers, 1, "sysid")
     policy, heights = ScriptedPlace(arms), []
     seen, _ = arms.reset(seed=0)
     before = arms.rests[:, -1]

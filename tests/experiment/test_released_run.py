@@ -6,8 +6,11 @@ import meshio
 import numpy as np
 import pytest
 
+import warp_resphys
 from support.configured import settings
 from support.main_job import run_without_report
+from support.refusals import refuses
+from warp_resphys import DataFileError
 from warp_resphys.experiment.experiment import ACTUATOR, LAW
 from warp_resphys.experiment.experiment import MODELS as ALL_MODELS
 from warp_resphys.experiment.mesh_check import check_mesh
@@ -150,7 +153,7 @@ def test_the_error_of_a_mesh_that_cannot_be_refined_is_not_known(finished, tmp_p
 
 
 @pytest.mark.slow
-def test_folds(finished, tmp_path):
+def test_folds_each_of_which_is_a_robot(finished, tmp_path):
     shutil.copytree(finished / "recordings", tmp_path / "recordings")
     run = run_without_report(tmp_path, *FOLDS)
     results = read_json(run / "metrics.json")
@@ -167,6 +170,8 @@ def test_folds(finished, tmp_path):
         assert trial not in split["train"] + split["validation"]
     places = (".", *(f"fold_{name}" for name in results["folds"]))
     assert all((run / place / "report.html").is_file() for place in places)
+    assert warp_resphys.load(run / "fold_bare").description.name == "run/fold_bare"
+    refuses(DataFileError, "is a cross-validation.*fold_bare.*fold_load52", warp_resphys.load, run)
     shown = read_json(run / "stages" / "report.json")["settings"]
     assert shown["folds"] == {trial: fold["errors_mm"] for trial, fold in results["folds"].items()}
 

@@ -39,15 +39,12 @@ COMMAND = ["experiment=unknown_pressures", TRACKED, "solver.relative_tolerance=1
 HIGH = 6e3  # Pa
 
 
-def made(folder, *overrides):
-    place_segment(folder)
-    (folder / "configs" / "experiment" / "unknown_pressures.yaml").write_text(SEGMENT)
-    return run_without_report(folder, *COMMAND, *overrides)
-
-
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("arm"))
+    folder = tmp_path_factory.mktemp("arm")
+    place_segment(folder)
+    (folder / "configs" / "experiment" / "unknown_pressures.yaml").write_text(SEGMENT)
+    return run_without_report(folder, *COMMAND)
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +67,6 @@ def wave(steps, batch=1):
 class TestRollouts:
     def test_every_model_does_what_the_evaluation_wrote(self, arm):
         check_robots(arm)
-
-    def test_a_fold_is_a_robot_and_their_parent_says_so(self, tmp_path):
-        folder = made(tmp_path, "data.folds=leave_one_out", "data.limit={train: 2, validation: 1, test: 2}")
-        folds = sorted(folder.glob("fold_*"))
-        assert len(folds) == 2
-        assert warp_resphys.load(folds[0]).description.name == f"run/{folds[0].name}"
-        refuses(DataFileError, rf"is a cross-validation.*{folds[0].name}.*{folds[1].name}", warp_resphys.load, folder)
 
     def test_steps_are_a_rollout(self, robot):
         pressure = wave(5, 2)

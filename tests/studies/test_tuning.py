@@ -81,7 +81,8 @@ def test_the_same_command_adds_trials_after_an_interruption_but_other_settings_h
 
 
 @pytest.mark.slow
-def test_a_trial_that_is_worse_than_others_is_stopped(tmp_path, monkeypatch):
+def test_a_trial_that_is_worse_than_others_is_stopped(searched, tmp_path, monkeypatch):
+    shutil.copytree(searched[0] / "run", tmp_path / "run", ignore=shutil.ignore_patterns("tune.db"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(optuna.trial.Trial, "should_prune", lambda self: self.number == 1)
     assert run(*SEARCH, "tune.trials=2", IN_RUN)[0] == 0

@@ -101,11 +101,3 @@ def files(folder="run"):
     root = Path(folder)
     paths = [p for p in root.rglob("*") if p.is_file() and ".hydra" not in p.parts and p.name != ".lock"]
     return {str(p.relative_to(root)): (p.stat().st_mtime_ns, p.read_bytes()) for p in paths}
-
-
-def ran(before):
-    """Stages whose record has changed."""
-    now = files()
-    return [
-        s for s in STAGES if f"stages/{s}.json" in now and now[f"stages/{s}.json"] != before.get(f"stages/{s}.json")
-    ]

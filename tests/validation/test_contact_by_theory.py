@@ -18,7 +18,6 @@ G. Carbone, L. Mangialardi: Analysis of the adhesive contact of confined layers 
 Journal of the Mechanics and Physics of Solids 56, 2008.
 """
 
-import itertools
 import math
 from dataclasses import replace
 
@@ -46,6 +45,12 @@ SHAPES = {
     "box": Box(edges=(0.02, 0.03, 0.04), axis=AXIS),
     "cylinder": Cylinder(radius=0.015, length=0.03, axis=AXIS),
 }
+# of every shape both distances and both types, and all four pairs of these
+THROWS = [
+    (shape, blocks.D if (number + half) % 2 else 0.1 * blocks.D, (torch.float64, torch.float32)[half])
+    for number, shape in enumerate(SHAPES)
+    for half in (0, 1)
+]
 integrators = pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
 
 
@@ -68,7 +73,7 @@ def test_blocks_slide_beyond_the_angle_of_friction_alone(integrator, device):
 
     Beyond, they are accelerated by g (sin a - mu cos a), which is measured from half a degree on.
     """
-    frictions, around = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7), range(-3, 5)
+    frictions, around = (0.1, 0.4, 0.7), range(-2, 4)
     cases = [(mu, math.floor(math.degrees(math.atan(mu))) + more) for mu in frictions for more in around]
     mu, degrees = np.array([case for case in cases if case[1] > 0]).T
     a, beyond = np.radians(degrees), degrees - np.degrees(np.arctan(mu))
@@ -84,7 +89,7 @@ def test_blocks_slide_beyond_the_angle_of_friction_alone(integrator, device):
 def test_a_sliding_block_stops_after_its_way(integrator, device):
     """From 1 m/s after v^2 / (2 mu g): of first order for implicit Euler; BDF2 is better than the block is rigid."""
     mu, errors = np.array([0.2, 0.5]), []
-    for h in (4e-3, 2e-3, 1e-3):
+    for h in (4e-3, 2e-3, 1e-3) if integrator == "implicit_euler" else (1e-3,):
         s = blocks.on_obstacles(blocks.resting_floor(blocks.WEIGHT), integrator=integrator, time_step=h, device=device)
         given = {"contact_friction": s.tensor(mu[:, None])}
         with torch.no_grad():
@@ -97,10 +102,7 @@ def test_a_sliding_block_stops_after_its_way(integrator, device):
         assert np.log2(np.abs(np.array(errors[:-1]) / errors[1:])).min() > 0.9
 
 
-@pytest.mark.parametrize(
-    ("distance", "dtype"), itertools.product((blocks.D, 0.1 * blocks.D), (torch.float64, torch.float32))
-)
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("shape", "distance", "dtype"), THROWS)
 def test_thrown_blocks_never_penetrate(shape, distance, dtype, device):
     """Twenty throws at up to 10 m/s from random directions, with a spin; every solve converges."""
     obstacle, batch = SHAPES[shape], 20
@@ -124,7 +126,7 @@ def test_thrown_blocks_never_penetrate(shape, distance, dtype, device):
     assert blocks.solves(path)[0] == 0
 
 
-@pytest.mark.parametrize(("mu", "kind"), [(0.2, "soft"), (0.5, "soft"), (0.5, "rigid")])
+@pytest.mark.parametrize(("mu", "kind"), [(0.5, "soft"), (0.2, "rigid")])
 def test_a_cube_on_a_held_plate_slides_beyond_the_angle_of_friction_alone(mu, kind, device):
     """A degree below it gains no speed in 0.15 s, a degree above that of Coulomb's law.
 
@@ -155,7 +157,7 @@ def turned(mesh, random, place):
 @pytest.mark.parametrize(("distance", "dtype"), [(1e-3, torch.float64), (1e-4, torch.float32)])
 def test_thrown_blocks_never_cross(distance, dtype, device):
     """Throws of two or three blocks of random sizes, the second of which is rigid in every other throw."""
-    random, hits, throws = np.random.default_rng(0), 0, 10
+    random, hits, throws = np.random.default_rng(0), 0, 4
     for k in range(throws):
         speed, h = 10.0 ** random.uniform(-0.5, 1.0), 10.0 ** random.uniform(-3.3, -2.0)
         way = random.normal(size=3)

@@ -5,6 +5,7 @@ tilted by 20 degrees.
 """
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,22 +20,26 @@ RUBBER = Corotated(264e3, 0.499, density=1070.0)
 CONVERGED = 31.63  # mm, under gravity
 
 
-def deflections(mesh, device, tilt=20.0):
-    """Ways of the tip towards +x [mm], of gravity with a base tilted by an angle [degrees], and of pressure."""
+@cache
+def deflection(size, layers, nodes, load, device):
+    """Way of the tip of an arm towards +x [mm], of gravity with a base tilted by 20 degrees, or of pressure."""
+    mesh = mesh_arm(ArmMesh(size=1e-3 * size, layers=1e-3 * layers))[0]
+    mesh = mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
     heights, chambers = mesh.vertices[:, 2], find_chambers(mesh)
     fixed, tip = (np.flatnonzero(np.abs(heights - end) < 1e-6) for end in (heights.max(), heights.min()))
     pressed = Pressure(chambers)
     fibres = Fibres(chambers, (8.0, -8.0), 2e-3, stiffness=1e4)
-    ways, solver = [], SolverSettings(relative_tolerance=1e-6)
-    load = torch.zeros(1, len(chambers), dtype=torch.float64)
-    load[0, 0] = 1e4  # Pa
-    for energies, angle, inputs in (([pressed], tilt, Inputs()), ([pressed, fibres], 0.0, Inputs(pressure=load))):
-        pull = 9.80709 * np.array([math.sin(math.radians(angle)), 0.0, -math.cos(math.radians(angle))])
-        body = Body(mesh, fixed, energies=energies)
-        simulator = Simulator(body, RUBBER, gravity=pull.tolist(), solver=solver, device=device)
-        moved = simulator.static_equilibrium(inputs).q - simulator.rest_positions
-        ways.append(1e3 * float(moved[0, tip, 0].mean()))
-    return ways
+    pressures = torch.zeros(1, len(chambers), dtype=torch.float64)
+    pressures[0, 0] = 1e4  # Pa
+    energies, angle, inputs = {
+        "gravity": ([pressed], math.radians(20.0), Inputs()),
+        "pressure": ([pressed, fibres], 0.0, Inputs(pressure=pressures)),
+    }[load]
+    pull = 9.80709 * np.array([math.sin(angle), 0.0, -math.cos(angle)])
+    body, solver = Body(mesh, fixed, energies=energies), SolverSettings(relative_tolerance=1e-6)
+    simulator = Simulator(body, RUBBER, gravity=pull.tolist(), solver=solver, device=device)
+    moved = simulator.static_equilibrium(inputs).q - simulator.rest_positions
+    return 1e3 * float(moved[0, tip, 0].mean())
 
 
 MESHES = {  # sizes of elements and layers [mm], nodes of a cell, and ways of the tip: the table of docs/results
@@ -45,16 +50,11 @@ MESHES = {  # sizes of elements and layers [mm], nodes of a cell, and ways of th
 }
 
 
-def arm(size, layers, nodes):
-    mesh = mesh_arm(ArmMesh(size=1e-3 * size, layers=1e-3 * layers))[0]
-    return mesh if nodes == 8 else quadratic(mesh, f"hexahedron{nodes}")
-
-
 @pytest.mark.parametrize("name", MESHES)
 def test_an_arm_bends_as_far_as_its_elements_allow(name, device):
     """The figures by which elements are recommended; quadratic ones are within 2 % under gravity."""
     *mesh, gravity, pressure = MESHES[name]
-    aside, bent = deflections(arm(*mesh), device)
+    aside, bent = (deflection(*mesh, load, device) for load in ("gravity", "pressure"))
     assert aside == pytest.approx(gravity, rel=2e-3)
     assert bent == pytest.approx(pressure, rel=4e-3)
     assert (abs(aside / CONVERGED - 1.0) < 0.02) == (mesh[2] > 8)
@@ -62,6 +62,6 @@ def test_an_arm_bends_as_far_as_its_elements_allow(name, device):
 
 def test_linear_hexahedra_converge_at_second_order(device):
     """Richardson's extrapolation of the way of the tip from two meshes, one twice as fine, is the converged one."""
-    coarse, fine = (deflections(arm(*sizes, 8), device)[0] for sizes in ((10.0, 24.0), (5.0, 12.0)))
+    coarse, fine = (deflection(*sizes, 8, "gravity", device) for sizes in ((10.0, 24.0), (5.0, 12.0)))
     assert fine + (fine - coarse) / 3.0 == pytest.approx(CONVERGED, rel=5e-3)
     assert abs(fine - CONVERGED) < 0.35 * abs(coarse - CONVERGED)

@@ -97,7 +97,7 @@ def test_an_arch(share, stands, device):
     assert speed < 5e-3 if stands else speed > 0.05
 
 
-@pytest.mark.parametrize("degrees", [15.0, 25.0, 35.0])
+@pytest.mark.parametrize("degrees", [15.0, 35.0])
 def test_two_cards(degrees, device):
     """Moments about the edge on which a card stands, of its weight and of the other card's force, give the friction."""
     scene = house(degrees, 1, 0.3)

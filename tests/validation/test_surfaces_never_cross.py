@@ -174,7 +174,7 @@ def _falls(lower, upper, speed=0.0):
     floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, base))}, kappa, friction, distance)
     bodies = {"lower": Body(lower, fixed=select_vertices(lower, z=base)), "upper": Body(upper, energies=[floor])}
     contact, thrown = SurfaceContact(kappa, friction, distance), {"upper": (speed, 0.0, -1.0)}
-    return Case(bodies, contact, distance, 100, velocities=thrown)
+    return Case(bodies, contact, distance, 60, velocities=thrown)
 
 
 def mat():
@@ -249,7 +249,7 @@ def tentacle():
     return Case({"tentacle": body}, contact, distance, 120, material=soft, pull={"tentacle": (2.7, 1.5)})
 
 
-CASES = {**erleben_cases(), **{"mat": mat(), "rollers": rollers(), "funnel": funnel(), "tentacle": tentacle()}}
+CASES = {**erleben_cases(), **{"mat": mat(), "funnel": funnel(), "tentacle": tentacle()}}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -262,8 +262,7 @@ def test_surfaces_touch_and_cross_without_contact_alone(name, device):
         assert end[Scene(case.bodies).vertex_slice("ball"), 0].mean() > 0.015
     if name == "tentacle":
         check_turn(case, end)
-    if name != "rollers":  # whose block never reaches them
-        assert all(run(replace(case, contact=None), device)[0].values())
+    assert all(run(replace(case, contact=None), device)[0].values())
 
 
 def check_turn(case, end):
@@ -286,8 +285,9 @@ def test_rollers_draw_by_friction_alone(device):
 
     The middles of the rollers are 21 mm from that of the block, which is 16 mm high, and their radius is 15 mm.
     """
-    case, slope = CASES["rollers"], math.tan(math.acos((21.0 - 8.0) / 15.0))
+    case, slope = rollers(), math.tan(math.acos((21.0 - 8.0) / 15.0))
     for friction, draws in ((1.15 * slope, True), (0.85 * slope, False)):
-        crossings, _, end = run(replace(case, contact=replace(case.contact, friction=friction)), device)
+        crossings, gap, end = run(replace(case, contact=replace(case.contact, friction=friction)), device)
         assert not any(crossings.values())
+        assert gap < case.distance
         assert (end[Scene(case.bodies).vertex_slice("block"), 0].mean() > 0.02) == draws

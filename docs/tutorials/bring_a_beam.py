@@ -132,7 +132,7 @@ in_the_loop: {{epochs: 2, hold_out: false}}  # short: 2 -> 1
 simfree: {{trainer: {{epochs: 40, rollout_every: 20}}}}  # short: 40, rollout_every: 20 -> 4, rollout_every: 4
 correct_uncorrected: false
 """)
-print(command("experiment=my_robot"))
+print(command("experiment=my_robot"))  # short: robot" -> robot", "parallel.processes=1"
 
 # %% [markdown]
 # ## Read the report
@@ -181,7 +181,7 @@ identify:
   first_guess: {prony_ratio_1: 0.1}
   max_evaluations: 8
 """)
-command("experiment=my_creeping_robot")
+command("experiment=my_creeping_robot")  # short: robot" -> robot", "parallel.processes=1"
 run = Path("runs/my_creeping_robot/default")
 creeping, identified = results(run)
 print(f"identified: {errors['sysid']:.2f} mm without, {creeping['sysid']:.2f} mm with creep")

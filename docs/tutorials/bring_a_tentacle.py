@@ -141,7 +141,7 @@ identify:
 
 def command(*arguments):
     """Runs `warp-resphys` with arguments, and gives what it printed."""
-    line = [sys.executable, "-m", "warp_resphys", *arguments]
+    line = [sys.executable, "-m", "warp_resphys", *arguments]  # short: ts] -> ts, "parallel.processes=1"]
     ended = subprocess.run(line, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr[-2000:]
     return ended.stdout

@@ -38,7 +38,7 @@ defaults:
   - tendon_rod_control
   - _self_
 name: drawing
-title: A rod that draws a circle
+title: A rod that draws a circle  # short: title: A rod that draws a circle -> parallel: {processes: 1}
 mesh: {layers: 3, nodes: 20}  # short: 3 -> 2
 laboratory:
   mesh: {layers: 4, nodes: 20}  # short: 4 -> 3

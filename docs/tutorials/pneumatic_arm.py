@@ -28,7 +28,7 @@ from warp_resphys.mesh import ArmMesh, find_chambers, mesh_arm
 wp.config.log_level = wp.LOG_WARNING
 
 dimensions = ArmMesh(chamber_lengths=(0.1,), caps=(0.008, 0.008), radii=(0.022, 0.018), size=0.008)  # m
-mesh, surfaces = mesh_arm(dimensions)  # short: dimensions -> ArmMesh(size=0.015, chamber_lengths=[0.05], caps=[8e-3] * 2, radii=[0.022, 0.02])
+mesh, surfaces = mesh_arm(dimensions)  # short: dimensions -> dimensions.model_copy(update={"size": 0.015})
 chambers = find_chambers(mesh)
 print(f"{len(mesh.vertices)} vertices; surfaces: {', '.join(surfaces)}")
 

@@ -25,7 +25,7 @@ import warp_resphys as wr
 
 wp.config.log_level = wp.LOG_WARNING
 
-box = wr.box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m  # short: (10, 3, 3) -> (10, 1, 1)
+box = wr.box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m  # short: (10, 3, 3) -> (10, 2, 2)
 x = box.vertices[box.cells].mean(1)[:, 0]  # centres of the cells
 regions = {
     "stiff": np.flatnonzero(x < 0.05),

@@ -147,7 +147,7 @@ def command(*arguments):
     return ended.stdout
 
 
-print(command("experiment=my_tentacle", "budget=quick", "data.limit=null"))  # short: null" -> null", "trainer.epochs=9"
+print(command("experiment=my_tentacle", "budget=quick", "data.limit=null"))  # short: l" -> l", "reconstruction=none"
 
 # %% [markdown]
 # ## Results

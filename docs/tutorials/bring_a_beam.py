@@ -99,7 +99,7 @@ defaults:
   - _self_
 name: my_robot
 title: My robot
-mesh: {{divisions: [8, 2, 2]}}  # short: [8, 2, 2] -> [4, 1, 1]
+mesh: {{divisions: [8, 2, 2]}}
 fixed: {{x: 0.0}}  # the clamped vertices
 tip: {{x: 0.1}}
 simulation:  # from the data sheet
@@ -132,7 +132,7 @@ in_the_loop: {{epochs: 2, hold_out: false}}  # short: 2 -> 1
 simfree: {{trainer: {{epochs: 40, rollout_every: 20}}}}  # short: 40, rollout_every: 20 -> 4, rollout_every: 4
 correct_uncorrected: false
 """)
-print(command("experiment=my_robot"))  # short: robot" -> robot", "parallel.processes=1"
+print(command("experiment=my_robot"))
 
 # %% [markdown]
 # ## Read the report
@@ -172,7 +172,7 @@ defaults:
   - override /reconstruction: none
   - _self_
 name: my_creeping_robot
-title: My robot, which creeps
+title: My robot, which creeps  # short: title: My robot, which creeps -> parallel: {processes: 1}
 simulation: {prony_ratio_1: 0.0, prony_time_1: 0.3}  # of the shear modulus; s
 identify:
   parameters:
@@ -181,7 +181,7 @@ identify:
   first_guess: {prony_ratio_1: 0.1}
   max_evaluations: 8
 """)
-command("experiment=my_creeping_robot")  # short: robot" -> robot", "parallel.processes=1"
+command("experiment=my_creeping_robot")
 run = Path("runs/my_creeping_robot/default")
 creeping, identified = results(run)
 print(f"identified: {errors['sysid']:.2f} mm without, {creeping['sysid']:.2f} mm with creep")

@@ -39,9 +39,9 @@ defaults:
   - _self_  # short: _self_ -> override /reconstruction: none
 name: drawing
 title: A rod that draws a circle  # short: title: A rod that draws a circle -> parallel: {processes: 1}
-mesh: {layers: 3, nodes: 20}  # short: 3 -> 2
+mesh: {layers: 3, nodes: 20}
 laboratory:
-  mesh: {layers: 4, nodes: 20}  # short: 4 -> 3
+  mesh: {layers: 4, nodes: 20}
   sequences: {rest: 0.01, correlation_time: 0.06}
 actuation: {filter_time_constants: [0.1]}
 data: {sequences: 6, steps: 60, train: 4, validation: 1, test: 1, horizons: [], rest_seconds: 0.01, cutoff: 20.0}
@@ -58,7 +58,7 @@ control:
   plan: {corrections: 2, reach: 0.05}
   horizon: 0.1
   feedback: {gains: [5.0], settles: 0.3}
-  reduction: {modes: [4], equilibria: 48, tangents: 24, motions: 3, seconds: 2.0}  # short: 48 -> 24
+  reduction: {modes: [4], equilibria: 48, tangents: 24, motions: 3, seconds: 2.0}
 """)
 ended = subprocess.run(
     [sys.executable, "-m", "warp_resphys", "experiment=drawing"], capture_output=True, text=True, check=False

@@ -62,8 +62,13 @@ def test_every_tutorial_is_in_the_contents_and_says_when_it_is_wrong():
 
 def test_tutorials_have_a_short_form():
     in_form = runpy.run_path(str(DOCS / "extensions" / "short_form.py"))["in_form"]
-    assert in_form("for _ in range(14):  # short: for _ in range(2):\n    x", False) == "for _ in range(14):\n    x"
-    assert in_form("    y = 6  # short: y = 3\n    x = y", True) == "    y = 3\n    x = y"
+    line = "    for _ in range(14):  # short: 14 -> 2\n        x"
+    assert in_form(line, False) == "    for _ in range(14):\n        x"
+    assert in_form(line, True) == "    for _ in range(2):\n        x"
+    assert in_form("y = (2, 2)  # m  # short: (2, 2) -> (1, 1)", True) == "y = (1, 1)  # m"
+    for number, line in enumerate(["y = (2, 2)  # short: 2 -> 1", "y = (2, 2)  # short: 3 -> 1"]):
+        with pytest.raises(ValueError, match=f"is {2 - 2 * number} times in the line"):
+            in_form(line, True)
     for page in (DOCS / "tutorials").glob("*.py"):
         text = page.read_text(encoding="utf-8")
         for short in (False, True):

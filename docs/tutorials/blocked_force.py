@@ -39,8 +39,8 @@ LENGTH, WIDTH, HEIGHT, END, LAYER = 0.08, 0.016, 0.014, 0.006, 0.001  # m
 
 def finger(roof=0.0025, side=0.0025):
     """The mesh of a finger along x, with thicknesses of the roof and the sides [m]."""
-    x = np.r_[0.0, np.linspace(END, LENGTH - END, 7), LENGTH]
-    y = np.r_[0.0, np.linspace(side, WIDTH - side, 3), WIDTH]
+    x = np.r_[0.0, np.linspace(END, LENGTH - END, 7), LENGTH]  # short: 7 -> 2
+    y = np.r_[0.0, np.linspace(side, WIDTH - side, 3), WIDTH]  # short: 3 -> 2
     z = np.r_[0.0, LAYER, 0.0035, HEIGHT - roof, HEIGHT]
     counts = [len(planes) - 1 for planes in (x, y, z)]
     box = box_hexahedra(counts, counts, nodes=20)  # cells of unit size
@@ -76,7 +76,7 @@ print(mesh)
 # and lower half.
 
 # %%
-pressures = torch.linspace(0.0, 60e3, 5, dtype=torch.float64)[:, None].requires_grad_()  # (B, 1) Pa
+pressures = torch.linspace(0.0, 60e3, 5, dtype=torch.float64)[:, None].requires_grad_()  # (B, 1) Pa  # short: 5 -> 3
 bent = free.static_equilibrium(Inputs(pressure=pressures))
 heights = mesh.vertices[tip, 2] - mesh.vertices[tip, 2].mean()
 
@@ -114,7 +114,7 @@ def push(pose, pressure):
 
 
 curves = {}
-for k in (0, 1, 2):  # poses of free air
+for k in (0, 1, 2):  # poses of free air  # short: , 2) -> )
     above = pressures[k:].detach().clone().requires_grad_()
     strength = push(bent.q[k].detach().expand(len(above), -1, -1), above)
     curves[float(np.degrees(angles[k].item()))] = (above.detach()[:, 0].numpy(), strength.detach().numpy())

@@ -39,7 +39,7 @@ tracked = {"Tip - 1": (0.1, 0.015, 0.03), "Tip - 2": (0.1, 0.0, 0.015), "Tip - 3
 reference = {"Base - 1": (0.0, 0.0, 0.0), "Base - 2": (0.0, 0.03, 0.03), "Base - 3": (0.0, 0.03, 0.0)}
 weights = {"bare": 0.0, "light": 0.04, "heavy": 0.08}  # kg
 
-mesh = quadratic(box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2)))
+mesh = quadratic(box_hexahedra((0.1, 0.03, 0.03), (6, 2, 2)))  # short: (6, 2, 2) -> (3, 1, 1)
 silicone = StableNeoHookean(250e3, 0.49, density=1070.0, stiffness_damping=1e-3, prony=[(0.15, 0.1)])
 robot = Simulator(Body(mesh, select_vertices(mesh, x=0.0)), silicone, time_step=0.005, integrator="midpoint")
 carries = select_vertices(mesh, x=0.1)
@@ -128,8 +128,8 @@ identify:
   elastic: {{poissons_ratio: null}}
   starts: 1
   max_evaluations: 6
-in_the_loop: {{epochs: 2, hold_out: false}}
-simfree: {{trainer: {{epochs: 40, rollout_every: 20}}}}
+in_the_loop: {{epochs: 2, hold_out: false}}  # short: 2 -> 1
+simfree: {{trainer: {{epochs: 40, rollout_every: 20}}}}  # short: 40, rollout_every: 20 -> 4, rollout_every: 4
 correct_uncorrected: false
 """)
 print(command("experiment=my_robot"))
@@ -172,7 +172,7 @@ defaults:
   - override /reconstruction: none
   - _self_
 name: my_creeping_robot
-title: My robot, which creeps
+title: My robot, which creeps  # short: title: My robot, which creeps -> parallel: {processes: 1}
 simulation: {prony_ratio_1: 0.0, prony_time_1: 0.3}  # of the shear modulus; s
 identify:
   parameters:

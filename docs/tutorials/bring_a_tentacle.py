@@ -49,7 +49,7 @@ test = ["first_middle", "second_middle", "mixed"]
 tracked = {"Low": [0.0, 0.016, -0.08], "Middle": [0.0, -0.014, -0.14], "Tip": [0.0, 0.0, -0.208]}  # m, on clips
 reference = {"Base": [0.03, 0.0, 0.005]}
 
-mesh = rod([[0.0, 0.0, 0.0], [0.0, 0.0, -length]], radii, layers=14)
+mesh = rod([[0.0, 0.0, 0.0], [0.0, 0.0, -length]], radii, layers=14)  # short: 14 -> 7
 along = np.linspace(0.0, 1.0, 21)[:, None]
 paths = {name: (1 - along) * np.array(start) + along * np.array(end) for name, (start, end) in routes.items()}
 paths["first"] += [0.001, 0.0, 0.0]  # unknown to the simulator
@@ -104,7 +104,7 @@ title: My tentacle
 mesh:
   centreline: [[0.0, 0.0, 0.0], [0.0, 0.0, {-length}]]  # m
   radii: {radii}
-  layers: 10
+  layers: 10  # short: 10 -> 5
 fixed: {{z: 0.0}}
 tip: {{z: {-length}, tolerance: 1.0e-6}}
 tendons:
@@ -141,13 +141,13 @@ identify:
 
 def command(*arguments):
     """Runs `warp-resphys` with arguments, and gives what it printed."""
-    line = [sys.executable, "-m", "warp_resphys", *arguments]
+    line = [sys.executable, "-m", "warp_resphys", *arguments]  # short: ts] -> ts, "parallel.processes=1"]
     ended = subprocess.run(line, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr[-2000:]
     return ended.stdout
 
 
-print(command("experiment=my_tentacle", "budget=quick", "data.limit=null"))
+print(command("experiment=my_tentacle", "budget=quick", "data.limit=null"))  # short: l" -> l", "reconstruction=none"
 
 # %% [markdown]
 # ## Results

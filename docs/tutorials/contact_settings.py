@@ -34,7 +34,7 @@ def beam_on_bar(bar, divisions=(16, 1, 2), distance=5e-4):
     body = Body(mesh, fixed=select_vertices(mesh, x=0.0), energies=[contact])
     simulator = Simulator(body, silicone, time_step=0.01, integrator="implicit_euler")
     with torch.no_grad():
-        return mesh, simulator.rollout(simulator.rest_state(), 80).q[-1, 0].numpy()
+        return mesh, simulator.rollout(simulator.rest_state(), 80).q[-1, 0].numpy()  # short: 80 -> 20
 
 
 def side_view(ax, mesh, q, bar, title):
@@ -65,7 +65,7 @@ figure.tight_layout()
 # %%
 thin = Cylinder(position=(0.0865, 0.01, -0.02), axis=(0.0, 1.0, 0.0), radius=0.0015, length=0.06)
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
-for ax, divisions in zip(axes, ((8, 1, 2), (48, 1, 2)), strict=True):
+for ax, divisions in zip(axes, ((8, 1, 2), (48, 1, 2)), strict=True):  # short: (48, 1, 2) -> (16, 1, 2)
     mesh, q = beam_on_bar(thin, divisions)
     side_view(ax, mesh, q, thin, f"vertices every {120 / divisions[0]:g} mm")
 figure.tight_layout()
@@ -80,12 +80,12 @@ figure.tight_layout()
 # stiffness: a soft barrier yields like a layer of the body, and a stiff one makes impacts sudden.
 
 # %%
-cube = box_hexahedra((0.02, 0.02, 0.02), (2, 2, 2))
+cube = box_hexahedra((0.02, 0.02, 0.02), (2, 2, 2))  # short: (2, 2, 2) -> (1, 1, 1)
 block = Corotated(2e6, 0.4, density=1070.0, stiffness_damping=2e-3)
 D = 1e-3  # m
-loads = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # short: loads = np.array([1.0, 100.0])
+loads = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # short: , 3.0, 10.0, 30.0 -> 
 figure, ax = plt.subplots(figsize=(5.5, 3.4))
-for stiffness in (1e4, 1e5, 1e6):  # short: for stiffness in (1e4, 1e6):
+for stiffness in (1e4, 1e5, 1e6):  # short: , 1e5 -> 
     gaps = []
     for load in loads:
         floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.9 * D))}, stiffness=stiffness, distance=D)
@@ -111,7 +111,7 @@ figure.tight_layout()
 
 # %%
 a, creeps = np.radians(15.0), []
-slip_speeds = np.array([1e-4, 1e-3, 1e-2, 1e-1])  # short: slip_speeds = np.array([1e-2])
+slip_speeds = np.array([1e-4, 1e-3, 1e-2, 1e-1])  # short: [1e-4, 1e-3, 1e-2, 1e-1] -> [1e-2]
 print("slip speed  creep      iterations of a thrown block's step, most")
 for slip_speed in slip_speeds:
     floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -9.5e-4))}, 1e5, 0.4, D, slip_speed)

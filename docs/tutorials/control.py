@@ -36,9 +36,9 @@ Path("configs/experiment").mkdir(parents=True)
 Path("configs/experiment/drawing.yaml").write_text("""# @package _global_
 defaults:
   - tendon_rod_control
-  - _self_
+  - _self_  # short: _self_ -> override /reconstruction: none
 name: drawing
-title: A rod that draws a circle
+title: A rod that draws a circle  # short: title: A rod that draws a circle -> parallel: {processes: 1}
 mesh: {layers: 3, nodes: 20}
 laboratory:
   mesh: {layers: 4, nodes: 20}

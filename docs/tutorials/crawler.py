@@ -29,7 +29,7 @@ from warp_resphys.energies import Muscle
 wp.config.log_level = wp.LOG_WARNING
 
 LENGTH, WIDTH, HEIGHT = 0.12, 0.03, 0.016  # m
-CELLS = (12, 1, 2)
+CELLS = (12, 1, 2)  # short: 12 -> 6
 GAP = 9.55e-4  # m: of a slab of this weight at rest; contact begins at 1 mm
 box = box_hexahedra((LENGTH, WIDTH, HEIGHT), CELLS)
 mesh = Mesh(box.vertices + [0.0, 0.0, GAP], box.cells)
@@ -84,7 +84,7 @@ def waves(phases):
 # 36 waves, all in one batch:
 
 # %%
-COUNT = 6  # short: COUNT = 3
+COUNT = 6  # short: 6 -> 2
 phase = 2.0 * math.pi * torch.arange(COUNT, dtype=torch.float64) / COUNT
 grid = torch.cartesian_prod(phase, phase)
 with torch.no_grad():
@@ -103,7 +103,7 @@ print(
 
 # %%
 torch.manual_seed(0)
-random = waves(2.0 * math.pi * torch.rand(8, 2, dtype=torch.float64))
+random = waves(2.0 * math.pi * torch.rand(8, 2, dtype=torch.float64))  # short: (8 -> (2
 with torch.no_grad():
     first, _ = crawl(random)
 # Forwards or backwards: the slab looks the same from both ends.
@@ -111,7 +111,7 @@ direction = torch.sign(first[first.abs().argmax()])
 gait = random[first.abs().argmax()][None].requires_grad_()
 optimiser = torch.optim.Adam([gait], lr=0.4)
 reached = []
-for _ in range(14):  # short: for _ in range(2):
+for _ in range(14):  # short: 14 -> 2
     optimiser.zero_grad()
     way, motion = crawl(gait)
     (-direction * way.sum()).backward()
@@ -182,6 +182,6 @@ plt.show()
 # 0.6 N, so friction can be at most 0.36 N.
 
 # %%
-assert reached[-1] > 1.5e3 * ways[best]  # short: assert reached[-1] > reached[0]
+assert reached[-1] > 1.5e3 * ways[best]  # short: 1.5e3 * ways[best] -> reached[0]
 assert abs(forces[-50:].sum(1).mean()) < 0.05 * 360
 assert np.abs(forces[-50:]).max() < 360

@@ -70,14 +70,14 @@ class Floor(PointwiseEnergy):
 # ## A block that is dropped
 
 # %%
-mesh = box_hexahedra(size=(0.04, 0.04, 0.04), divisions=(4, 4, 4))  # m
+mesh = box_hexahedra(size=(0.04, 0.04, 0.04), divisions=(4, 4, 4))  # m  # short: (4, 4, 4) -> (2, 2, 2)
 bottom, top = select_vertices(mesh, z=0.0), select_vertices(mesh, z=0.04)
 body = Body(mesh, energies=[Floor(bottom, stiffness=1e5, height=-0.02)])
 silicone = Corotated(youngs_modulus=50e3, poissons_ratio=0.45, density=1070.0, stiffness_damping=2e-3)
-simulator = Simulator(body, silicone, time_step=0.002, integrator="bdf2", relative_tolerance=1e-9)
+simulator = Simulator(body, silicone, time_step=0.002, integrator="bdf2", relative_tolerance=1e-9)  # short: 02, -> 04,
 print("parameters:", ", ".join(simulator.parameters))
 
-fall = simulator.rollout(simulator.rest_state(), steps=1000)
+fall = simulator.rollout(simulator.rest_state(), steps=1000)  # short: 1000 -> 500
 height = fall.q[:, 0, :, 2]
 times = simulator.time_step * np.arange(len(height))
 figure, axis = plt.subplots(figsize=(7, 3), layout="constrained")
@@ -109,7 +109,7 @@ state = State(state.q - torch.tensor([0.0, 0.0, 0.018], dtype=torch.float64), st
 
 def rebound(stiffness, floor):
     parameters = {"floor_stiffness": stiffness, "floor_height": floor}
-    return simulator.rollout(state, steps=60, parameters=parameters).q[-1, 0, :, 2].mean()
+    return simulator.rollout(state, steps=60, parameters=parameters).q[-1, 0, :, 2].mean()  # short: 60 -> 30
 
 
 values = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (1e5, -0.02)]

@@ -20,7 +20,7 @@ import warp_resphys as wr
 
 wp.config.log_level = wp.LOG_WARNING  # no message for each loaded kernel
 
-mesh = wr.rod(centreline=[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], radii=0.01, layers=8)  # m
+mesh = wr.rod(centreline=[[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], radii=0.01, layers=8)  # m  # short: 8 -> 4
 tendon = wr.Tendons([[[x, 0.0, -0.006] for x in (0.0, 0.02, 0.04, 0.06, 0.08, 0.1)]])  # guides, m
 finger = wr.Body(mesh, fixed=wr.select_vertices(mesh, x=0.0), energies=[tendon])
 tip = wr.select_vertices(mesh, x=0.1)

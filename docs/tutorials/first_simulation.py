@@ -23,7 +23,7 @@ from warp_resphys import Body, Corotated, Inputs, Simulator, StableNeoHookean, b
 
 wp.config.log_level = wp.LOG_WARNING  # no message for each loaded kernel
 
-mesh = quadratic(box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 2, 2)))  # m; 27-node hexahedra
+mesh = quadratic(box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 2, 2)))  # m; 27-node hexahedra  # short: 8 -> 3
 clamp, tip = select_vertices(mesh, x=0.0), select_vertices(mesh, x=0.1)
 body = Body(mesh, fixed=clamp)
 silicone = Corotated(youngs_modulus=264e3, poissons_ratio=0.45, density=1070.0)  # Pa, 1, kg/m^3

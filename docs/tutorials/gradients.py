@@ -24,7 +24,7 @@ from warp_resphys import Body, Corotated, Inputs, Simulator, box_hexahedra, reco
 wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)
 
-mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m
+mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m  # short: (10, 3, 3) -> (4, 1, 1)
 body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
 tip = select_vertices(mesh, x=0.1)
 # Second order, with residuals far below the measured differences; gradients are exact at the solution.
@@ -67,7 +67,7 @@ print(f"d(height at the end) / dE = {exact:.9e} m/Pa")
 # were wrong, the error would stop decreasing earlier, at the error of the gradient.
 
 # %%
-relative = 10.0 ** -np.arange(1.0, 7.5, 0.5)
+relative = 10.0 ** -np.arange(1.0, 7.5, 0.5)  # short: np.arange(1.0, 7.5, 0.5) -> np.array([2.0, 4.0, 5.0])
 errors = []
 with torch.no_grad():
     for step in relative:

@@ -109,7 +109,7 @@ def grasp(knots):
 # Ten constant tensions from 0.9 to 1.8 N, in one batch:
 
 # %%
-constant = torch.linspace(0.9, 1.8, 10, dtype=torch.float64)  # short: constant = torch.tensor([1.3, 1.4]).double()
+constant = torch.linspace(0.9, 1.8, 10, dtype=torch.float64)  # short: 0.9, 1.8, 10 -> 1.2, 1.6, 2
 with torch.no_grad():
     heights, efforts, motions = grasp(constant[:, None].expand(-1, 6))
 for tension, height in zip(constant.tolist(), heights.tolist(), strict=True):
@@ -127,9 +127,9 @@ least = int(torch.where(heights >= HELD, efforts, torch.inf).argmin())
 
 # %%
 knots = torch.full((1, 6), 1.4, dtype=torch.float64, requires_grad=True)
-optimiser = torch.optim.Adam([knots], lr=0.12)
+optimiser = torch.optim.Adam([knots], lr=0.12)  # short: 12 -> 05
 best = None
-for _ in range(5):  # short: for _ in range(3):
+for _ in range(5):  # short: 5 -> 2
     optimiser.zero_grad()
     height, effort, motion = grasp(knots)
     (effort + 0.1 * (HELD - height).clamp_min(0.0)).sum().backward()

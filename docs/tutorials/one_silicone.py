@@ -64,15 +64,15 @@ print(f"\nerror over the amplitude: {law['validation']['law']:.2g}, of SysID {la
 
 # %%
 bodies = {
-    "beam of 20 cm": (wr.box_hexahedra((0.2, 0.03, 0.03), (16, 2, 2)), {"x": 0.0}),
-    "thin beam": (wr.box_hexahedra((0.1, 0.02, 0.02), (10, 2, 2)), {"x": 0.0}),
+    "beam of 20 cm": (wr.box_hexahedra((0.2, 0.03, 0.03), (16, 2, 2)), {"x": 0.0}),  # short: (16, 2, 2) -> (6, 1, 1)
+    "thin beam": (wr.box_hexahedra((0.1, 0.02, 0.02), (10, 2, 2)), {"x": 0.0}),  # short: (10, 2, 2) -> (5, 1, 1)
     "tapered finger": (wr.rod([[0, 0, 0], [0.12, 0, 0]], [[0.0, 0.014], [0.12, 0.007]], layers=6), {"x": 0.0}),
 }
 truth = wr.energies.MooneyRivlin(30e3, 14e3, 20e6, density=1070.0, stiffness_damping=5e-4, prony=[(0.3, 0.08)])
 robots = {model: wr.load("runs/beam", model=model) for model in ("simulation", "sysid", "law")}
 
 
-def swing(simulator, parameters=None, steps=100):
+def swing(simulator, parameters=None, steps=100):  # short: 100 -> 40
     """Motion of a body that is let go from straight [m]."""
     with torch.no_grad():
         return simulator.rollout(simulator.rest_state(), steps, parameters=parameters).q[:, 0].numpy()
@@ -100,7 +100,7 @@ for axis, (name, own) in zip(axes, motions.items(), strict=True):
     tip = np.argmax(bodies[name][0].vertices[:, 0])
     for model, label in {"simulation": "uncorrected", "sysid": "SysID", "law": "law", "true": "true"}.items():
         line = {"color": "black", "linestyle": ":"} if model == "true" else {}
-        axis.plot(0.01 * np.arange(101), 1e3 * own[model][:, tip, 2], label=label, **line)
+        axis.plot(0.01 * np.arange(101), 1e3 * own[model][:, tip, 2], label=label, **line)  # short: 101 -> 41
     axis.set(title=name, xlabel="time [s]")
 axes[0].set_ylabel("height of the tip [mm]")
 axes[0].legend(frameon=False, fontsize=8)

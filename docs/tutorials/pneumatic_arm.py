@@ -28,7 +28,7 @@ from warp_resphys.mesh import ArmMesh, find_chambers, mesh_arm
 wp.config.log_level = wp.LOG_WARNING
 
 dimensions = ArmMesh(chamber_lengths=(0.1,), caps=(0.008, 0.008), radii=(0.022, 0.018), size=0.008)  # m
-mesh, surfaces = mesh_arm(dimensions)
+mesh, surfaces = mesh_arm(dimensions)  # short: dimensions -> dimensions.model_copy(update={"size": 0.015})
 chambers = find_chambers(mesh)
 print(f"{len(mesh.vertices)} vertices; surfaces: {', '.join(surfaces)}")
 
@@ -50,8 +50,8 @@ def arm(energies):
 
 # %%
 threads = Fibres(chambers, (8.0, -8.0), stiffness=1e4)  # degrees; N/m
-pressures = torch.zeros(6, 3, dtype=torch.float64)  # (B, chambers) Pa
-pressures[:, 0] = torch.linspace(0.0, 20e3, 6)
+pressures = torch.zeros(6, 3, dtype=torch.float64)  # (B, chambers) Pa  # short: (6 -> (2
+pressures[:, 0] = torch.linspace(0.0, 20e3, 6)  # short: , 6 -> , 2
 volumes, bends = {}, {}
 for name, energies in {"without fibres": [Pressure(chambers)], "with fibres": [Pressure(chambers), threads]}.items():
     simulator = arm(energies)

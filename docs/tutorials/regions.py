@@ -25,7 +25,7 @@ import warp_resphys as wr
 
 wp.config.log_level = wp.LOG_WARNING
 
-box = wr.box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m
+box = wr.box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(10, 3, 3))  # m  # short: (10, 3, 3) -> (10, 2, 2)
 x = box.vertices[box.cells].mean(1)[:, 0]  # centres of the cells
 regions = {
     "stiff": np.flatnonzero(x < 0.05),
@@ -112,7 +112,7 @@ print(f"the cap deforms by {strain:.1e} of its size")
 # falls beside the beam:
 
 # %%
-cube = wr.Body(wr.box_hexahedra(size=(0.02, 0.02, 0.02), divisions=(4, 4, 4)))
+cube = wr.Body(wr.box_hexahedra(size=(0.02, 0.02, 0.02), divisions=(4, 4, 4)))  # short: (4, 4, 4) -> (1, 1, 1)
 scene = wr.Scene({"beam": beam, "cube": cube})
 both = wr.Simulator(
     scene,

@@ -35,7 +35,7 @@ wp.config.log_level = wp.LOG_WARNING
 torch.manual_seed(0)
 torch.set_num_threads(1)  # faster for a small network, in particular on busy cores
 
-mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 3, 3))  # m
+mesh = box_hexahedra(size=(0.1, 0.03, 0.03), divisions=(8, 3, 3))  # m  # short: (8, 3, 3) -> (4, 3, 3)
 body = Body(mesh, fixed=select_vertices(mesh, x=0.0))
 tip = select_vertices(mesh, x=0.1)
 settings = SolverSettings(on_failure="count")  # a failed environment does not stop the others
@@ -53,7 +53,7 @@ train, test = slice(0, 7), slice(7, 9)
 load = torch.zeros(len(weights), len(mesh.vertices), 3, dtype=torch.float64)  # (B, N, 3) N
 load[:, tip, 2] = -9.81 * weights[:, None] / len(tip)
 held = robot.static_equilibrium(Inputs(external_force=load))
-STEPS = 60  # of 0.01 s
+STEPS = 60  # of 0.01 s  # short: 60 -> 40
 motion = robot.rollout(held, STEPS)  # q and v (T + 1, B, N, 3)
 
 
@@ -113,9 +113,9 @@ with torch.no_grad():
     inputs, outputs = model.encode(q, v), model.encode_outputs(f)
     model.fit_linear(inputs, outputs, noise=1e-3)
 optimiser = torch.optim.Adam(model.network.parameters(), lr=3e-3)
-schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 400)
+schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 400)  # short: 400 -> 200
 losses = []
-for _ in range(400):
+for _ in range(400):  # short: 400 -> 200
     optimiser.zero_grad()
     noisy = inputs + 1e-3 * torch.randn_like(inputs)
     loss = (model.standardised(noisy) - outputs).square().mean()

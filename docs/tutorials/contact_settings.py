@@ -83,9 +83,9 @@ figure.tight_layout()
 cube = box_hexahedra((0.02, 0.02, 0.02), (2, 2, 2))  # short: (2, 2, 2) -> (1, 1, 1)
 block = Corotated(2e6, 0.4, density=1070.0, stiffness_damping=2e-3)
 D = 1e-3  # m
-loads = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # short: , 3.0, 10.0, 30.0 -> 
+loads = np.array([1.0, 3.0, 10.0, 30.0, 100.0])  # short: 3.0, 10.0, 30.0, 100.0 -> 100.0
 figure, ax = plt.subplots(figsize=(5.5, 3.4))
-for stiffness in (1e4, 1e5, 1e6):  # short: , 1e5 -> 
+for stiffness in (1e4, 1e5, 1e6):  # short: 1e5, 1e6 -> 1e6
     gaps = []
     for load in loads:
         floor = Contact({"floor": HalfSpace(position=(0.0, 0.0, -0.9 * D))}, stiffness=stiffness, distance=D)

@@ -369,7 +369,7 @@ def test_an_obstacle_and_a_clamp_that_pass_through_one_another_in_a_step_are_ref
     simulator = Simulator(Body(BLOCK, energies=[Contact({"plate": plate})]), gravity=(0.0, 0.0, 0.0), time_step=0.01)
     still = torch.zeros(1, 1, dtype=torch.float64)
     state = simulator.step(simulator.rest_state(), Inputs(obstacle_move_z=still))
-    for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 6):
+    for way in np.linspace(0.012 + 0.5 * thickness, 0.1, 3):
         with pytest.raises(InputError, match="'plate' pass through one another"):
             simulator.step(state, Inputs(obstacle_move_z=still - way))
     simulator.step(state, Inputs(obstacle_move_z=still - 0.0105 + 0.5 * thickness))
@@ -379,7 +379,7 @@ def test_an_obstacle_and_a_clamp_that_pass_through_one_another_in_a_step_are_ref
     body = Body(BLOCK, fixed=select_vertices(BLOCK, z=0.0), energies=[Contact({"plate": plate})])
     simulator = Simulator(body, gravity=(0.0, 0.0, 0.0), time_step=0.01)
     clamp = simulator.rest_positions[simulator.fixed]
-    for way in (0.004, 0.008, 0.05):
+    for way in (0.004, 0.05):
         inputs = Inputs(fixed_positions=clamp - torch.tensor([0.0, 0.0, way]))
         refuses(InputError, "'plate'", simulator.step, simulator.rest_state(), inputs)
         refuses(InputError, "'plate'", simulator.static_equilibrium, inputs)

@@ -25,7 +25,6 @@ from .experiment.ablation import ablation_stages, print_ablation
 from .experiment.build import choose_device
 from .experiment.checks import check_run
 from .experiment.digests import digest_of, files_read
-from .experiment.duration import announcement
 from .experiment.experiment import LEARNED, SIMFREE
 from .experiment.folds import Fold, intervals_of_folds, run_folds, workers_for
 from .experiment.laboratory import run_laboratory
@@ -41,8 +40,8 @@ from .experiment.timing import time_models
 from .io.atomic import digest
 from .io.fan_out import ALONE, Workers
 from .io.kernel_cache import start_quietly
-from .io.progress import show
-from .io.resuming import Stage, package_versions, resources_used, run_stages, unfinished
+from .io.progress import show, title_of
+from .io.resuming import Stage, expected_seconds, package_versions, resources_used, run_stages, unfinished
 from .io.safe_files import read_json, write_json
 from .learning.metrics import summarise_folds
 from .report.conditions import conditions
@@ -51,6 +50,7 @@ from .report.data import Metrics
 from .report.ranking import recommended, shown_metrics
 from .report.sections import shapes_table
 from .report.verdict import results_table, verdict
+from .report.wording import duration_text
 from .settings.body import TargetSettings
 from .settings.control import ControlSettings
 from .settings.performed import Split, Trial
@@ -60,6 +60,7 @@ from .settings.stage_keys import BATCH, FIGURES, IMPORTED, LEARNING, NETWORKS, P
 log = logging.getLogger(__name__)
 
 
+_LEAST_SECONDS = 60.0  # that are announced
 _MOST_THREADS = 4  # that share the trials of a batch, as Python's part of a step runs in one at a time
 
 
@@ -332,7 +333,7 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     folds = folds_of(run)
     if folds is None:
         stages = learning_stages(run, split_of(run), ".", acquired)
-        _announce(run, stages, folder, workers_of(run))
+        _announce(unfinished(stages, folder), folder)
         run_stages(stages, folder)
         metrics = collect_metrics(folder, run, [stage.name for stage in (*first, *stages)])
     else:
@@ -345,16 +346,20 @@ def run_experiment(run: RunSettings, folder: Path) -> None:
     _print(metrics, folder, run)
 
 
-def _announce(run: RunSettings, stages: Sequence[Stage], folder: Path, workers: Workers, times: float = 1.0) -> None:
-    """Logs how long the unfinished stages of a split take, unless that is short; see `announcement`."""
-    left = unfinished(stages, folder)
-    try:
-        sentence = announcement(left, folder, run.budget == "quick", workers, times)
-    except Exception as error:  # An estimate never ends a run.
-        log.debug("no estimate: %s", error)
+def _announce(left: Sequence[Stage], folder: Path, times: float = 1.0) -> None:
+    """Logs how long unfinished stages took the last time, if that is known of all and is more than a minute.
+
+    Args:
+        left: the stages.
+        folder: of the split.
+        times: factor of the duration, as of several folds.
+    """
+    took = {name: times * seconds for name, seconds in expected_seconds(left, folder).items() if name != "report"}
+    if sum(took.values()) < _LEAST_SECONDS or not {stage.name for stage in left} <= {*took, "report"}:
         return
-    if sentence:
-        log.info("%s", sentence)
+    longest = sorted(took, key=lambda name: -took[name])[:3]
+    parts = ", ".join(f"{title_of(name)} {duration_text(took[name])}" for name in longest)
+    log.info("About %s more, as the last time (%s)", duration_text(sum(took.values())), parts)
 
 
 def _run_folds(
@@ -368,7 +373,7 @@ def _run_folds(
     left = [fold for fold in folds.values() if unfinished(fold.stages(ALONE), fold.folder)]
     if left:
         times = len(left) / workers_of(run).at_most(len(left)).count
-        _announce(run, left[0].stages(ALONE), left[0].folder, ALONE, times)
+        _announce(left[0].stages(ALONE), left[0].folder, times)
     run_folds(folds, workers_of(run))
     metrics = dict[str, Metrics]()
     for name, fold in folds.items():

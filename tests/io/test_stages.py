@@ -2,6 +2,7 @@ import io
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -284,3 +285,23 @@ class TestProgress:
             assert 0.9 * most <= len(described) <= most
         assert "20000/20000 steps" in stream.getvalue()
         assert "error 1e+04" in stream.getvalue()
+
+
+def test_stages_are_expected_to_take_as_long_as_the_last_time(tmp_path):
+    """As stages of one name on the same body and data, in any folder beside this one."""
+    body = {"mesh": {"size": 0.01}, "data": {"kind": "release"}, "budget": "full", "time_step": 0.01}
+
+    def stage(**changes):
+        return resuming.Stage("identify", lambda context: None, (), {**body, **changes})
+
+    assert resuming.expected_seconds([stage()], tmp_path / "new") == {}
+    for number, (changes, seconds) in enumerate([({"seed": 1}, 80.0), ({"seed": 2}, 70.0), ({"budget": "quick"}, 5.0)]):
+        resuming.run_stages([stage(**changes)], tmp_path / str(number))
+        record = tmp_path / str(number) / "stages" / "identify.json"
+        finished = f"2026-01-0{3 - number}T00:00:00+00:00"
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"seconds": seconds, "finished": finished}))
+    (tmp_path / "damaged" / "stages").mkdir(parents=True)
+    (tmp_path / "damaged" / "stages" / "identify.json").write_text("{")
+    assert resuming.expected_seconds([stage(), replace(stage(), name="train")], tmp_path / "new") == {"identify": 80.0}
+    assert resuming.expected_seconds([stage(budget="quick")], tmp_path / "new") == {"identify": 5.0}
+    assert resuming.expected_seconds([stage(mesh={"size": 0.02})], tmp_path / "new") == {}

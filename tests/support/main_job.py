@@ -49,9 +49,8 @@ QUIET = ("hydra/job_logging=none", "hydra/hydra_logging=none")
 
 @contextlib.contextmanager
 def without_reports():
-    """Replaces reports and estimates of durations, which take most of a tiny run's time and have tests of their own."""
+    """Replaces reports, which take most of a tiny run's time and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "announcement", lambda *arguments: "")
         for name in ("make_report", "make_folds_report"):
             patch.setattr(pipeline, name, lambda context: (context.run_dir / "report.html").write_text("-"))
         yield

@@ -129,6 +129,30 @@ def unfinished(stages: Sequence[Stage], run_dir: str | Path) -> list[Stage]:
     return [stage for stage, context in _contexts(stages, Path(run_dir)) if _earlier(stage, context)[0] is None]
 
 
+def expected_seconds(stages: Sequence[Stage], run_dir: str | Path) -> dict[str, float]:
+    """Returns how long stages took that did the same before, by name [s].
+
+    These are stages of one name on the same body, the same data and the same budget, in this folder and in those beside
+    it, of which the last one counts.
+    """
+    took = dict[str, float]()
+    for stage in stages:
+        last = ""
+        for path in Path(run_dir).parent.glob(f"*/stages/{stage.name}.json"):
+            with suppress(DataFileError, KeyError):  # A damaged record counts for nothing.
+                record = read_json(path)
+                alike = _works_on(record["settings"]) == _works_on(to_plain(stage.settings))
+                if alike and record["finished"] > last:
+                    last = record["finished"]
+                    took[stage.name] = float(record["seconds"])
+    return took
+
+
+def _works_on(settings: Mapping[str, Any]) -> list[Any]:
+    """What the duration of a stage depends on most."""
+    return [settings.get(key) for key in ("mesh", "data", "budget", "time_step")]
+
+
 def _contexts(stages: Sequence[Stage], run_dir: Path) -> Iterator[tuple[Stage, StageContext]]:
     """Yields stages with their contexts."""
     fingerprints: dict[str, str] = {}

@@ -33,16 +33,17 @@ def own(folder):
 
 class TestCommandLine:
     @pytest.mark.parametrize(
-        "text",
+        ("place", "title", "path"),
         [
-            *("20261128", "2026-11-28", "1e5", "010", "true", "inf", "on", "a (1)", "a [1]", "[1]", "{x}", "it's"),
-            *('q"u', "50 %", "a,b", "m=50g", "#1", "a:b", "$x", "a\\b\\", "Übung é", "摆动", "f(x)", "choice (2)"),
+            *(("20261128", "2026-11-28", "1e5"), ("010", "true", "inf"), ("on", "a (1)", "a [1]")),
+            *(("[1]", "{x}", "it's"), ('q"u', "50 %", "a,b"), ("m=50g", "#1", "a:b")),
+            *(("$x", "a\\b\\", "Übung é"), ("摆动", "f(x)", "choice (2)"), ("1e5", "[1]", "{x}")),
         ],
     )
-    def test_texts_are_as_they_were_typed(self, folder, text):
-        settings = shown(RECORDED, f"data.folder={text}", f"title={text}", "mesh=file", f"mesh.path={text}/a.msh")
+    def test_texts_are_as_they_were_typed(self, folder, place, title, path):
+        settings = shown(RECORDED, f"data.folder={place}", f"title={title}", "mesh=file", f"mesh.path={path}/a.msh")
         read = settings["data"]["folder"], settings["title"], settings["mesh"]["path"]
-        assert read == (text, text, f"{text}/a.msh")
+        assert read == (place, title, f"{path}/a.msh")
 
     def test_what_exists_is_a_file_without_interpolation_or_sweep(self, folder):
         for name in ("${x}", "a,b", "choice(a)"):

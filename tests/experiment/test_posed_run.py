@@ -8,10 +8,12 @@ import warp_resphys
 from support.configured import settings
 from support.main_job import finish, run_without_report
 from support.played_run import check_robots
+from support.report_page import FAILING
 from warp_resphys.data.trials import Trials
 from warp_resphys.experiment.build import bound_markers, build_simulator, finer
 from warp_resphys.io.safe_files import read_array, read_hdf5, read_json
 from warp_resphys.learning.identification.search import Identification
+from warp_resphys.report import render
 from warp_resphys.report.identification_section import trials_table
 from warp_resphys.settings.body import MaterialSettings
 from warp_resphys.settings.mesh import ArmMesh, FileMesh, HexahedralBox, RodMesh, ShippedArm
@@ -66,7 +68,8 @@ def write(folder, places_of_poses):
         np.savetxt(folder / f"{name}.csv", table, delimiter=",", fmt="%.6f")
 
 
-def test_poses_of_unnamed_markers_identify_the_body(poses, folder):
+def test_poses_of_unnamed_markers_identify_the_body(poses, folder, monkeypatch):
+    monkeypatch.setattr(render, "COMMAND", FAILING)  # Bodies are drawn in tests of reports.
     write(folder / "recordings", poses)
     run = finish(*TINY, *trials())
     dataset = Trials.read(run / "dataset.h5")

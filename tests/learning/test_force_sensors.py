@@ -235,9 +235,15 @@ def test_internal_forces_leave_the_sensor_its_true_loads(pushed, method):
     assert errors[0] < 1e-5 < 1e-2 < errors[1]
 
 
-@pytest.mark.parametrize("acts", ["internal", "external"])
-@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
-@pytest.mark.parametrize("problem", [MarkerPositionProblem, MarkerForceProblem])
+@pytest.mark.parametrize(
+    ("integrator", "problem", "acts"),
+    [
+        ("implicit_euler", MarkerPositionProblem, "internal"),
+        ("implicit_euler", MarkerForceProblem, "external"),
+        ("bdf2", MarkerPositionProblem, "external"),
+        ("bdf2", MarkerForceProblem, "internal"),
+    ],
+)
 def test_derivatives_of_readings_in_a_step(integrator, problem, acts):
     """By positions of the stage, times the fraction of the step where it stands; with friction on a plate."""
     simulator, sensors = pressing(integrator)

@@ -105,7 +105,7 @@ def test_a_start_where_the_simulation_fails_is_passed_over():
 
 
 def test_starts_are_the_first_guess_and_the_best_candidates():
-    replay, release = replay_of(simulator(), TRUTH, frames=20)
+    replay, release = replay_of(simulator(), TRUTH, frames=12)
     misfit = Misfit([(replay, release)], RANGES)
     starts = first_points(misfit, FIRST, 3, 8, seed=0)
     assert len(starts) == 3
@@ -177,7 +177,7 @@ def test_stiffness_and_damping_are_identified_from_poses_and_motions():
     assert alone.parameters["youngs_modulus"] == pytest.approx(215e3, rel=1e-3)
 
 
-DELAYS, FRAMES, BEGIN = (0.013, -0.021, 0.004), 40, 6
+DELAYS, FRAMES, BEGIN = (0.013, -0.021, 0.004), 28, 6
 DAMPED = TRUTH | {"stiffness_damping": 0.004}
 ACCURACY = Accuracy(markers=0.003, shift=0.002)
 

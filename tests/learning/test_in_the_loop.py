@@ -73,7 +73,7 @@ class TestAtSteps:
         np.testing.assert_allclose(result[2:], self.path(0.002 + STEP * np.arange(2, 20)), rtol=0, atol=1e-6)
 
 
-def observed_motions(frames=8):
+def observed_motions(frames=6):
     """Two motions of the beam, bare and with a weight, that another stiffness made; and how they begin."""
     sim = simulator()
     times = (STEP * torch.arange(1, frames + 1, dtype=torch.float64)).repeat(2, 1)

@@ -13,9 +13,11 @@ from warp_resphys.io.errors import DataFileError, InputError
 from warp_resphys.learning import MaterialTest, Membrane, scale_to_tests
 
 MODULUS = 30e3
-DISC = Membrane(radius=0.07, thickness=0.001, cap=0.025, force=8.0)
+DISC = Membrane(radius=0.07, thickness=0.001, cap=0.025, force=8.0, cell=3.0)
 RINGED = Membrane(radius=0.04, thickness=0.002, cap=0.015, force=4.0, rings=[(0.027, 0.003)])
-KNOWN = {"model": "law", "parameters": {"density": 1070.0, "c10": 8e3, "c20": 70.0, "bulk_1": 8e6}}
+HEIGHTS = np.linspace(0.3, 0.6, 30)
+LAW = {"c10": 12e3, "c20": 99.0}
+KNOWN = {"model": "law", "parameters": {"density": 1070.0, "c10": 8e3, "c20": 66.0, "bulk_1": 8e6}}
 HEAD = "# thickness_mm,contact_radius_mm,ring1_radius_mm,ring1_width_mm,ring2_radius_mm,ring2_width_mm = "
 COLUMNS = "height_mm,pressure_Pa,lifted_force_N"
 
@@ -49,41 +51,41 @@ def height_of(membrane, pressure, modulus):
 
 def test_a_disc_lifts_its_cap_as_a_membrane():
     """Within the thickness over the radius, up to half the radius."""
-    for pressure in (1250.0, 1400.0):
-        height = height_of(DISC, pressure, MODULUS)
-        assert 0.1 < height / DISC.radius < 0.7
-        found, _, _ = DISC.response(np.array([0.9, 1.0]) * height / DISC.radius, {"c10": 0.5 * MODULUS})
-        assert found[1] == pytest.approx(pressure, rel=0.02)
+    pressure = 1400.0
+    height = height_of(DISC, pressure, MODULUS)
+    assert 0.1 < height / DISC.radius < 0.7
+    found, _, _ = DISC.response(np.array([0.9, 1.0]) * height / DISC.radius, {"c10": 0.5 * MODULUS})
+    assert found[1] == pytest.approx(pressure, rel=0.02)
 
 
-def test_derivatives_of_the_pressure():
-    heights = np.linspace(0.3, 0.6, 6)
-    law = {"c10": 12e3, "c20": 100.0}
-    value, by_law, by_height = RINGED.response(heights, law)
-    for name, step in (("c10", 12.0), ("c20", 1.0)):
-        ends = [RINGED.response(heights, {**law, name: law[name] + sign * step})[0] for sign in (1.0, -1.0)]
+@pytest.fixture(scope="module")
+def ringed():
+    """Pressures of the membrane with a ring, and their derivatives."""
+    return RINGED.response(HEIGHTS, LAW)
+
+
+def test_derivatives_of_the_pressure(ringed):
+    value, by_law, by_height = ringed
+    for name, step in (("c10", 12.0), ("c20", 4.0)):
+        ends = [RINGED.response(HEIGHTS, {**LAW, name: LAW[name] + sign * step})[0] for sign in (1.0, -1.0)]
         np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * step), by_law[name], rtol=2e-3)
-    middle = 0.5 * (heights[1:] + heights[:-1])
-    between = RINGED.response(heights, law)[0]
-    np.testing.assert_allclose(np.diff(between) / np.diff(heights), np.interp(middle, heights, by_height), rtol=0.02)
-    assert np.all(RINGED.response(heights, {"c10": 20e3, "c20": 100.0})[0] > value)
+        assert np.all(by_law[name] > 0.0)
+    middle = 0.5 * (HEIGHTS[1:] + HEIGHTS[:-1])
+    np.testing.assert_allclose(np.diff(value) / np.diff(HEIGHTS), np.interp(middle, HEIGHTS, by_height), rtol=0.02)
 
 
-def test_stiff_rings_raise_the_pressure():
-    law, heights = {"c10": 12e3}, np.linspace(0.3, 0.6, 6)
-    plain = replace(RINGED, rings=()).response(heights, law)[0]
-    same = replace(RINGED, ring_modulus=24e3).response(heights, law)[0]
+def test_stiff_rings_raise_the_pressure(ringed):
+    plain = replace(RINGED, rings=()).response(HEIGHTS, LAW)[0]
+    same = replace(RINGED, ring_modulus=24e3).response(HEIGHTS, LAW)[0]
     np.testing.assert_allclose(same, plain, rtol=0.01)
-    assert np.all(RINGED.response(heights, law)[0] > 1.2 * plain)
+    assert np.all(ringed[0] > 1.2 * plain)
 
 
-def test_the_factor_of_a_batch_is_found():
-    heights = np.linspace(0.3, 0.6, 30)
-    true = {"c10": 1.7 * 8e3, "c20": 1.7 * 70.0}
-    pressure = RINGED.response(heights, true)[0]
-    law = scale_to_tests({"lift": MaterialTest("bulge", heights, pressure, specimen=RINGED)}, KNOWN, density=1070.0)
-    assert law.parameters["c10"] == pytest.approx(true["c10"], rel=2e-3)
-    assert law.parameters["c20"] == pytest.approx(true["c20"], rel=2e-3)
+def test_the_factor_of_a_batch_is_found(ringed):
+    test = MaterialTest("bulge", HEIGHTS, ringed[0], specimen=RINGED)
+    law = scale_to_tests({"lift": test}, KNOWN, density=1070.0)
+    assert law.parameters["c10"] == pytest.approx(LAW["c10"], rel=2e-3)
+    assert law.parameters["c20"] == pytest.approx(LAW["c20"], rel=2e-3)
     assert law.errors["lift"] < 1e-3
     assert law.content()["validation"]["split"] == "all samples"
 

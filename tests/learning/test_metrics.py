@@ -176,7 +176,8 @@ def covered(intervals, some):
 @pytest.mark.parametrize("count", [3, 10])
 def test_intervals_have_their_coverage_on_other_trials_of_any_amplitude(noise, count):
     """Mean coverage over many calibrations, with few or many trials."""
-    made = [(Intervals.calibrated(trials(count, s, noise), REST), trials(20, 1000 + s, noise)) for s in range(30)]
+    seeds = range(30 if count == 3 else 12)  # few trials calibrate to more different intervals
+    made = [(Intervals.calibrated(trials(count, s, noise), REST), trials(20, 1000 + s, noise)) for s in seeds]
     results = [covered(*pair) for pair in made]
     assert 0.86 < np.mean([result["coverage"] for result in results]) < 0.96
     thirds = np.mean([by_amplitude(*pair) for pair in made], axis=0)

@@ -113,7 +113,7 @@ def with_depths(pose):
 @pytest.mark.parametrize(("kind", "tolerance"), [("points", 3e-3), ("outlines", 0.05), ("depths", 0.05)])
 def test_derivatives_are_those_of_differences(kind, tolerance):
     """By physical parameters, release and camera, where rows have times of their own."""
-    own = released(8, outlines=kind == "outlines")
+    own = released(6, outlines=kind == "outlines")
     if kind == "outlines":
         own = replace(own, photos=tuple(replace(photo, tracked=None) for photo in own.photos))
     if kind == "depths":

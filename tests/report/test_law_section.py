@@ -88,7 +88,7 @@ def test_page_has_the_law_and_the_errors_by_load(tmp_path):
     assert (tmp_path / "figures" / "error_over_time.png").is_file()
 
 
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.usefixtures("no_figures")
 def test_a_law_that_is_not_used_is_said_to_be_so(tmp_path):
     page = run(tmp_path, law(accepted=False, validation=errors_on(["80 g"], 0.2, 0.1)))
     said = "The identified law is not used: its root mean square error on the validation trials (80 g) is 20 %"

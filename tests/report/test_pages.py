@@ -21,24 +21,12 @@ from warp_resphys.mesh.readers import write_mesh
 from warp_resphys.report.body_section import paths_section
 from warp_resphys.report.data import best_and_worst
 from warp_resphys.report.motion_section import motion_of
-from warp_resphys.report.page import Canvas, Drawn
 from warp_resphys.report.pages import run_page
 from warp_resphys.report.wording import NONE, number_text
 
 ARM = arm_settings()
 FIGURES_OF_AN_ARM = {"error_over_time", "loss_history", "paths_worst", "paths_best", "inputs"}
 FIGURES_OF_AN_ARM |= {"training_resphys", "training_simfree"}
-
-
-@pytest.fixture
-def no_figures(no_drawing, monkeypatch):
-    """Figures are drawn in tests of their own; here their names are kept."""
-
-    def figure(canvas, name, _, alt, caption):
-        (canvas.folder / f"{name}.png").touch()
-        return Drawn(name, caption, alt, "data:,")
-
-    monkeypatch.setattr(Canvas, "figure", figure)
 
 
 def figures_in(folder):
@@ -107,7 +95,7 @@ class TestArms:
         assert set(pressures.scaled) < pressures.values.keys()
         assert trials.errors_mm["resphys"][:, 1:].mean() == pytest.approx(scales["1"]["resphys"]["mean"], rel=1e-5)
 
-    @pytest.mark.usefixtures("no_drawing")
+    @pytest.mark.usefixtures("no_figures")
     def test_one_chamber_one_trial_and_two_models(self, tmp_path):
         box = hollow_box("hexahedron")
         turned = box.vertices[:, [2, 1, 0]] * [1.0, 1.0, -1.0] - [0.01, 0.015, 0.0]
@@ -213,7 +201,7 @@ class TestBeams:
         others = {"error_over_time", "loss_history", "paths_worst", "paths_best"}
         assert figures_in(tmp_path) == learned | others
 
-    @pytest.mark.usefixtures("no_drawing")
+    @pytest.mark.usefixtures("no_figures")
     def test_what_is_not_there_is_left_out_and_what_diverged_is_said(self, tmp_path):
         made_up_run.write_beam_run(tmp_path, "bare", "load52", models=("simulation", "resphys"), diverged=("resphys",))
         for name in ("identification.json", "training_resphys.json", "truth.json"):
@@ -256,7 +244,7 @@ class TestBeams:
         marked = re.findall(r'class="marked"><th scope="row">([^<]+)<', page.source)
         assert marked == ["+ identified parameters (SysID)"]
 
-    @pytest.mark.usefixtures("no_drawing")
+    @pytest.mark.usefixtures("no_figures")
     def test_page_over_folds_leads_to_theirs(self, tmp_path):
         made_up_run.write_folds(tmp_path, models=("simulation", "sysid", "resphys"))
         metrics = read_json(tmp_path / "metrics.json")

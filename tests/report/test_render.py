@@ -71,10 +71,13 @@ def test_sharp_edges_are_those_of_the_box_and_the_rim_of_a_part():
     assert len(sharp_edges(mesh.vertices, end)) == 4 * 2
 
 
+CRASH = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+
+
 @pytest.mark.parametrize(
     ("script", "time_out", "reason"),
     [
-        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", 60.0, "Segmentation fault"),
+        (CRASH, 60.0, "Segmentation fault"),
         ("import no_such_renderer", 60.0, "No module named 'no_such_renderer'"),
         ("import time; time.sleep(60)", 0.1, "not done after 0.1 s"),
     ],
@@ -85,6 +88,8 @@ def test_why_nothing_can_be_drawn(tmp_path, monkeypatch, script, time_out, reaso
     (tmp_path / "modules").mkdir()
     (tmp_path / "modules" / "pyvista.py").write_text(script)
     monkeypatch.setattr(render, "TIME_OUT", time_out)
+    if script == CRASH:  # A crash needs none of the program.
+        monkeypatch.setattr(render, "COMMAND", (sys.executable, "-c", "import pyvista"))
     mesh = box_hexahedra(divisions=(1, 1, 1))
     scene = body_scene(mesh)
     with pytest.raises(render.DrawingError) as caught:

@@ -76,7 +76,7 @@ def test_the_same_run_gives_the_same_page(finished, tmp_path, used_again):
         assert report(tmp_path, SETTINGS).source == finished[1].source
 
 
-@pytest.mark.usefixtures("no_drawing")
+@pytest.mark.usefixtures("no_figures")
 def test_a_diverged_rollout_is_said_and_does_not_hide_the_rest(tmp_path):
     write_vertex_run(tmp_path, SETTINGS, models=("simulation", "resphys"), diverged=("resphys",))
     stale = tmp_path / "figures" / "motion.png"

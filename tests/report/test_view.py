@@ -10,7 +10,7 @@ import pytest
 from support.browser import opened as browser_of_tests
 from support.browser import until
 from support.made_up_run import arm_settings, vertex_settings, write_arm_run, write_vertex_run
-from support.report_page import FAILING, Page, report
+from support.report_page import FAILING, Page, report, skip_figures
 from warp_resphys import Body, Contact, box_hexahedra
 from warp_resphys.energies import Capsule, Sphere
 from warp_resphys.energies.contact.obstacle_surface import ObstacleSurface
@@ -134,6 +134,7 @@ def page(request, tmp_path_factory):
     write(folder, config)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(render, "COMMAND", FAILING)  # Nothing else is drawn, which takes seconds.
+        skip_figures(patch)
         report(folder, config)
     return folder / "report.html"
 
